@@ -1,0 +1,75 @@
+"""The backbone's first door: an ordered list of named blocks, and a table that says which block may look at which."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+
+Visibility = Mapping[str, frozenset[str] | set[str]]
+"""For each block that asks: the blocks whose keys it may attend to."""
+
+PI05_VISIBILITY: Visibility = {
+    "images": {"images", "prompt"},
+    "prompt": {"images", "prompt"},
+    "action": {"images", "prompt", "action"},
+}
+"""Images and prompt are one bidirectional block; actions see everything and nothing sees them."""
+
+
+@dataclass
+class Block:
+    """A run of tokens that share a name, hence a row of the table, and an expert whose weights process them.
+
+    tokens: [b, n, d] at the expert's width. mask: [b, n] bool, False on padding.
+    """
+
+    name: str
+    tokens: Tensor
+    mask: Tensor
+    expert: str
+
+    def __len__(self) -> int:
+        return self.tokens.shape[1]
+
+
+class Span(NamedTuple):
+    """A block's name and length: what remains of it in a key-value cache."""
+
+    name: str
+    length: int
+
+
+def attention_mask(
+    queries: Sequence[Span], keys: Sequence[Span], query_mask: Tensor, key_mask: Tensor, table: Visibility
+) -> Tensor:
+    """Who attends whom: query q sees key k iff q's row of the table names k's block and both tokens are valid.
+
+    Args:
+        queries, keys: blocks in sequence order.
+        query_mask: [b, q] bool. key_mask: [b, k] bool.
+        table: the visibility table.
+
+    Returns:
+        [b, q, k] bool.
+
+    Raises:
+        UserError: a block has no row in the table.
+    """
+    device = key_mask.device
+    rows = []
+    for query in queries:
+        if query.name not in table:
+            raise UserError(f"Block {query.name!r} has no row in the visibility table; it has rows {sorted(table)}.")
+        sees = [torch.full((key.length,), key.name in table[query.name], device=device) for key in keys]
+        rows.append(torch.cat(sees).expand(query.length, -1))
+    return torch.cat(rows) & query_mask[:, :, None] & key_mask[:, None, :]
+
+
+def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
+    """Rotary positions [b, n]: valid tokens are numbered on, padding repeats the number before it (−1 at the start)."""
+    positions = mask.long().cumsum(1) - 1
+    return positions if past_mask is None else positions + past_mask.long().sum(1, keepdim=True)

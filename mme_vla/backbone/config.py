@@ -1,0 +1,75 @@
+"""Sizes as rows of a table: `pi05` is the real model, `tiny` a first-class citizen that trains on a laptop's CPU."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, Self
+
+from mme_vla.errors import UserError, did_you_mean
+
+
+class _Config:
+    """Builds itself from a plain mapping and refuses keys it does not know."""
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
+        unknown = [key for key in values if key not in known]
+        if unknown:
+            raise UserError(f"{cls.__name__} has no key {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
+        built: dict[str, Any] = {}
+        for key, value in values.items():
+            kind = known[key].type
+            nested = isinstance(kind, type) and is_dataclass(kind)
+            built[key] = kind.from_dict(value) if nested and isinstance(value, Mapping) else value  # type: ignore[union-attr]
+        return cls(**built)
+
+
+@dataclass(frozen=True)
+class VisionConfig(_Config):
+    """SigLIP; its output width is the VLM's. `image_size` must be a multiple of `patch_size`."""
+
+    image_size: int = 224
+    patch_size: int = 14
+    width: int = 1152
+    depth: int = 27
+    mlp_dim: int = 4304
+    num_heads: int = 16
+
+    def __post_init__(self) -> None:
+        if self.image_size % self.patch_size:
+            raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
+
+
+@dataclass(frozen=True)
+class ExpertConfig(_Config):
+    """One Gemma expert's own sizes; depth, heads and head width are shared by all (paper, section 4.1)."""
+
+    width: int
+    mlp_dim: int
+
+
+@dataclass(frozen=True)
+class BackboneConfig(_Config):
+    """π0.5: a vision tower, a VLM expert and an action expert under joint attention."""
+
+    vision: VisionConfig = field(default_factory=VisionConfig)
+    vlm: ExpertConfig = field(default_factory=lambda: ExpertConfig(2048, 16384))
+    action: ExpertConfig = field(default_factory=lambda: ExpertConfig(1024, 4096))
+    depth: int = 18
+    num_heads: int = 8
+    num_kv_heads: int = 1
+    head_dim: int = 256
+    vocab_size: int = 257_152
+    action_dim: int = 32
+    horizon: int = 20
+    time_distribution: str = "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
+
+    def __post_init__(self) -> None:
+        if self.num_heads % self.num_kv_heads:
+            raise UserError(f"num_heads={self.num_heads} must be a multiple of num_kv_heads={self.num_kv_heads}.")
+        if self.head_dim % 2:
+            raise UserError(f"head_dim={self.head_dim} must be even: rotary embedding turns pairs.")
+        if self.action.width % 2:
+            raise UserError(f"action.width={self.action.width} must be even: the flow time is embedded in sin and cos.")
+        if self.time_distribution not in ("beta", "uniform"):
+            raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")

@@ -1,0 +1,273 @@
+"""Gemma experts under joint attention: every expert has its own weights, all share one attention.
+
+b batch · n tokens · d an expert's width · N query heads · K key heads · h head width
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from mme_vla.backbone.attention import additive_mask, attend
+from mme_vla.backbone.blocks import Block, Span, Visibility, attention_mask, token_positions
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.norms import AdaRMSNorm, Modulation, RMSNorm
+from mme_vla.backbone.precision import compute_dtype
+from mme_vla.backbone.rope import Rotation, rotate, rotation
+
+Hook = Callable[[int, Tensor], Tensor]
+"""The backbone's second door: (layer, residual stream [b, n, d]) → what the answering expert's MLP reads instead."""
+
+KeyValue = tuple[Tensor, Tensor]
+
+
+class LayerModulation(NamedTuple):
+    """One layer's two time modulations, made beforehand for a sampling step."""
+
+    attention: Modulation
+    mlp: Modulation
+
+
+class Segment(NamedTuple):
+    """Neighbouring blocks of one expert, run as one matrix."""
+
+    expert: str
+    tokens: Tensor
+
+
+class GatedMLP(nn.Module):
+    """GeGLU: (gelu(x W₀) ⊙ x W₁) W₂, with W₀ and W₁ in one matrix."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.gate_up = nn.Linear(width, 2 * hidden, bias=False)
+        self.down = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        gate, up = self.gate_up(x).chunk(2, dim=-1)
+        return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
+
+
+class ExpertLayer(nn.Module):
+    """One expert's weights in one layer.
+
+    In the last layer only the answering expert is read further: of the others that layer needs keys and values
+    alone (`keys_only`), and has no other weights.
+    """
+
+    def __init__(self, config: BackboneConfig, expert: ExpertConfig, condition_width: int | None, keys_only: bool):
+        super().__init__()
+        self.heads, self.kv_heads, self.head_dim = config.num_heads, config.num_kv_heads, config.head_dim
+        self.keys_only = keys_only
+
+        def norm() -> nn.Module:
+            return AdaRMSNorm(expert.width, condition_width) if condition_width else RMSNorm(expert.width)
+
+        self.attention_norm = norm()
+        kv_width = 2 * self.kv_heads * self.head_dim
+        if keys_only:
+            self.kv = nn.Linear(expert.width, kv_width, bias=False)
+            return
+        q_width = self.heads * self.head_dim
+        self.qkv = nn.Linear(expert.width, q_width + kv_width, bias=False)
+        self.out = nn.Linear(q_width, expert.width, bias=False)
+        self.mlp_norm = norm()
+        self.mlp = GatedMLP(expert.width, expert.mlp_dim)
+
+    def project(
+        self, x: Tensor, condition: Tensor | Modulation | None
+    ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
+        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate."""
+        x, gate = self.attention_norm(x, condition)
+        projected = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
+        k, v = projected[..., -2 * self.kv_heads :, :].chunk(2, dim=-2)
+        return None if self.keys_only else projected[..., : self.heads, :], k, v, gate
+
+    def finish(
+        self,
+        x: Tensor,
+        attended: Tensor,
+        gate: Tensor | None,
+        condition: Tensor | Modulation | None,
+        hook: Callable[[Tensor], Tensor] | None,
+    ) -> Tensor:
+        """Add the attention's output, then the MLP's; the hook changes only what the MLP reads."""
+        x = _residual(x, self.out(attended), gate)
+        normed, gate = self.mlp_norm(x if hook is None else hook(x), condition)
+        return _residual(x, self.mlp(normed), gate)
+
+
+def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
+    return x + (update if gate is None else update * gate)
+
+
+class JointBlock(nn.Module):
+    """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap it whole."""
+
+    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str, last: bool) -> None:
+        super().__init__()
+        self.answering = answering
+        self.experts = nn.ModuleDict({
+            name: ExpertLayer(config, expert, expert.width if name == answering else None, last and name != answering)
+            for name, expert in experts.items()
+        })  # fmt: skip
+
+    def forward(
+        self,
+        segments: Sequence[Segment],
+        turn: Rotation,
+        mask: Tensor,
+        condition: Tensor | LayerModulation | None,
+        hook: Callable[[Tensor], Tensor] | None = None,
+        past: KeyValue | None = None,
+    ) -> tuple[list[Segment], KeyValue]:
+        """Run one layer.
+
+        Args:
+            segments: this pass's tokens in sequence order. turn: their rotation.
+            mask: additive [b, 1, n, past + n].
+            condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
+            hook: see `Hook`, layer already bound.
+            past: keys and values [b, past, K, h] of earlier passes, rotated.
+
+        Returns:
+            The updated segments (of those that asked), and this pass's keys (rotated) and values.
+        """
+        of_attention, of_mlp = condition if isinstance(condition, LayerModulation) else (condition, condition)
+        asked, queries, keys, values, row = [], [], [], [], 0
+        for segment in segments:
+            layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
+            adaptive = segment.expert == self.answering
+            q, k, v, gate = layer.project(segment.tokens, of_attention if adaptive else None)
+            rows = slice(row, row + k.shape[1])
+            keys.append(k)
+            values.append(v)
+            if q is not None:
+                asked.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
+                queries.append(rotate(q, turn.rows(rows)))
+            row = rows.stop
+        k, v = rotate(torch.cat(keys, 1), turn), torch.cat(values, 1)
+        if not asked:
+            return [], (k, v)
+        all_k, all_v = (k, v) if past is None else (torch.cat([past[0], k], 1), torch.cat([past[1], v], 1))
+        seen = mask if len(asked) == len(segments) else torch.cat([mask[:, :, rows] for *_, rows in asked], 2)
+        attended = attend(torch.cat(queries, 1), all_k, all_v, seen)
+        pieces = attended.split([rows.stop - rows.start for *_, rows in asked], dim=1)
+        updated = [
+            Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
+            for (segment, layer, gate, of, change, _), piece in zip(asked, pieces, strict=True)
+        ]
+        return updated, (k, v)
+
+
+@dataclass
+class KVCache:
+    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens are valid."""
+
+    layers: list[KeyValue]
+    spans: list[Span]
+    mask: Tensor  # [b, past] bool
+
+
+@dataclass
+class Conditioning:
+    """Time modulations of all layers, made once for the fixed times of a sampler (`JointTransformer.conditioning`)."""
+
+    layers: list[LayerModulation]
+    final: Modulation
+
+    def at(self, index: int) -> "Conditioning":
+        """Return the modulations of one time, kept broadcastable over the batch."""
+
+        def pick(m: Modulation) -> Modulation:
+            return Modulation(*(x[index : index + 1] for x in m))
+
+        return Conditioning([LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final))
+
+
+class JointTransformer(nn.Module):
+    """All layers and the final norm of the one expert that answers; nothing that no action reads."""
+
+    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str = "action") -> None:
+        super().__init__()
+        self.head_dim, self.answering, self.experts = config.head_dim, answering, experts
+        self.gradient_checkpointing = False
+        self.layers = nn.ModuleList(
+            JointBlock(config, experts, answering, last=i == config.depth - 1) for i in range(config.depth)
+        )
+        width = experts[answering].width
+        self.final_norm = AdaRMSNorm(width, width)
+
+    def conditioning(self, condition: Tensor) -> Conditioning:
+        """Compute every layer's modulation for conditions [m, c] at once: the weights are read once, not m times."""
+        layers = []
+        for block in self.layers:
+            layer = block.experts[self.answering]  # type: ignore[union-attr, index]
+            layers.append(
+                LayerModulation(layer.attention_norm.modulation(condition), layer.mlp_norm.modulation(condition))  # type: ignore[operator, union-attr]
+            )
+        return Conditioning(layers, self.final_norm.modulation(condition))
+
+    def forward(
+        self,
+        blocks: Sequence[Block],
+        table: Visibility,
+        condition: Tensor | Conditioning | None = None,
+        hook: Hook | None = None,
+        past: KVCache | None = None,
+        keep: bool = False,
+    ) -> tuple[Tensor | None, KVCache | None]:
+        """Run blocks, after those of `past`, under a visibility table.
+
+        Args:
+            blocks: in sequence order. table: see `blocks.Visibility`.
+            condition: time condition [b, c] of the answering expert, or its modulations; unread without that expert.
+            hook: the per-layer hook. past: an earlier pass's cache.
+            keep: whether to return a cache of `past` and this pass.
+
+        Returns:
+            The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
+        """
+        spans = [Span(block.name, len(block)) for block in blocks]
+        valid = torch.cat([block.mask for block in blocks], 1)
+        dtype = compute_dtype(blocks[0].tokens)
+        positions = token_positions(valid, past.mask if past else None)
+        all_spans, all_valid = (past.spans + spans, torch.cat([past.mask, valid], 1)) if past else (spans, valid)
+        mask = additive_mask(attention_mask(spans, all_spans, valid, all_valid, table), dtype)
+        turn = rotation(positions, self.head_dim)
+
+        segments = _segments(blocks, dtype)
+        cached: list[KeyValue] = []
+        for i, block in enumerate(self.layers):
+            of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
+            of_hook = None if hook is None else _bind(hook, i)
+            args = (segments, turn, mask, of_layer, of_hook, past.layers[i] if past else None)
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                segments, kv = checkpoint(block, *args, use_reentrant=False)
+            else:
+                segments, kv = block(*args)
+            if keep:
+                old = past.layers[i] if past else None
+                cached.append(kv if old is None else (torch.cat([old[0], kv[0]], 1), torch.cat([old[1], kv[1]], 1)))
+        answer = None
+        if segments:
+            final = condition.final if isinstance(condition, Conditioning) else condition
+            answer, _ = self.final_norm(segments[-1].tokens, final)
+        return answer, KVCache(cached, all_spans, all_valid) if keep else None
+
+
+def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
+    """Join neighbouring blocks of one expert, in the compute dtype."""
+    runs: list[tuple[str, list[Tensor]]] = []
+    for block in blocks:
+        if not runs or runs[-1][0] != block.expert:
+            runs.append((block.expert, []))
+        runs[-1][1].append(block.tokens.to(dtype))
+    return [Segment(expert, torch.cat(tokens, 1) if len(tokens) > 1 else tokens[0]) for expert, tokens in runs]
+
+
+def _bind(hook: Hook, layer: int) -> Callable[[Tensor], Tensor]:
+    return lambda x: hook(layer, x)

@@ -1,0 +1,57 @@
+"""`Integration`: the one room that knows both memory and backbone, through the backbone's two doors."""
+
+from collections.abc import Sequence
+
+from torch import nn
+
+from mme_vla.backbone.blocks import PI05_VISIBILITY, Block, Visibility
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.gemma import Hook
+from mme_vla.types import MemoryTokens
+
+MEMORY_VISIBILITY: Visibility = {
+    "memory": {"memory"},
+    "images": {"images", "prompt"},
+    "prompt": {"memory", "images", "prompt"},
+    "action": {"memory", "images", "prompt", "action"},
+}
+"""As released, wherever memory is a block. The paper's text has one word less: the prompt does not see memory."""
+
+
+def memory_visibility(prompt_sees_memory: bool) -> Visibility:
+    """Return the table, with or without that one word."""
+    return MEMORY_VISIBILITY if prompt_sees_memory else {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}
+
+
+class Integration(nn.Module):
+    """Where memory tokens enter the backbone. This base class adds nothing: π0.5 without memory.
+
+    A subclass overrides what it needs:
+        memory_width: width of the memory tokens it takes (0: it takes none).
+        visibility: the table for its block list.
+        extra_experts: experts the backbone has to have besides its own two.
+        blocks: the prefix's block list, memory in its place.
+        hook: the action expert's per-layer hook for this chunk, with all that depends on memory alone computed now.
+    """
+
+    memory_width: int = 0
+    visibility: Visibility = PI05_VISIBILITY
+
+    def __init__(self, backbone: BackboneConfig) -> None:
+        super().__init__()
+
+    def extra_experts(self) -> dict[str, ExpertConfig]:
+        return {}
+
+    def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
+        return list(observation)
+
+    def hook(self, memory: MemoryTokens | None) -> Hook | None:
+        return None
+
+
+def required(memory: MemoryTokens | None) -> MemoryTokens:
+    """Return the memory, or say that it is missing."""
+    if memory is None:
+        raise ValueError("This policy has a memory: batch.history must hold its selection (it is None).")
+    return memory

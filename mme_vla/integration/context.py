@@ -1,0 +1,23 @@
+"""Memory as context: tokens the VLM expert reads before the images (paper, section 4.3)."""
+
+from collections.abc import Sequence
+
+from mme_vla.backbone.blocks import Block
+from mme_vla.backbone.config import BackboneConfig
+from mme_vla.integration.base import Integration, memory_visibility, required
+from mme_vla.registry import INTEGRATIONS
+from mme_vla.types import MemoryTokens
+
+
+@INTEGRATIONS.register("context")
+class Context(Integration):
+    """[memory | images | prompt] in the VLM expert, then actions."""
+
+    def __init__(self, backbone: BackboneConfig, prompt_sees_memory: bool = True) -> None:
+        super().__init__(backbone)
+        self.memory_width = backbone.vlm.width
+        self.visibility = memory_visibility(prompt_sees_memory)
+
+    def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
+        memory = required(memory)
+        return [Block("memory", memory.tokens, memory.mask, "vlm"), *observation]

@@ -1,0 +1,86 @@
+"""Memory as modulator: each action layer's MLP input is scaled and shifted by what it recalls (paper, section 4.3)."""
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.attention import additive_mask, attend
+from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.gemma import Hook
+from mme_vla.backbone.norms import EPS, RMSNorm, rms_normalise
+from mme_vla.backbone.precision import compute_dtype
+from mme_vla.backbone.rope import rotate, rotation
+from mme_vla.integration.base import Integration, required
+from mme_vla.registry import INTEGRATIONS
+from mme_vla.types import MemoryTokens
+
+
+class ModulatorLayer(nn.Module):
+    """One layer's cross-attention on memory and the linear map from what it read to (a, β)."""
+
+    def __init__(self, width: int, heads: int, kv_heads: int, head_dim: int, exact_identity: bool) -> None:
+        super().__init__()
+        self.kv_heads, self.head_dim, self.exact_identity = kv_heads, head_dim, exact_identity
+        self.norm = RMSNorm(width)  # shared by queries and memory
+        self.q = nn.Linear(width, heads * head_dim, bias=False)
+        self.kv = nn.Linear(width, 2 * kv_heads * head_dim, bias=False)
+        self.out = nn.Linear(heads * head_dim, width, bias=False)
+        self.modulation = nn.Linear(width, 2 * width)
+        for layer in (self.q, self.kv, self.out):
+            nn.init.normal_(layer.weight, std=layer.in_features**-0.5)
+        nn.init.normal_(self.modulation.weight, std=0.0 if exact_identity else 0.002)
+        nn.init.zeros_(self.modulation.bias)
+
+    def keys_values(self, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the number of steps."""
+        kv = self.kv(self.norm(memory)[0]).unflatten(-1, (-1, self.head_dim))
+        k, v = kv.chunk(2, dim=-2)
+        return rotate(k, rotation(_positions(0, memory), self.head_dim)), v
+
+    def recall(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+        """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding included."""
+        q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
+        return self.out(attend(rotate(q, rotation(_positions(k.shape[1], x), self.head_dim)), k, v, mask))
+
+    def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+        """x̂ = rms(x)·(1 + a) + β with (a, β) = W r + b."""
+        a, beta = self.modulation(self.recall(x, k, v, mask)).float().chunk(2, dim=-1)
+        if self.exact_identity:
+            # The same direction at x's own size: the norm that follows removes it, and a = β = 0 gives x to the bit.
+            size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()
+            return (x.float() * (1 + a) + size * beta).to(x.dtype)
+        return (rms_normalise(x) * (1 + a) + beta).to(x.dtype)
+
+
+@INTEGRATIONS.register("modulator")
+class Modulator(Integration):
+    """Fills the action expert's hook in every layer; the prefix never sees memory."""
+
+    def __init__(
+        self,
+        backbone: BackboneConfig,
+        num_heads: int = 4,
+        num_kv_heads: int = 1,
+        head_dim: int | None = None,
+        exact_identity: bool = False,
+    ) -> None:
+        """Build one `ModulatorLayer` per layer.
+
+        Args:
+            num_heads, num_kv_heads, head_dim: of the cross-attention; `head_dim` defaults to the backbone's.
+            exact_identity: start as the memoryless policy to the bit; as released (False) it starts near it.
+        """
+        super().__init__(backbone)
+        self.memory_width = backbone.action.width
+        sizes = (self.memory_width, num_heads, num_kv_heads, head_dim or backbone.head_dim, exact_identity)
+        self.layers = nn.ModuleList(ModulatorLayer(*sizes) for _ in range(backbone.depth))
+
+    def hook(self, memory: MemoryTokens | None) -> Hook:
+        memory = required(memory)
+        tokens = memory.tokens.to(compute_dtype(memory.tokens))
+        cached = [layer.keys_values(tokens) for layer in self.layers]  # type: ignore[operator]
+        mask = additive_mask(memory.mask[:, None], tokens.dtype)  # b 1 1 m: every action sees the same keys
+        return lambda layer, x: self.layers[layer](x, *cached[layer], mask)
+
+
+def _positions(start: int, x: Tensor) -> Tensor:
+    return torch.arange(start, start + x.shape[1], device=x.device)[None]

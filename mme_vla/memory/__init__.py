@@ -1,0 +1,8 @@
+"""Memories: each chooses stored vision tokens and encodes them into at most `budget` memory tokens.
+
+Importing this room registers the memories it ships.
+"""
+
+from mme_vla.memory import framesamp, tokendrop
+
+__all__ = ["framesamp", "tokendrop"]

@@ -1,0 +1,86 @@
+"""`MemoryModule`: choose stored tokens, then encode them into at most `budget` memory tokens."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mme_vla.memory.history import FrameScorer, History, StorageSpec
+from mme_vla.types import GRID, HistoryTokens, MemoryTokens
+
+
+class MemoryModule(nn.Module):
+    """The interface of every neural memory.
+
+    A subclass sets, before use:
+        budget: most memory tokens it may hand over.
+        capacity: length to which its selections are padded (`budget` unless the encoder reads more than it writes).
+        storage: what has to be stored of each frame.
+        pad_left: True puts the padding before the tokens (recurrent memories), False after them.
+
+    and implements `select` and `forward`.
+    """
+
+    budget: int
+    capacity: int
+    storage: StorageSpec
+    pad_left: bool = False
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        """Say which stored tokens step `step` remembers.
+
+        Cheap, on the CPU, and the same code offline and online. Nothing later than `step` may decide.
+
+        Args:
+            history: the episode so far (offline: possibly longer than `step`).
+            step: index of the current frame, video included.
+            rng: randomness for training-time jitter; None where the choice must be reproducible.
+
+        Returns:
+            int64 [n, 2] of (frame, patch) in time order, n ≤ `capacity`.
+        """
+        raise NotImplementedError
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        """Encode the selection [b, capacity, d_vision] into memory tokens [b, budget, d]."""
+        raise NotImplementedError
+
+    def make_scorer(self) -> FrameScorer | None:
+        """Return a fresh scorer for one episode, or None when frames need no scores."""
+        return None
+
+    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        """Select, gather and pad: the unbatched tokens of one step ([capacity, …]), ready to be stacked."""
+        indices = self.select(history, step, rng)
+        if len(indices) > self.capacity:
+            raise ValueError(f"{type(self).__name__}.select returned {len(indices)} tokens; at most {self.capacity}.")
+        features = history.gather(indices)
+        positions = torch.from_numpy(token_positions(indices, self.storage.grid)).to(features.device)
+        missing = self.capacity - len(indices)
+        before, after = (missing, 0) if self.pad_left else (0, missing)
+        mask = torch.ones(len(indices), dtype=torch.bool, device=features.device)
+        return HistoryTokens(
+            features=nn.functional.pad(features, (0, 0, before, after)),
+            positions=nn.functional.pad(positions, (0, 0, before, after)),
+            mask=nn.functional.pad(mask, (before, after)),
+        )
+
+
+def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
+    """(frame, patch) [n, 2] → (frame, row, column) [n, 3] float32, rows and columns at patch centres in grid lines.
+
+    An 8×8 patch y sits at 2y + 1, a 4×4 patch at 4y + 2 (policy.md, 5.2).
+    """
+    frame, patch = indices[:, 0], indices[:, 1]
+    cell = GRID / grid
+    return np.stack([frame, (patch // grid + 0.5) * cell, (patch % grid + 0.5) * cell], axis=1).astype(np.float32)
+
+
+def stack_history(items: Sequence[HistoryTokens], device: torch.device | None = None) -> HistoryTokens:
+    """Stack unbatched selections into one batch [b, capacity, …]."""
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([getattr(item, name) for item in items]).to(device)
+
+    return HistoryTokens(stack("features"), stack("positions"), stack("mask"))

@@ -1,0 +1,40 @@
+"""FrameSamp: whole frames, evenly spaced over video and execution alike (paper, section 4.2)."""
+
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.registry import MEMORIES
+
+
+def evenly_spaced_frames(step: int, count: int) -> np.ndarray:
+    """Frames 0 … `step`: all of them while they fit in `count`, else `count` evenly spaced ones, both ends included."""
+    return np.arange(step + 1) if step < count else np.linspace(0, step, count).astype(np.int64)
+
+
+@MEMORIES.register("framesamp")
+class FrameSamp(PerceptualMemory):
+    """budget / grid² frames of grid×grid tokens each: 32 frames of 16 tokens as released."""
+
+    def __init__(
+        self, d_vision: int, width: int, budget: int = 512, grid: int = 4, pooling: str = "mean", **encoder: Any
+    ):
+        """See `PerceptualMemory`; `grid` is the side of a remembered frame's token grid.
+
+        Raises:
+            UserError: the budget is not a whole number of frames.
+        """
+        if budget % grid**2 or budget < grid**2:
+            raise UserError(
+                f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
+                f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}."
+            )
+        super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
+        self.frames = budget // grid**2
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        frames, patches = evenly_spaced_frames(step, self.frames), np.arange(self.storage.grid**2)
+        return np.stack(np.meshgrid(frames, patches, indexing="ij"), axis=-1).reshape(-1, 2)

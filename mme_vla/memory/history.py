@@ -1,0 +1,198 @@
+"""The history store: one episode's pooled vision tokens, grown online or read from the cache.
+
+Both forms answer the same three questions: which frames are there (`len`), what did the scorer say of them
+(`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory cannot tell them apart.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+
+
+@dataclass(frozen=True)
+class StorageSpec:
+    """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
+
+    grid: side of the pooled token grid (16×16 tokens are pooled to grid×grid before they are stored).
+    pooling: `mean` (as released) or `max` (paper, section 4.2).
+    keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
+    scorer: name of the frame scorer whose rows are stored beside the tokens; empty for none.
+    """
+
+    grid: int
+    pooling: str = "mean"
+    keep_every: int = 1
+    scorer: str = ""
+
+    def keeps(self, frame: int) -> bool:
+        """Whether tokens of this frame are stored."""
+        return frame == 0 or (frame + 1) % self.keep_every == 0
+
+    def kept_frames(self, length: int) -> np.ndarray:
+        """Ascending indices of the stored frames among the first `length`."""
+        frames = np.arange(length)
+        return frames[(frames == 0) | ((frames + 1) % self.keep_every == 0)]
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class FrameScorer(Protocol):
+    """Scores raw frames as they pass, for memories that choose by content. One instance per episode."""
+
+    def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
+        """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²] or None."""
+        ...
+
+
+@dataclass
+class FrameScores:
+    """Rows a scorer gave: `frames` [m] ascending, `values` [m, patches] float32."""
+
+    frames: np.ndarray
+    values: np.ndarray
+
+    @classmethod
+    def empty(cls, patches: int) -> "FrameScores":
+        return cls(np.zeros(0, np.int64), np.zeros((0, patches), np.float32))
+
+    def until(self, step: int) -> "FrameScores":
+        """Return only the rows of frames ≤ `step`."""
+        count = int(np.searchsorted(self.frames, step, side="right"))
+        return FrameScores(self.frames[:count], self.values[:count])
+
+
+class History:
+    """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video)."""
+
+    def __init__(self, spec: StorageSpec, exec_start: int = 0) -> None:
+        self.spec = spec
+        self.exec_start = exec_start
+
+    def __len__(self) -> int:
+        """Number of frames seen, kept or not."""
+        raise NotImplementedError
+
+    @property
+    def scores(self) -> FrameScores:
+        raise NotImplementedError
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch).
+
+        Raises:
+            UserError: a frame lies beyond the history or was not kept.
+        """
+        raise NotImplementedError
+
+    def _row_of(self, frames: np.ndarray, kept: np.ndarray) -> np.ndarray:
+        rows = np.minimum(np.searchsorted(kept, frames), max(len(kept) - 1, 0))
+        if len(frames) and (len(kept) == 0 or (kept[rows] != frames).any()):
+            lost = sorted(set(np.asarray(frames).tolist()) - set(kept.tolist()))
+            raise UserError(
+                f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames and keeps frame 0 "
+                f"and every {self.spec.keep_every}th. The memory selects frames that its StorageSpec does not keep."
+            )
+        return rows
+
+
+class CachedHistory(History):
+    """Tokens read from disk: only the rows a selection names are touched.
+
+    tokens: array-like [kept, patches, d_vision] (usually a memory map); bfloat16 is stored as its uint16 bits.
+    """
+
+    def __init__(
+        self,
+        spec: StorageSpec,
+        tokens: np.ndarray,
+        kept: np.ndarray,
+        length: int,
+        scores: FrameScores | None = None,
+        exec_start: int = 0,
+    ) -> None:
+        super().__init__(spec, exec_start)
+        self._tokens, self._kept, self._length = tokens, kept, length
+        self._scores = scores if scores is not None else FrameScores.empty(spec.grid**2)
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def scores(self) -> FrameScores:
+        return self._scores
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        rows = self._row_of(indices[:, 0], self._kept)
+        picked = torch.from_numpy(np.ascontiguousarray(self._tokens[rows, indices[:, 1]]))
+        return picked.view(torch.bfloat16) if picked.dtype == torch.uint16 else picked
+
+
+class OnlineHistory(History):
+    """Tokens appended as the episode goes, in storage that doubles when it is full.
+
+    Tokens stay on the device that encoded them; scores are numbers on the CPU.
+    """
+
+    def __init__(self, spec: StorageSpec, scorer: FrameScorer | None = None, exec_start: int = 0) -> None:
+        super().__init__(spec, exec_start)
+        self._scorer = scorer
+        self._length = 0
+        self._kept: list[int] = []
+        self._tokens: Tensor | None = None
+        self._score_frames: list[int] = []
+        self._score_values: list[np.ndarray] = []
+
+    def __len__(self) -> int:
+        return self._length
+
+    @property
+    def scores(self) -> FrameScores:
+        if not self._score_frames:
+            return FrameScores.empty(self.spec.grid**2)
+        return FrameScores(np.asarray(self._score_frames, np.int64), np.stack(self._score_values))
+
+    def wanted(self, count: int) -> np.ndarray:
+        """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`."""
+        kept = self.spec.kept_frames(self._length + count)
+        return kept[kept >= self._length] - self._length
+
+    def append(self, frames: Sequence[np.ndarray] | np.ndarray, tokens: Tensor) -> None:
+        """Add frames [t, H, W, 3] uint8 in order, with the tokens [wanted, patches, d_vision] of the wanted ones."""
+        wanted = self.wanted(len(frames))
+        if len(tokens) != len(wanted):
+            raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
+        if self._scorer is not None:
+            for offset, frame in enumerate(frames):
+                values = self._scorer(self._length + offset, frame)
+                if values is not None:
+                    self._score_frames.append(self._length + offset)
+                    self._score_values.append(np.asarray(values, np.float32))
+        if len(tokens):
+            self._grow(len(self._kept) + len(tokens), tokens)
+            assert self._tokens is not None
+            self._tokens[len(self._kept) : len(self._kept) + len(tokens)] = tokens
+            self._kept.extend((wanted + self._length).tolist())
+        self._length += len(frames)
+
+    def _grow(self, needed: int, like: Tensor) -> None:
+        capacity = 0 if self._tokens is None else len(self._tokens)
+        if needed <= capacity:
+            return
+        grown = like.new_empty((max(needed, 2 * capacity, 16), *like.shape[1:]))
+        if self._tokens is not None:
+            grown[: len(self._kept)] = self._tokens[: len(self._kept)]
+        self._tokens = grown
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        if self._tokens is None:
+            raise UserError("The history is empty: observe at least one frame before acting.")
+        rows = self._row_of(indices[:, 0], np.asarray(self._kept, np.int64))
+        device = self._tokens.device
+        return self._tokens[torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)]

@@ -1,0 +1,16 @@
+"""The released (JAX) names of the memories' tensors."""
+
+from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.naming import NameTable, linear, prefixed
+
+ENCODER = "mem_encoder/feature_encoder"
+
+
+def released_names(memory: MemoryModule) -> NameTable | None:
+    """The table of a memory, or None where no released checkpoint has one (a memory of one's own)."""
+    if isinstance(memory, PerceptualMemory):
+        return prefixed("encoder.position", linear(f"{ENCODER}/pos_proj")) | prefixed(
+            "encoder.project", linear(f"{ENCODER}/encoder_static")
+        )
+    return None

@@ -1,0 +1,108 @@
+"""TokenDrop: the first frame whole, then the patches that changed most (paper, section 4.2)."""
+
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.memory.history import FrameScores, History, StorageSpec
+from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.registry import MEMORIES
+
+FIRST_FRAME_SCORE = 1000.0  # above any change, so that the first frame always stays
+THRESHOLD = 1e-4  # patches that changed less are never candidates
+
+
+class ChangeScorer:
+    """Mean |ΔRGB| per patch, in units of [−1, 1], between every `stride`-th frame and the one scored before it.
+
+    Frames stride−1, 2·stride−1, … are scored; the first of them against frame 0, as released.
+    """
+
+    def __init__(self, grid: int, stride: int) -> None:
+        self.grid, self.stride = grid, stride
+        self._reference: np.ndarray | None = None
+
+    def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
+        """Score one frame [H, W, 3] uint8, or keep it as a reference.
+
+        Raises:
+            UserError: the frame does not divide into grid×grid patches.
+        """
+        if frame_index and (frame_index + 1) % self.stride:
+            return None
+        height, width, _ = frame.shape
+        if height % self.grid or width % self.grid:
+            raise UserError(f"A {height}×{width} frame does not divide into {self.grid}×{self.grid} patches.")
+        image = frame.astype(np.float32) / 255 * 2 - 1
+        reference, self._reference = self._reference, image
+        if reference is None or frame_index == 0:
+            # A stride of 1 scores frame 0 too, against itself: no patch passes the threshold.
+            return None
+        change = np.abs(image - reference)
+        cells = change.reshape(self.grid, height // self.grid, self.grid, width // self.grid, 3)
+        return cells.mean(axis=(1, 3, 4), dtype=np.float32).reshape(-1)
+
+
+@MEMORIES.register("tokendrop")
+class TokenDrop(PerceptualMemory):
+    """The `budget` highest-scored patches up to now, the first frame's among them, in time order."""
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        budget: int = 512,
+        grid: int = 8,
+        pooling: str = "mean",
+        stride: int = 8,
+        candidates: int = 2048,
+        causal: bool = True,
+        **encoder: Any,
+    ) -> None:
+        """See `PerceptualMemory`.
+
+        Args:
+            grid: side of a frame's token grid. stride: frames between two scored ones.
+            candidates: length of the list of best patches that is kept along an episode.
+            causal: only frames up to the current one compete for that list. False lets the whole episode compete,
+                as the released offline preprocessing does; it needs a finished episode.
+
+        Raises:
+            UserError: the budget does not hold the first frame, or exceeds the candidates.
+        """
+        if not grid**2 <= budget <= candidates:
+            raise UserError(
+                f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "
+                f"memory.candidates={candidates} (the patches a running list holds)."
+            )
+        storage = StorageSpec(grid, pooling, keep_every=stride, scorer=f"change{grid}x{grid}-every{stride}")
+        super().__init__(d_vision, width, budget, storage, **encoder)
+        self.stride, self.candidates, self.causal = stride, candidates, causal
+
+    def make_scorer(self) -> ChangeScorer:
+        return ChangeScorer(self.storage.grid, self.stride)
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        scores = history.scores.until(step) if self.causal else history.scores
+        return most_changed(ranked_patches(scores, self.storage.grid**2, self.candidates), step, self.budget)
+
+
+def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
+    """The best `limit` candidates as (frame, patch) [n, 2], ascending by (score, frame, patch).
+
+    This is what a heap of that size holds after all frames have passed; the first frame's patches rank highest.
+    """
+    changed = scores.values >= THRESHOLD
+    row, patch = np.nonzero(changed)
+    frame = np.concatenate([np.zeros(patches, np.int64), scores.frames[row]])
+    patch = np.concatenate([np.arange(patches), patch])
+    score = np.concatenate([np.full(patches, FIRST_FRAME_SCORE, np.float32), scores.values[changed]])
+    order = np.lexsort((patch, frame, score))[-limit:]
+    return np.stack([frame[order], patch[order]], axis=1)
+
+
+def most_changed(ranked: np.ndarray, step: int, budget: int) -> np.ndarray:
+    """The last `budget` of the ranked patches that lie no later than `step`, in time order."""
+    chosen = ranked[ranked[:, 0] <= step][-budget:]
+    return chosen[np.lexsort((chosen[:, 1], chosen[:, 0]))]

@@ -1,0 +1,116 @@
+"""Name tables: how a foreign checkpoint names and lays out our tensors, written once and read in both directions.
+
+A room supplies a table for its own modules; an adapter in `weights/` applies the tables to whole checkpoints.
+"""
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import torch
+from einops import rearrange
+from torch import Tensor
+
+from mme_vla.errors import UserError
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some rows of one of our tensors, as they lie in a foreign one.
+
+    path: the foreign name.
+    pattern: einops pattern from theirs to ours; empty where they are the same.
+    axes: sizes of the pattern's grouped axes, which the way back needs.
+    layer: index in the foreign tensor's leading layer axis, if it has one.
+    """
+
+    path: str
+    pattern: str = ""
+    axes: Mapping[str, int] = field(default_factory=dict)
+    layer: int | None = None
+
+    def to_ours(self, theirs: Tensor) -> Tensor:
+        if self.layer is not None:
+            theirs = theirs[self.layer]
+        return rearrange(theirs, self.pattern, **self.axes) if self.pattern else theirs
+
+    def to_theirs(self, ours: Tensor) -> Tensor:
+        if not self.pattern:
+            return ours
+        left, right = self.pattern.split("->")
+        return rearrange(ours, f"{right} -> {left}", **self.axes)
+
+    def rows(self) -> int:
+        """How many rows of our tensor this piece fills; asked only where several pieces share one."""
+        first = self.pattern.split("->")[1].strip().split(")")[0].strip("( ").split()
+        return math.prod(self.axes[axis] for axis in first)
+
+
+NameTable = dict[str, list[Piece]]
+"""Our parameter name → the pieces that make it, in order of rows."""
+
+
+@dataclass(frozen=True)
+class Unread:
+    """A foreign tensor, or one layer of it, that no action reads: dropped when read, zeros when written."""
+
+    path: str
+    shape: tuple[int, ...]
+    layer: int | None = None
+
+
+def prefixed(prefix: str, table: NameTable) -> NameTable:
+    """Return the table of a module that sits at `prefix` in its parent."""
+    return {f"{prefix}.{name}": pieces for name, pieces in table.items()}
+
+
+def linear(path: str, *, layer: int | None = None, bias: bool = True) -> NameTable:
+    """A linear layer stored as kernel (in, out), with its bias."""
+    table: NameTable = {"weight": [Piece(f"{path}/kernel", "i o -> o i", layer=layer)]}
+    if bias:
+        table["bias"] = [Piece(f"{path}/bias", layer=layer)]
+    return table
+
+
+def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Translate a foreign checkpoint into our names and layouts.
+
+    Raises:
+        UserError: tensors that the table names are missing; all are listed.
+    """
+    missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
+    if missing:
+        raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {', '.join(missing)}")
+    ours = {}
+    for name, pieces in table.items():
+        try:
+            parts = [piece.to_ours(source[piece.path]) for piece in pieces]
+        except (RuntimeError, IndexError, ValueError) as error:
+            shapes = {piece.path: tuple(source[piece.path].shape) for piece in pieces}
+            raise UserError(f"{name} cannot be made of {shapes}: {error}") from error
+        ours[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
+    return ours
+
+
+def write(table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Translate our tensors into the foreign names and layouts; what no action reads is written as zeros."""
+    layers: dict[str, dict[int, Tensor]] = defaultdict(dict)
+    theirs: dict[str, Tensor] = {}
+
+    def put(path: str, layer: int | None, tensor: Tensor) -> None:
+        if layer is None:
+            theirs[path] = tensor.contiguous()
+        else:
+            layers[path][layer] = tensor
+
+    example = next(iter(ours.values()))
+    for name, pieces in table.items():
+        parts = ours[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [ours[name]]
+        for piece, part in zip(pieces, parts, strict=True):
+            put(piece.path, piece.layer, piece.to_theirs(part))
+    for gap in unread:
+        put(gap.path, gap.layer, example.new_zeros(gap.shape))
+    for path, by_layer in layers.items():
+        theirs[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
+    return theirs

@@ -1,0 +1,100 @@
+"""The containers everyone shares.
+
+One legend for shapes, used in the whole library:
+
+b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l prompt length
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+from torch import Tensor
+
+GRID = 16
+"""Side of a view's token grid; memories pool it, and token positions count in its lines."""
+
+VIEWS = ("image", "wrist_image")
+"""The two cameras of RoboMME, front and wrist; the front view feeds memory."""
+
+
+class TensorStruct:
+    """A dataclass of tensors (or nested structs, or None) that moves between devices as one."""
+
+    def _map(self, fn: Any) -> Self:
+        moved = {}
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                moved[field.name] = fn(value)
+            elif isinstance(value, TensorStruct):
+                moved[field.name] = value._map(fn)
+            else:
+                moved[field.name] = value
+        return type(self)(**moved)
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Return a copy whose tensors went through `Tensor.to` with these arguments."""
+        return self._map(lambda x: x.to(*args, **kwargs))
+
+    def pin_memory(self) -> Self:
+        """Return a copy in page-locked memory (what `DataLoader(pin_memory=True)` calls)."""
+        return self._map(lambda x: x.pin_memory())
+
+    def tensors(self) -> Iterator[Tensor]:
+        """Yield every tensor, nested ones included."""
+        for field in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                yield value
+            elif isinstance(value, TensorStruct):
+                yield from value.tensors()
+
+
+@dataclass
+class HistoryTokens(TensorStruct):
+    """Selected past vision tokens, zero-padded.
+
+    features: [b, n, d_vision]; pooled vision tokens.
+    positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's first,
+        video included, the rest patch centres in units of the 16×16 grid's lines.
+    mask: [b, n] bool; False on padding.
+    """
+
+    features: Tensor
+    positions: Tensor
+    mask: Tensor
+
+
+@dataclass
+class MemoryTokens(TensorStruct):
+    """What every neural memory hands over: at most `budget` valid tokens.
+
+    tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is undefined.
+    """
+
+    tokens: Tensor
+    mask: Tensor
+
+
+@dataclass
+class Batch(TensorStruct):
+    """What the network reads, and for training what it should answer.
+
+    images: [b, v, 3, s, s] uint8; the views at the vision tower's resolution, base camera first.
+    image_mask: [b, v] bool; False hides a view.
+    prompt: [b, l] int64 token ids; prompt_mask: [b, l] bool.
+    history: the memory's selection, None for a policy without memory.
+    actions: [b, h, a]; normalised, padded chunk. None when sampling.
+    action_mask: [b, h] bool; steps that count in the loss. None counts all.
+    state: [b, 8]; raw joint state, never read by the network: it anchors the joint deltas.
+    """
+
+    images: Tensor
+    image_mask: Tensor
+    prompt: Tensor
+    prompt_mask: Tensor
+    history: HistoryTokens | None = None
+    actions: Tensor | None = None
+    action_mask: Tensor | None = None
+    state: Tensor | None = None

@@ -1,0 +1,33 @@
+"""Fixtures that find the data beside the repository, and skip clearly where it is absent."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def _folder(variable: str, default: Path, what: str) -> Path:
+    folder = Path(os.environ.get(variable, default))
+    if not folder.is_dir():
+        pytest.skip(f"{what} not found at {folder}; set {variable} to a folder of that layout to run this test")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder with specifications and reference data that developers have beside the repository."""
+    return _folder("MME_VLA_SHARED", REPOSITORY.parent / "shared", "reference data")
+
+
+@pytest.fixture(scope="session")
+def parity() -> Path:
+    """Golden inputs, parameters and outputs of the released implementation."""
+    return _folder("MME_VLA_PARITY", REPOSITORY.parent / "shared" / "parity", "golden parity data")
+
+
+@pytest.fixture(scope="session")
+def h5_folder() -> Path:
+    """Official demonstration files, record_dataset_<Task>.h5."""
+    return _folder("MME_VLA_ROBOMME_H5", REPOSITORY.parent / "shared" / "robomme_h5", "RoboMME HDF5 episodes")

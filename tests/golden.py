@@ -1,0 +1,107 @@
+"""Golden cases of the released implementation: files, and policies built to their sizes with their parameters."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig, VisionConfig
+from mme_vla.policy import MMEPolicy
+from mme_vla.types import Batch, MemoryTokens
+from mme_vla.weights.released import from_released
+
+MEMORY = {"frame_sampling": "framesamp", "token_dropping": "tokendrop"}
+INTEGRATION = {"context": "context", "modulation": "modulator", "expert": "expert"}
+
+
+def load(folder: Path, name: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors and description of one golden file."""
+    return load_file(folder / f"{name}.safetensors"), json.loads((folder / f"{name}.json").read_text())
+
+
+def params(tensors: dict[str, Tensor], prefix: str = "") -> dict[str, Tensor]:
+    """The released parameters of a golden file, optionally under a further prefix."""
+    return {prefix + key.removeprefix("params/"): value for key, value in tensors.items() if key.startswith("params/")}
+
+
+def vision_config(sizes: dict[str, Any], resolution: int) -> VisionConfig:
+    keys = {"width": "width", "depth": "depth", "mlp_dim": "mlp_dim", "num_heads": "num_heads", "patch_size": "patch"}
+    return VisionConfig(image_size=resolution, **{ours: sizes[theirs] for ours, theirs in keys.items()})
+
+
+def config(about: dict[str, Any]) -> dict[str, Any]:
+    """The policy configuration of a golden model, every dimension from its description."""
+    vlm, action, history = about["vlm_expert"], about["action_expert"], about.get("history_config") or {}
+    backbone = BackboneConfig(
+        vision=vision_config(about["siglip"], about["image_resolution"]),
+        vlm=ExpertConfig(vlm["width"], vlm["mlp_dim"]),
+        action=ExpertConfig(action["width"], action["mlp_dim"]),
+        **{key: vlm[key] for key in ("depth", "num_heads", "num_kv_heads", "head_dim")},
+        vocab_size=about["vocab_size"],
+        action_dim=about["action_dim"],
+        horizon=about["action_horizon"],
+    )
+    sections: dict[str, Any] = {"backbone": {"name": "pi05", **vars(backbone)}, "policy": {"augment": False}}
+    if history.get("representation_type") != "perceptual":
+        return sections
+    feature = history["memory_feature"]
+    sections["memory"] = {
+        "name": MEMORY[history["perceptual_memory"]["type"]],
+        "budget": history["budget"],
+        "grid": round(history["token_per_image"] ** 0.5),
+        "position_dim": feature["pos"]["input_dim"],
+        "position_hidden": feature["pos"]["hidden_dim"],
+    }
+    kind = INTEGRATION[history["integration_type"]]
+    sections["integration"] = {"name": kind}
+    if kind == "expert":
+        sections["integration"] |= {key: about["memory_expert"][key] for key in ("width", "mlp_dim")}
+    if kind == "modulator":
+        sections["integration"] |= {key: about["modulator"][key] for key in ("num_heads", "num_kv_heads", "head_dim")}
+    return sections
+
+
+def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
+    """A golden model, its parameters read through the adapter for released trees."""
+    sections = config(about)
+    built = MMEPolicy.from_config(sections)
+    history = about.get("history_config") or {}
+    if built.memory is not None:
+        # The golden features are narrower than the tower's tokens: the memory's width of a vision token is its own.
+        from mme_vla.registry import MEMORIES
+
+        options = {k: v for k, v in sections["memory"].items() if k != "name"}
+        built.memory = MEMORIES[sections["memory"]["name"]](
+            d_vision=history["memory_feature"]["img"]["input_dim"], width=built.integration.memory_width, **options
+        )
+    return from_released(built, params(tensors)).eval()
+
+
+def batch(tensors: dict[str, Tensor]) -> Batch:
+    """The golden inputs as a batch (without history: golden memories come with ready-made position features)."""
+    cameras = ("base_0_rgb", "left_wrist_0_rgb")
+    return Batch(
+        images=torch.stack([tensors[f"in/image/{c}"] for c in cameras], 1).permute(0, 1, 4, 2, 3),
+        image_mask=torch.stack([tensors[f"in/image_mask/{c}"] for c in cameras], 1),
+        prompt=tensors["in/tokenized_prompt"].long(),
+        prompt_mask=tensors["in/tokenized_prompt_mask"],
+        actions=tensors["in/actions"],
+    )
+
+
+def memory_tokens(policy: MMEPolicy, tensors: dict[str, Tensor]) -> MemoryTokens | None:
+    """Encode the golden memory inputs."""
+    if policy.memory is None:
+        return None
+    encoder: Any = policy.memory.encoder
+    tokens = encoder.encode(tensors["in/static_image_emb"], tensors["in/static_pos_emb"])
+    return MemoryTokens(tokens, tensors["in/static_mask"])
+
+
+def error(ours: Tensor, golden: Tensor) -> float:
+    """Largest absolute difference."""
+    assert ours.shape == golden.shape, (ours.shape, golden.shape)
+    return float((ours.double() - golden.double()).abs().max())
