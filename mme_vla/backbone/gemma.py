@@ -5,7 +5,7 @@ b batch · n tokens · d an expert's width · N query heads · K key heads · h 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -205,10 +205,9 @@ class JointTransformer(nn.Module):
         """Compute every layer's modulation for conditions [m, c] at once: the weights are read once, not m times."""
         layers = []
         for block in self.layers:
-            layer = block.experts[self.answering]  # type: ignore[union-attr, index]
-            layers.append(
-                LayerModulation(layer.attention_norm.modulation(condition), layer.mlp_norm.modulation(condition))  # type: ignore[operator, union-attr]
-            )
+            layer: Any = block.experts[self.answering]  # type: ignore[index]
+            norms = (layer.attention_norm, layer.mlp_norm)
+            layers.append(LayerModulation(*(norm.modulation(condition) for norm in norms)))
         return Conditioning(layers, self.final_norm.modulation(condition))
 
     def forward(

@@ -12,8 +12,7 @@ EPS = 1e-6
 
 def rms_normalise(x: Tensor) -> Tensor:
     """Return x / √(mean(x²) + ε) over the last axis, in float32."""
-    x = x.float()
-    return x * torch.rsqrt(x.square().mean(-1, keepdim=True) + EPS)
+    return nn.functional.rms_norm(x.float(), x.shape[-1:], eps=EPS)
 
 
 class RMSNorm(nn.Module):

@@ -1,6 +1,7 @@
 """SigLIP: timm's vision transformer, which computes the same function, with the released model's dtype rules."""
 
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -34,12 +35,12 @@ class VisionTower(nn.Module):
         )
 
     def forward(self, images: Tensor) -> Tensor:
-        vit = self.vit
+        vit: Any = self.vit
+        convolution = vit.patch_embed.proj
+        # Patches and positions in float32, as released; then the compute dtype.
         with torch.autocast(images.device.type if images.device.type != "meta" else "cpu", enabled=False):
-            patches = nn.functional.conv2d(
-                images.float(), vit.patch_embed.proj.weight.float(), vit.patch_embed.proj.bias.float(),
-                stride=vit.patch_embed.proj.stride,
-            )  # fmt: skip
+            weight, bias = convolution.weight.float(), convolution.bias.float()
+            patches = nn.functional.conv2d(images.float(), weight, bias, stride=convolution.stride)
             x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)

@@ -1,0 +1,113 @@
+"""What a failed composition means in terms of the YAML tree: the near names, and values of the wrong kind."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import hydra
+import yaml
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException, MissingConfigException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from mme_vla.errors import UserError, did_you_mean
+
+COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError)
+_BAD_KEY = re.compile(r"Could not override '(.+)'\.\n|Could not delete from config\. '(.+)' does not exist")
+
+
+class ConfigTree:
+    """The tree under the user's choices of groups, before any of their values. Needs an initialised Hydra."""
+
+    def __init__(self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override]) -> None:
+        self.loader = loader
+        self.config_name = config_name
+        self.choices = [o for o in overrides if loader.get_group_options(o.key_or_group)]
+        self.values = [o for o in overrides if o not in self.choices]
+
+    def defaults(self) -> Any:
+        """Compose with the group choices alone, as plain containers."""
+        return OmegaConf.to_container(hydra.compose(self.config_name, [str(o.input_line) for o in self.choices]))
+
+    def explain(self, error: Exception) -> str:
+        """Say what was misspelt, with the near names; Hydra's own words where nothing was."""
+        if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+            group, _, name = error.missing_cfg_file.rpartition("/")
+            options = error.options or [n for n in self.loader.get_group_options(group) if not n.startswith("_")]
+            return f"Unknown {group or 'config'} {name!r}. {did_you_mean(name, options)}"
+        for choice in self.choices:
+            if not isinstance(choice.value(), str | list | None):
+                options = self.loader.get_group_options(choice.key_or_group)
+                return f"{choice.input_line!r} names no config of the group. Known: {', '.join(options)}."
+        if isinstance(error, yaml.YAMLError):
+            return f"Cannot read a config file: {error}"
+        text = str(error) or str(error.__cause__)
+        unknown = _BAD_KEY.match(text)
+        key = (unknown[1] or unknown[2]) if unknown else ""
+        if not key or key.startswith("hydra."):
+            return text
+        # Keys are set after the choices were composed, so these do compose.
+        return _unknown_key(key, self.defaults(), self.loader.list_groups(""))
+
+    def check_kinds(self) -> None:
+        """Refuse a value that cannot stand for the default: text for a number, a value for a section.
+
+        Raises:
+            UserError: naming the override and what was expected.
+        """
+        defaults = self.defaults() if self.values else {}
+        for override in self.values:
+            default = _select(defaults, override.key_or_group)
+            given = override.value()
+            expected = _expected(default, given)
+            if expected and not override.is_delete():
+                raise UserError(f"{override.input_line!r} does not fit: {override.key_or_group!r} is {expected}.")
+
+
+def _expected(default: Any, given: Any) -> str:
+    """What `default` asks for where `given` is of another kind; empty where it may pass."""
+    if given is None or default is None or (isinstance(given, str) and "${" in given):
+        return ""
+    if isinstance(default, Mapping) and not isinstance(given, Mapping):
+        return f"a section with the keys {', '.join(map(str, default)) or '(none)'}"
+    if isinstance(default, bool):
+        return "" if isinstance(given, bool) else "true or false"
+    if isinstance(default, int | float) and isinstance(given, str | bool | Mapping):
+        return f"a number (default {default})"
+    return ""
+
+
+def _select(tree: Any, key: str) -> Any:
+    for part in key.split("."):
+        if not isinstance(tree, Mapping):
+            return None
+        tree = tree.get(part)
+    return tree
+
+
+def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
+    """Walk down `key` as far as it exists and name what is near there, or the same word elsewhere in the tree."""
+    section, parents, rest = defaults, [], key.split(".")
+    while len(rest) > 1 and isinstance(section, Mapping) and rest[0] in section:
+        parents.append(rest[0])
+        section = section[rest.pop(0)]
+    where = ".".join(parents)
+    if where and not section:
+        return f"Unknown config key {key!r}: {where!r} has no keys under these choices."
+    if not isinstance(section, Mapping):
+        return f"Unknown config key {key!r}: {where!r} is a value ({section!r}), not a section."
+    options = {str(name) for name in section} | (set() if parents else set(groups) - {"hydra"})
+    elsewhere = [path for path in _paths(defaults) if path.split(".")[-1] == rest[0]]
+    if elsewhere:
+        return f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, elsewhere[:3]))}?"
+    within = f" In {where!r}:" if where else ""
+    return f"Unknown config key {key!r}.{within} {did_you_mean(rest[0], options)}"
+
+
+def _paths(tree: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in tree.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _paths(value, f"{prefix}{key}.")

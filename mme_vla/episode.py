@@ -1,0 +1,110 @@
+"""One running episode: all streaming state lives here, never on the policy."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.memory.history import OnlineHistory
+from mme_vla.types import VIEWS, HistoryTokens
+
+if TYPE_CHECKING:
+    from mme_vla.policy import MMEPolicy
+
+
+class Episode:
+    """What the policy knows of one episode: goal, current view and state, and the history of past frames."""
+
+    def __init__(self, policy: "MMEPolicy", goal: str, seed: int = 0) -> None:
+        self._policy = policy
+        self._generator = torch.Generator().manual_seed(seed)
+        self._images: Tensor | None = None
+        self._state: Tensor | None = None
+        self._video_over = False
+        self.goal = goal
+        self.subgoal: str | None = None
+        """The current language subgoal, for policies whose prompt has one; set it before `act`."""
+        memory = policy.memory
+        self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
+        self.frames_seen = 0
+
+    def observe(self, frames: Mapping[str, np.ndarray], states: np.ndarray, is_demo: bool | np.ndarray = False) -> None:
+        """Take frames in order, each once, the current one last; the conditioning video comes first.
+
+        Args:
+            frames: `image` and `wrist_image`, each [t, H, W, 3] uint8.
+            states: [t, 8]; seven joint angles and the first finger's position.
+            is_demo: whether the frames belong to the conditioning video; one bool, or [t].
+
+        Raises:
+            UserError: a missing view, a wrong dtype or shape, or a video frame after execution has begun.
+        """
+        front, wrist = (self._checked_view(frames, view) for view in VIEWS)
+        states = np.asarray(states, np.float32)
+        demo = np.broadcast_to(np.asarray(is_demo, bool), (len(front),))
+        if states.shape != (len(front), 8) or len(wrist) != len(front):
+            raise UserError(
+                f"observe() needs as many wrist images and 8-number states as front images: got {len(front)} front, "
+                f"{len(wrist)} wrist and states of shape {states.shape}."
+            )
+        if len(front) == 0:
+            return
+        if demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any()):
+            raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
+        if self.history is not None:
+            if not self._video_over:
+                self.history.exec_start = self.frames_seen + int(demo.sum())
+            wanted = self.history.wanted(len(front))
+            self.history.append(front, self._policy.encode_frames(front[wanted]))
+        self._video_over = self._video_over or not bool(demo[-1])
+        self.frames_seen += len(front)
+        processor = self._policy.require_processor()
+        self._images = processor.images([front[-1], wrist[-1]])
+        self._state = torch.from_numpy(states[-1].copy())
+
+    def recall(self) -> HistoryTokens:
+        """The memory's selection at the current frame, unbatched."""
+        memory, history = self._policy.memory, self.history
+        if memory is None or history is None:
+            raise UserError("This policy has no memory to recall from.")
+        self._require_observation()
+        return memory.recall(history, len(history) - 1)
+
+    @property
+    def images(self) -> Tensor:
+        """The current views [v, 3, s, s] uint8."""
+        self._require_observation()
+        assert self._images is not None
+        return self._images
+
+    @property
+    def state(self) -> Tensor:
+        """The current state [8]."""
+        self._require_observation()
+        assert self._state is not None
+        return self._state
+
+    @property
+    def prompt(self) -> tuple[Tensor, Tensor]:
+        """Token ids and mask of the goal, and the subgoal where the policy reads one."""
+        return self._policy.require_processor().prompt(self.goal, subgoal=self.subgoal, state=self._state)
+
+    def draw_noise(self) -> Tensor:
+        """The next chunk's starting noise [h, a], from this episode's own generator: batching cannot change it."""
+        config = self._policy.backbone.config
+        return torch.randn(config.horizon, config.action_dim, generator=self._generator)
+
+    def _require_observation(self) -> None:
+        if self._state is None:
+            raise UserError("The episode has seen no frame yet: call observe() with the current frame before act().")
+
+    def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
+        if view not in frames:
+            raise UserError(f"observe() needs the view {view!r}; got {sorted(frames)}.")
+        array = np.asarray(frames[view])
+        if array.ndim != 4 or array.shape[-1] != 3 or array.dtype != np.uint8:
+            raise UserError(f"View {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.")
+        return array

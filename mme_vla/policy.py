@@ -1,0 +1,320 @@
+"""`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+import mme_vla.integration
+import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
+from mme_vla.backbone import flow
+from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.gemma import Conditioning, Hook, KVCache
+from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.episode import Episode
+from mme_vla.errors import UserError
+from mme_vla.integration.base import Integration
+from mme_vla.memory.base import MemoryModule, stack_history
+from mme_vla.pretrained import assign_tensors, load_tensors, save_tensors
+from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens
+
+if TYPE_CHECKING:
+    from mme_vla.processing.processor import Processor
+
+CONFIG = "config.json"
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+class MMEPolicy(nn.Module):
+    """One composition of backbone, memory and integration.
+
+    The two independent choices meet here and nowhere else; no method asks which variant it is.
+    """
+
+    def __init__(
+        self,
+        backbone: Pi05Backbone,
+        memory: MemoryModule | None,
+        integration: Integration,
+        processor: "Processor | None" = None,
+        config: Mapping[str, Any] | None = None,
+        *,
+        compute_dtype: str = "float32",
+        history_dtype: str = "bfloat16",
+        augment: bool = True,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            processor: needed for episodes and data; the network alone runs on ready batches without it.
+            config: what `from_config` was given; saved with the weights.
+            compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
+            history_dtype: dtype of stored vision tokens; bfloat16 as released.
+            augment: augment the current views while training (memory features never are).
+        """
+        super().__init__()
+        self.backbone, self.memory, self.integration = backbone, memory, integration
+        self.processor = processor
+        self.config = dict(config or {})
+        self.compute_dtype = _dtype("compute_dtype", compute_dtype)
+        self.history_dtype = _dtype("history_dtype", history_dtype)
+        self.augment = augment
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any], processor: "Processor | None" = None) -> Self:
+        """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a registry's key.
+
+        Raises:
+            UserError: an unknown name or option, or sizes that do not fit together.
+        """
+        sizes = dict(config["backbone"])
+        backbone_cls = BACKBONES[sizes.pop("name")]
+        backbone_config = BackboneConfig.from_dict(sizes)
+        integration = _construct(INTEGRATIONS, config.get("integration"), backbone_config) or Integration(
+            backbone_config
+        )
+        backbone = backbone_cls(backbone_config, integration.extra_experts())
+        memory = _construct(
+            MEMORIES, config.get("memory"), d_vision=backbone_config.vlm.width, width=integration.memory_width
+        )
+        if (memory is None) != (integration.memory_width == 0):
+            given = "an integration without a memory" if memory is None else "a memory without an integration"
+            raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
+        return cls(backbone, memory, integration, processor, config, **config.get("policy", {}))
+
+    @property
+    def device(self) -> torch.device:
+        return self.backbone.device
+
+    def autocast(self) -> torch.autocast:
+        """The context all network code runs in."""
+        kind = self.device.type if self.device.type != "meta" else "cpu"
+        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+    # Training
+
+    def forward(
+        self,
+        batch: Batch,
+        noise: Tensor | None = None,
+        time: Tensor | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The flow-matching loss of a batch.
+
+        Args:
+            batch: with `actions`.
+            noise [b, h, a], time [b]: drawn when not given.
+            memory: memory tokens encoded beforehand; by default they are made from `batch.history`.
+
+        Returns:
+            The mean loss, and metrics to log (detached).
+        """
+        if batch.actions is None:
+            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
+        actions = batch.actions.float()
+        noise = torch.randn_like(actions) if noise is None else noise
+        if time is None:
+            time = flow.sample_time(len(actions), self.backbone.config.time_distribution, actions.device)
+        x_t, target = flow.interpolate(actions, noise, time)
+        losses = flow.step_loss(self.velocity(batch, x_t, time, memory), target)  # b h
+        if batch.action_mask is None:
+            loss = losses.mean()
+        else:
+            loss = (losses * batch.action_mask).sum() / batch.action_mask.sum().clamp(min=1)
+        return loss, {"loss": loss.detach()}
+
+    def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
+        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
+        with self.autocast():
+            memory = self.encode_memory(batch.history) if memory is None else memory
+            blocks = self.integration.blocks(self.backbone.observation_blocks(batch, self._views(batch)), memory)
+            answer, _ = self.backbone.transformer(
+                [*blocks, self.backbone.action_block(x_t)],
+                self.integration.visibility,
+                self.backbone.time_condition(time),
+                self.integration.hook(memory),
+            )
+            return self.backbone.velocity(answer)
+
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """Memory tokens of a selection, or None for a policy without memory."""
+        if self.memory is None or history is None:
+            return None
+        return self.memory(history)
+
+    def _views(self, batch: Batch) -> Tensor:
+        from mme_vla.processing.augment import augment_views
+        from mme_vla.processing.images import to_unit_range
+        from mme_vla.types import VIEWS
+
+        images = to_unit_range(batch.images)
+        return augment_views(images, VIEWS) if self.training and self.augment else images
+
+    # Sampling
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        batch: Batch,
+        noise: Tensor | None = None,
+        steps: int = 10,
+        generator: torch.Generator | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
+        """Integrate the flow from noise to a normalised chunk [b, h, a].
+
+        All that does not depend on the flow time runs once: memory, prefix keys and values, the modulator's keys and
+        values, and every layer's time modulation. A step runs the action block alone.
+        """
+        config = self.backbone.config
+        if noise is None:
+            shape = (len(batch.prompt), config.horizon, config.action_dim)
+            noise = torch.randn(shape, device=self.device, generator=generator)
+        with self.autocast():
+            prefix, hook = self.prefill(batch, memory)
+            times = flow.euler_times(steps, self.device)
+            modulations = self.backbone.transformer.conditioning(self.backbone.time_condition(times))
+            return flow.euler(noise, steps, lambda x, i: self.denoise(x, modulations.at(i), prefix, hook))
+
+    def prefill(self, batch: Batch, memory: MemoryTokens | None = None) -> tuple[KVCache, Hook | None]:
+        """Run what a chunk's steps share: keys and values of the prefix, and the memory's hook."""
+        memory = self.encode_memory(batch.history) if memory is None else memory
+        blocks = self.integration.blocks(self.backbone.observation_blocks(batch, self._views(batch)), memory)
+        _, prefix = self.backbone.transformer(blocks, self.integration.visibility, keep=True)
+        return prefix, self.integration.hook(memory)
+
+    def denoise(self, x_t: Tensor, condition: Tensor | Conditioning, prefix: KVCache, hook: Hook | None) -> Tensor:
+        """The velocity at one flow time, from the cached prefix: what one Euler step costs."""
+        answer, _ = self.backbone.transformer(
+            [self.backbone.action_block(x_t)], self.integration.visibility, condition, hook, past=prefix
+        )
+        return self.backbone.velocity(answer)
+
+    # Episodes
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode: its memory, its noise and its current view live in the returned object alone."""
+        return Episode(self, goal, seed)
+
+    def act(self, episodes: Sequence[Episode], steps: int = 10) -> np.ndarray:
+        """Choose the next chunk for many episodes in one batch, adding nothing to their memories.
+
+        Returns:
+            float32 [n, h, 8]: absolute joint targets and gripper commands.
+        """
+        if not episodes:
+            return np.zeros((0, self.backbone.config.horizon, 8), np.float32)
+        processor = self.require_processor()
+        prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
+        batch = Batch(
+            images=torch.stack([e.images for e in episodes]),
+            image_mask=torch.ones(len(episodes), len(processor.views), dtype=torch.bool),
+            prompt=torch.stack(prompts),
+            prompt_mask=torch.stack(masks),
+        )
+        batch = batch.without_prompt_padding().to(self.device)
+        if self.memory is not None:
+            batch.history = stack_history([e.recall() for e in episodes], self.device)
+        noise = torch.stack([e.draw_noise() for e in episodes]).to(self.device)
+        was_training = self.training
+        self.eval()
+        try:
+            chunk = self.sample_actions(batch, noise, steps).float().cpu()
+        finally:
+            self.train(was_training)
+        return processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy().astype(np.float32)
+
+    @torch.no_grad()
+    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
+        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
+        if self.memory is None:
+            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+        storage, encoded = self.memory.storage, []
+        for start in range(0, len(frames), batch_size):
+            images = self.require_processor().memory_images(frames[start : start + batch_size], device=self.device)
+            with self.autocast():
+                tokens = self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
+            encoded.append(tokens.to(self.history_dtype))
+        if not encoded:
+            width = self.backbone.config.vlm.width
+            return torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
+        return torch.cat(encoded)
+
+    def vision_fingerprint(self) -> str:
+        """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
+        digest = hashlib.sha256(str(self.compute_dtype).encode())
+        for name, tensor in sorted(self.backbone.vision.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def require_processor(self) -> "Processor":
+        """Return the processor, or say what it takes to have one."""
+        if self.processor is None:
+            raise UserError(
+                "This policy was built without a processor, so it can run batches but no raw data: build it with "
+                "build_policy() or load it with MMEPolicy.from_pretrained()."
+            )
+        return self.processor
+
+    # Checkpoints
+
+    def save_pretrained(self, folder: str | Path) -> None:
+        """Write weights, configuration, normalisation statistics and tokenizer; `from_pretrained` needs no more."""
+        folder = Path(folder)
+        save_tensors(self.state_dict(), folder)
+        (folder / CONFIG).write_text(json.dumps(self.config, indent=2, ensure_ascii=False) + "\n")
+        if self.processor is not None:
+            self.processor.save(folder)
+
+    @classmethod
+    def from_pretrained(cls, folder: str | Path, *, device: str | torch.device = "cpu", **policy: Any) -> Self:
+        """Load what `save_pretrained` wrote; of a training checkpoint, the EMA weights.
+
+        Args:
+            folder: a folder on disk. device: where to put the weights.
+            policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
+
+        Raises:
+            UserError: no checkpoint there, a damaged file, or weights that do not fit the configuration.
+        """
+        from mme_vla.processing.processor import Processor
+
+        folder = Path(folder)
+        if not (folder / CONFIG).is_file():
+            raise UserError(f"No policy at {folder}: expected a folder with {CONFIG}, as save_pretrained() writes.")
+        try:
+            config = json.loads((folder / CONFIG).read_text())
+        except json.JSONDecodeError as error:
+            raise UserError(f"{folder / CONFIG} is not valid JSON: {error}") from error
+        config["policy"] = {**config.get("policy", {}), **policy}
+        with torch.device("meta"):
+            loaded = cls.from_config(config)
+        assign_tensors(loaded, load_tensors(folder), str(folder))
+        loaded.processor = Processor.load(folder)
+        return loaded.to(device).eval()
+
+
+def _dtype(key: str, name: str) -> torch.dtype:
+    if name not in DTYPES:
+        raise UserError(f"policy.{key}={name!r}: choose one of {', '.join(DTYPES)}.")
+    return DTYPES[name]
+
+
+def _construct(registry: Any, section: Mapping[str, Any] | None, *args: Any, **fixed: Any) -> Any:
+    """Call the constructor a section names with the section's other keys, or return None for an empty section."""
+    if not section:
+        return None
+    options = dict(section)
+    name = options.pop("name")
+    try:
+        return registry[name](*args, **fixed, **options)
+    except TypeError as error:
+        raise UserError(f"{registry.kind} {name!r} does not take these options: {options} ({error}).") from error

@@ -1,0 +1,31 @@
+"""What stands between raw data and the network: images, normalisation, actions, prompt and tokenizer."""
+
+from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
+from mme_vla.processing.augment import augment_views
+from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
+from mme_vla.processing.normalize import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.processing.processor import Processor
+from mme_vla.processing.prompt import PROMPTS, PromptFormat, PromptInput, encode_prompt
+from mme_vla.processing.tokenizer import Tokenizer
+
+__all__ = [
+    "PROMPTS",
+    "NormStats",
+    "Processor",
+    "PromptFormat",
+    "PromptInput",
+    "QuantileStats",
+    "RunningStats",
+    "Tokenizer",
+    "as_uint8_frames",
+    "augment_views",
+    "encode_prompt",
+    "normalize",
+    "pad_width",
+    "resize_with_pad",
+    "resize_with_pad_uint8",
+    "to_absolute",
+    "to_deltas",
+    "to_unit_range",
+    "unnormalize",
+]

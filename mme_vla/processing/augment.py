@@ -1,0 +1,120 @@
+"""Training-time augmentation of the current views. Memory frames are never augmented.
+
+As released: base cameras are cropped, resized back and rotated in one resampling; then every camera's colours are
+jittered half of the time. The released saturation jitter has no effect, so there is none here.
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from mme_vla.errors import UserError
+
+CROP = 0.95  # side of the crop, rounded down to whole pixels: 212 of 224
+ROTATION = math.radians(5)
+JITTER_PROBABILITY = 0.5
+BRIGHTNESS, CONTRAST, HUE = 0.3, 0.4, 0.1
+
+
+@torch.no_grad()
+def augment_views(images: Tensor, views: Sequence[str], generator: torch.Generator | None = None) -> Tensor:
+    """Augment a batch of current observations on the device they are on.
+
+    All views of one sample share their random numbers, as released.
+
+    Args:
+        images: [b, v, 3, s, s] float in [-1, 1].
+        views: the v camera names; only those without "wrist" in their name are cropped and rotated.
+        generator: source of all randomness; None uses PyTorch's default one.
+
+    Returns:
+        [b, v, 3, s, s] float32 in [-1, 1].
+
+    Raises:
+        UserError: shape and `views` do not fit together, or the images are not square.
+    """
+    if images.ndim != 5 or images.shape[2] != 3 or images.shape[-1] != images.shape[-2]:
+        raise UserError(f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.")
+    if images.shape[1] != len(views):
+        raise UserError(f"Got {images.shape[1]} views but {len(views)} names ({', '.join(views)}).")
+    # Everything is drawn at once, so that the numbers do not depend on which cameras there are.
+    source = images.device if generator is None else generator.device
+    draws = torch.rand(len(images), 7, generator=generator, device=source).to(images.device)
+    symmetric = draws[:, :6] * 2 - 1
+    offset, angle = symmetric[:, :2], symmetric[:, 2] * ROTATION
+    brightness, contrast, hue = symmetric[:, 3:6].mul(symmetric.new_tensor([BRIGHTNESS, CONTRAST, HUE])).unbind(1)
+    jittered = draws[:, 6] < JITTER_PROBABILITY
+
+    pixels = (images.float() + 1) / 2  # in [0, 1] the zero fill of the resampling is black
+    base = [i for i, name in enumerate(views) if "wrist" not in name]
+    if base:
+        pixels[:, base] = crop_and_rotate(pixels[:, base], offset, angle)
+    coloured = jitter_colours(pixels, brightness, contrast, hue)
+    pixels = torch.where(jittered[:, None, None, None, None], coloured, pixels)
+    return pixels.clamp(0, 1) * 2 - 1
+
+
+def crop_and_rotate(pixels: Tensor, offset: Tensor, angle: Tensor) -> Tensor:
+    """Crop, resize back and rotate in one bilinear resampling, black outside.
+
+    Args:
+        pixels: [b, v, 3, s, s] in [0, 1].
+        offset: [b, 2] in [-1, 1]; where the crop lies between its extreme places, (x, y), sub-pixel.
+        angle: [b] radians.
+    """
+    batch, views, _, size, _ = pixels.shape
+    scale = int(CROP * size) / size
+    cos, sin = scale * angle.cos(), scale * angle.sin()
+    shift = (1 - scale) * offset
+    rows = torch.stack([torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)], 1)
+    grid = functional.affine_grid(rows, [batch, 1, size, size], align_corners=False)
+    stacked = pixels.flatten(1, 2)  # the views of a sample move together: as channels they share one grid
+    moved = functional.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return moved.unflatten(1, (views, 3))
+
+
+def jitter_colours(pixels: Tensor, brightness: Tensor, contrast: Tensor, hue: Tensor) -> Tensor:
+    """Change brightness and contrast of the HSV value, then turn the hue.
+
+    Args:
+        pixels: [b, v, 3, s, s] in [0, 1].
+        brightness: [b]; below 0 towards black, above 0 towards white.
+        contrast: [b] in (-1, 1); 0 changes nothing.
+        hue: [b] in turns.
+    """
+    brightness, contrast, hue = (x[:, None, None, None] for x in (brightness, contrast, hue))
+    h, s, value = _rgb_to_hsv(pixels)
+    value = torch.where(brightness < 0, value * (1 + brightness), value * (1 - brightness) + brightness)
+    # A line of slope k through the middle, continued by lines of slope 1/k that end in black and in white.
+    k = torch.tan((contrast + 1) * (math.pi / 4))
+    knee = k / (2 * (1 + k))
+    middle = k * (value - 0.5) + 0.5
+    value = torch.where(value < knee, value / k, torch.where(value > 1 - knee, (value - 1) / k + 1, middle))
+    return _hsv_to_rgb(h + hue, s, value)
+
+
+def _rgb_to_hsv(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """[b, v, 3, s, s] → hue in turns, saturation, value, each [b, v, s, s]."""
+    red, green, blue = pixels.unbind(2)
+    value, low = pixels.amax(2), pixels.amin(2)
+    chroma = value - low
+    divisor = torch.where(chroma > 0, chroma, 1.0)
+    sextant = torch.where(
+        value == red,
+        (green - blue) / divisor,
+        torch.where(value == green, (blue - red) / divisor + 2, (red - green) / divisor + 4),
+    )
+    saturation = chroma / torch.where(value > 0, value, 1.0)
+    return (sextant / 6) % 1, saturation, value
+
+
+def _hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
+    """Inverse of `_rgb_to_hsv`: each channel falls from `value` as the hue moves away from it."""
+    channels = []
+    for start in (5, 3, 1):
+        k = (start + hue * 6) % 6
+        channels.append(value * (1 - saturation * torch.minimum(k, 4 - k).clamp(0, 1)))
+    return torch.stack(channels, 2)

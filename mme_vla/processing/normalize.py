@@ -1,0 +1,211 @@
+"""Quantile normalisation of states and actions, and the running statistics it needs."""
+
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from torch import Tensor
+
+from mme_vla.errors import UserError
+
+EPSILON = 1e-6  # keeps a dimension that never moves finite
+BINS = 5000
+
+
+@dataclass(frozen=True)
+class QuantileStats:
+    """Mean, standard deviation, 1 % and 99 % quantile of each dimension; four arrays [d] of float64."""
+
+    mean: np.ndarray
+    std: np.ndarray
+    q01: np.ndarray
+    q99: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.q01)
+
+    def to_dict(self) -> dict[str, list[float]]:
+        """Return plain lists, as `norm_stats.json` holds them."""
+        return {field.name: getattr(self, field.name).tolist() for field in fields(self)}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any], name: str = "statistics") -> Self:
+        """Read what `to_dict` writes.
+
+        Raises:
+            UserError: an entry is missing, not a list of finite numbers, or of another length than the rest.
+        """
+        arrays = {}
+        for field in fields(cls):
+            if data.get(field.name) is None:
+                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {sorted(data)}.")
+            try:
+                array = np.asarray(data[field.name], dtype=np.float64)
+            except (TypeError, ValueError):
+                array = np.full(1, np.nan)
+            if array.ndim != 1 or not np.isfinite(array).all():
+                raise UserError(f"{name}.{field.name} must be a list of finite numbers, got {data[field.name]}.")
+            arrays[field.name] = array
+        if len({len(array) for array in arrays.values()}) > 1:
+            raise UserError(f"{name}: the lists have different lengths { {k: len(v) for k, v in arrays.items()} }.")
+        if (arrays["q99"] < arrays["q01"]).any():
+            raise UserError(f"{name}: q99 lies below q01 in a dimension; the statistics are damaged.")
+        return cls(**arrays)
+
+
+@dataclass(frozen=True)
+class NormStats:
+    """Statistics of the raw states, and of the action chunks after the delta transform."""
+
+    state: QuantileStats
+    actions: QuantileStats
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the layout of openpi's `norm_stats.json`."""
+        return {"norm_stats": {"state": self.state.to_dict(), "actions": self.actions.to_dict()}}
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Self:
+        """Read the layout of openpi's `norm_stats.json`.
+
+        Raises:
+            UserError: the layout is another one, or a list is missing or damaged.
+        """
+        inner = data.get("norm_stats")
+        if not isinstance(inner, dict) or not all(isinstance(inner.get(key), dict) for key in ("state", "actions")):
+            raise UserError(
+                'Normalisation statistics must look like {"norm_stats": {"state": {…}, "actions": {…}}}; '
+                f"got the keys {sorted(inner if isinstance(inner, dict) else data)}."
+            )
+        return cls(**{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")})
+
+    def save(self, path: Path | str) -> None:
+        """Write `norm_stats.json`."""
+        Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n")
+
+    @classmethod
+    def load(cls, path: Path | str) -> Self:
+        """Read `norm_stats.json`.
+
+        Raises:
+            UserError: there is no such file, or it does not hold these statistics.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise UserError(f"No normalisation statistics at {path}.")
+        try:
+            data = json.loads(path.read_text())
+        except ValueError as error:
+            raise UserError(f"{path} is not a JSON file: {error}.") from None
+        if not isinstance(data, dict):
+            raise UserError(f"{path} holds a {type(data).__name__}, not normalisation statistics.")
+        return cls.from_dict(data)
+
+
+def normalize(x: Tensor, stats: QuantileStats) -> Tensor:
+    """Map [q01, q99] to [-1, 1] in the first `len(stats)` dimensions of x [..., d]; the others pass.
+
+    Nothing is clipped.
+
+    Raises:
+        UserError: x has fewer dimensions than the statistics.
+    """
+    low, span = _range(x, stats)
+    n = len(stats)
+    out = x.clone()
+    out[..., :n] = (x[..., :n] - low) / span * 2 - 1
+    return out
+
+
+def unnormalize(x: Tensor, stats: QuantileStats) -> Tensor:
+    """Invert `normalize`."""
+    low, span = _range(x, stats)
+    n = len(stats)
+    out = x.clone()
+    out[..., :n] = (x[..., :n] + 1) / 2 * span + low
+    return out
+
+
+def _range(x: Tensor, stats: QuantileStats) -> tuple[Tensor, Tensor]:
+    if not x.is_floating_point():
+        raise UserError(f"Only floating-point values can be normalised, got {x.dtype}.")
+    if x.shape[-1] < len(stats):
+        raise UserError(f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}.")
+    low = x.new_tensor(stats.q01)
+    return low, x.new_tensor(stats.q99 - stats.q01 + EPSILON)
+
+
+class RunningStats:
+    """Mean, deviation and quantiles of a stream too long to keep, in one pass.
+
+    Quantiles come from one histogram per dimension, laid over the range seen so far. When the range grows, every old
+    bin's count moves to the new bin that holds its left edge. A quantile q is the left edge of the first bin at which
+    the cumulative count reaches q·n. All as released, so that the same data give the same `norm_stats.json`: also that
+    a first bin whose edge lies a hair outside the new range loses its count, so quantiles are approximate.
+    """
+
+    def __init__(self, bins: int = BINS) -> None:
+        self._bins = bins
+        self._count = 0
+        empty: np.ndarray = np.zeros(0)
+        self._mean = self._square = self._low = self._high = empty  # [d]
+        self._edges = self._counts = empty  # [d, bins + 1] and [d, bins]
+
+    @property
+    def count(self) -> int:
+        """How many rows went in."""
+        return self._count
+
+    def update(self, batch: np.ndarray) -> None:
+        """Add rows [..., d].
+
+        Raises:
+            UserError: values that are not finite, or another d than before.
+        """
+        rows = np.asarray(batch, dtype=np.float64)
+        rows = rows.reshape(-1, rows.shape[-1])
+        if not len(rows):
+            return
+        if not np.isfinite(rows).all():
+            raise UserError("Statistics need finite values, but the data contain NaN or infinity.")
+        low, high = rows.min(0), rows.max(0)
+        if self._count == 0:
+            self._mean, self._square = np.zeros((2, rows.shape[1]))
+            self._low, self._high = low, high
+            # A hair of room, so that a dimension that never moves still has bins.
+            self._edges = np.linspace(low - 1e-10, high + 1e-10, self._bins + 1, axis=1)
+            self._counts = np.zeros((rows.shape[1], self._bins))
+        elif rows.shape[1] != len(self._mean):
+            raise UserError(f"Rows of {rows.shape[1]} numbers cannot join statistics of {len(self._mean)}.")
+        elif (low < self._low).any() or (high > self._high).any():
+            self._low, self._high = np.minimum(low, self._low), np.maximum(high, self._high)
+            self._rebin()
+        self._count += len(rows)
+        weight = len(rows) / self._count
+        self._mean = self._mean + (rows.mean(0) - self._mean) * weight
+        self._square = self._square + ((rows**2).mean(0) - self._square) * weight
+        for edges, counts, column in zip(self._edges, self._counts, rows.T, strict=True):
+            counts += np.histogram(column, edges)[0]
+
+    def result(self) -> QuantileStats:
+        """Return the statistics of everything so far.
+
+        Raises:
+            UserError: fewer than two rows went in.
+        """
+        if self._count < 2:
+            raise UserError(f"Statistics need at least two rows, got {self._count}.")
+        std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
+        return QuantileStats(self._mean.copy(), std, self._quantile(0.01), self._quantile(0.99))
+
+    def _rebin(self) -> None:
+        edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)
+        for i, (old, new) in enumerate(zip(self._edges, edges, strict=True)):
+            self._counts[i] = np.histogram(old[:-1], new, weights=self._counts[i])[0]
+        self._edges = edges
+
+    def _quantile(self, q: float) -> np.ndarray:
+        below = self._counts.cumsum(1) < q * self._count
+        return self._edges[np.arange(len(below)), below.sum(1)]

@@ -1,0 +1,273 @@
+"""`Processor`: everything between raw data and the network, saved with every checkpoint."""
+
+import inspect
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
+from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
+from mme_vla.processing.normalize import NormStats, normalize, unnormalize
+from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt
+from mme_vla.processing.tokenizer import HUB, Tokenizer
+
+CONFIG_FILE = "processor.json"
+STATS_FILE = "norm_stats.json"
+TOKENIZER_FILE = "tokenizer.model"
+VIEWS = ("base_0_rgb", "left_wrist_0_rgb")  # π0.5's names of the front and the wrist camera
+
+
+class Processor:
+    """Turns raw pictures, words, states and actions into what the network reads, and its answer back into actions.
+
+    Training, evaluation and serving share one such object, so they cannot differ.
+
+    Args:
+        image_size: s; side of the square pictures the vision tower takes, in pixels.
+        tokenizer: turns prompts into ids.
+        prompt: name of the prompt format (`PROMPTS`).
+        prompt_length: l; longest prompt in tokens.
+        action_dim: a; width of the network's actions, the robot's own padded with zeros.
+        horizon: h; steps in a chunk.
+        views: camera names in the order the network sees them.
+        stats: normalisation statistics; without them everything works but states and actions.
+
+    Raises:
+        UserError: an unknown prompt format, or a size that is not positive.
+    """
+
+    def __init__(
+        self,
+        image_size: int,
+        tokenizer: Tokenizer,
+        prompt: str = "plain",
+        prompt_length: int = 64,
+        action_dim: int = 32,
+        horizon: int = 20,
+        views: Sequence[str] = VIEWS,
+        stats: NormStats | None = None,
+    ) -> None:
+        sizes = {
+            "image_size": image_size,
+            "prompt_length": prompt_length,
+            "action_dim": action_dim,
+            "horizon": horizon,
+        }
+        for name, value in sizes.items():
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise UserError(f"processor.{name} must be a positive whole number, got {value!r}.")
+        if isinstance(views, str) or not views:
+            raise UserError(f"processor.views must be a list of camera names, got {views!r}.")
+        self.prompt_format = PROMPTS[prompt]()
+        self.prompt_name = prompt
+        self.tokenizer = tokenizer
+        self.image_size = image_size
+        self.prompt_length = prompt_length
+        self.action_dim = action_dim
+        self.horizon = horizon
+        self.views = tuple(views)
+        self.stats = stats
+
+    @property
+    def stats(self) -> NormStats | None:
+        """Normalisation statistics; may be set once the data are known."""
+        return self._stats
+
+    @stats.setter
+    def stats(self, stats: NormStats | None) -> None:
+        if stats is not None and len(stats.actions) > self.action_dim:
+            raise UserError(
+                f"Statistics of {len(stats.actions)}-dimensional actions do not fit action_dim={self.action_dim}; "
+                "raise action_dim, or give the statistics of this robot."
+            )
+        self._stats = stats
+
+    def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
+        """Resize the current pictures of all cameras with Pillow, as released.
+
+        Args:
+            views: one entry a camera in the order of `self.views`: [H, W, 3], or [n, H, W, 3] for n observations;
+                uint8, or float in [0, 1].
+
+        Returns:
+            [v, 3, s, s] uint8, or [n, v, 3, s, s].
+
+        Raises:
+            UserError: a camera too many or too few, or pictures of another form.
+        """
+        if len(views) != len(self.views):
+            raise UserError(f"Expected {len(self.views)} views ({', '.join(self.views)}), got {len(views)}.")
+        resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
+        if len({view.shape for view in resized}) > 1:
+            raise UserError(f"All views need as many pictures, got shapes {[list(view.shape) for view in resized]}.")
+        return torch.from_numpy(np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3)))
+
+    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
+        """Resize memory frames [n, H, W, 3] uint8 to [n, 3, s, s] float32 in [-1, 1], on `device` if one is given."""
+        # A copy where the array is read-only (memory-mapped), which PyTorch cannot share safely.
+        array = frames if isinstance(frames, Tensor) else torch.from_numpy(np.require(frames, requirements=["C", "W"]))
+        return resize_with_pad(array.to(device) if device is not None else array, self.image_size)
+
+    def prompt(
+        self, goal: str, subgoal: str | None = None, state: np.ndarray | Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Tokenise the prompt.
+
+        Args:
+            goal: the task in words.
+            subgoal: the language subgoal; formats that do not use one ignore it.
+            state: [8] raw state; formats that do not use it ignore it.
+
+        Returns:
+            ids [l] int64 and mask [l] bool.
+
+        Raises:
+            UserError: the format needs a state and there is none, or no statistics to normalise it.
+        """
+        normalised = None
+        if state is not None and self.prompt_format.reads_state:
+            normalised = normalize(_float(state), self._need_stats().state).numpy()
+        given = PromptInput(goal, subgoal, normalised)
+        return encode_prompt(self.prompt_format, self.tokenizer, given, self.prompt_length)
+
+    def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
+        """Turn recorded actions into what the network should answer.
+
+        Args:
+            chunk: [h, 8] absolute joint targets and gripper commands.
+            state: [8] raw state at the observation.
+
+        Returns:
+            [h, action_dim] float32: joint deltas, quantile-normalised, padded with zeros.
+
+        Raises:
+            UserError: there are no statistics, or the shapes do not fit.
+        """
+        stats = self._need_stats()
+        chunk, state = _float(chunk), _float(state)
+        if chunk.shape != (self.horizon, len(stats.actions)) or state.shape != (len(stats.state),):
+            raise UserError(
+                f"Expected actions [{self.horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
+                f"got {list(chunk.shape)} and {list(state.shape)}."
+            )
+        return pad_width(normalize(to_deltas(chunk, state), stats.actions), self.action_dim)
+
+    def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
+        """Turn the network's answer into actions the robot takes: the inverse of `actions`.
+
+        Args:
+            chunk: [..., h, action_dim] normalised.
+            state: [..., 8] raw.
+
+        Returns:
+            [..., h, 8] float32 on the device of `chunk`.
+
+        Raises:
+            UserError: there are no statistics.
+        """
+        stats = self._need_stats()
+        deltas = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
+        return to_absolute(deltas, state.to(deltas))
+
+    def to_config(self) -> dict[str, Any]:
+        """Describe this processor as `processor.json` does; file names are relative to the folder `save` wrote."""
+        on_hub = self.tokenizer.spec.startswith(HUB)
+        return {
+            "image_size": self.image_size,
+            "tokenizer": self.tokenizer.spec if on_hub else TOKENIZER_FILE,
+            "tokenizer_fingerprint": self.tokenizer.fingerprint,
+            "prompt": self.prompt_name,
+            "prompt_length": self.prompt_length,
+            "action_dim": self.action_dim,
+            "horizon": self.horizon,
+            "views": list(self.views),
+            "stats": None if self.stats is None else STATS_FILE,
+        }
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any], folder: Path | str | None = None) -> Self:
+        """Build a processor.
+
+        Args:
+            config: the constructor's arguments by name, two of them in words: `tokenizer` as `Tokenizer.load` takes it,
+                `stats` as the path of a `norm_stats.json` or None. `tokenizer_fingerprint`, if given, is checked.
+            folder: where files named in `config` are looked for first.
+
+        Raises:
+            UserError: an unknown, missing or impossible entry.
+        """
+        settings = dict(config)
+        known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint"}
+        for key in settings:
+            if key not in known:
+                raise UserError(f"Unknown processor setting {key!r}. {did_you_mean(str(key), known)}")
+        for key in ("image_size", "tokenizer"):
+            if key not in settings:
+                raise UserError(f"The processor's settings lack {key!r}; they hold {sorted(settings)}.")
+        PROMPTS[settings.get("prompt", "plain")]  # a misspelt name is told before any file is read
+        fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
+        tokenizer = Tokenizer.load(_inside(folder, settings.pop("tokenizer")))
+        if fingerprint is not None and tokenizer.fingerprint != fingerprint:
+            raise UserError(
+                f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {fingerprint} was used "
+                "in training: its ids would mean other words. Give the file that was used."
+            )
+        return cls(
+            **settings,
+            tokenizer=tokenizer,
+            stats=None if stats is None else NormStats.load(_inside(folder, stats)),
+        )
+
+    def save(self, folder: Path | str) -> None:
+        """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub, into `folder`."""
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        config = self.to_config()
+        (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n")
+        if config["tokenizer"] == TOKENIZER_FILE:
+            self.tokenizer.save(folder / TOKENIZER_FILE)
+        if self.stats is not None:
+            self.stats.save(folder / STATS_FILE)
+
+    @classmethod
+    def load(cls, folder: Path | str) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            UserError: `folder` holds no processor, or a damaged one.
+        """
+        path = Path(folder) / CONFIG_FILE
+        if not path.is_file():
+            raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
+        try:
+            config = json.loads(path.read_text())
+        except ValueError as error:
+            raise UserError(f"{path} is damaged: {error}.") from None
+        if not isinstance(config, dict):
+            raise UserError(f"{path} holds a {type(config).__name__}, not a processor's settings.")
+        return cls.from_config(config, Path(folder))
+
+    def _need_stats(self) -> NormStats:
+        if self._stats is None:
+            raise UserError(
+                "States and actions need normalisation statistics, and this processor has none. Training computes them "
+                "from its data; otherwise set processor.stats to a norm_stats.json (one stands in every checkpoint)."
+            )
+        return self._stats
+
+
+def _inside(folder: Path | str | None, name: Path | str) -> str:
+    """Return the file's path in `folder` if it is there, else `name` as given."""
+    if folder is not None and not str(name).startswith(HUB) and (Path(folder) / name).is_file():
+        return str(Path(folder) / name)
+    return str(name)
+
+
+def _float(x: np.ndarray | Tensor) -> Tensor:
+    return torch.as_tensor(x, dtype=torch.float32)

@@ -1,0 +1,149 @@
+"""What the policy is told in words. A format is one class here; everything else refers to it by name."""
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.processing.tokenizer import Tokenizer
+from mme_vla.registry import Registry
+
+STATE_BINS = 256
+
+_warned: set[object] = set()  # what was said already, in this process
+
+Piece = tuple[str, bool]  # a text, and whether a beginning-of-sequence token precedes it
+
+
+@dataclass(frozen=True)
+class PromptInput:
+    """What a prompt may be made of.
+
+    goal: the task in words.
+    subgoal: the language subgoal of this step, None if there is none.
+    state: [d] normalised state, None if unknown.
+    """
+
+    goal: str
+    subgoal: str | None = None
+    state: np.ndarray | None = None
+
+
+class PromptFormat:
+    """The interface of a prompt format.
+
+    A subclass sets what it reads beside the goal (so that nobody computes the rest) and implements `pieces`.
+    """
+
+    reads_subgoal: bool = False
+    reads_state: bool = False
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return the texts in order; each is tokenised by itself."""
+        raise NotImplementedError
+
+
+PROMPTS: Registry[type[PromptFormat]] = Registry("prompt format")
+
+
+@PROMPTS.register("plain")
+class Plain(PromptFormat):
+    """The goal and a newline: π0.5 without state in the prompt, and every policy with a neural memory."""
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return the goal, then the newline, which is tokenised apart."""
+        return [(_one_line(given.goal), True), ("\n", False)]
+
+
+@PROMPTS.register("state")
+class State(PromptFormat):
+    """The goal and the state as 256-level numbers, as released (openpi's own π0.5 has a comma for the semicolon)."""
+
+    reads_state = True
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return one text.
+
+        Raises:
+            UserError: there is no state.
+        """
+        if given.state is None:
+            raise UserError(
+                "The prompt format 'state' needs the robot's state; give one, or choose the format 'plain'."
+            )
+        levels = " ".join(map(str, discretize(given.state)))
+        return [(f"Task: {_one_line(given.goal)}; State: {levels};\nAction: ", True)]
+
+
+@PROMPTS.register("subgoal")
+class Subgoal(PromptFormat):
+    """The goal and the language subgoal: symbolic memory, as released.
+
+    Where a step has no subgoal the prompt is the plain one (as released), and a warning says so once.
+    """
+
+    reads_subgoal = True
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return one text, or the plain pieces if there is no subgoal."""
+        if given.subgoal is None:
+            _warn_once("The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as released.")
+            return Plain().pieces(given)
+        return [(f"Task: {_one_line(given.goal)};\nCurrent Subgoal: {_one_line(given.subgoal)};\nAction: ", True)]
+
+
+@PROMPTS.register("subgoal_sentence")
+class SubgoalSentence(Subgoal):
+    """The goal and the subgoal with the punctuation of the real-robot release, which has a state but leaves it out."""
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return one text, or the plain pieces if there is no subgoal."""
+        if given.subgoal is None:
+            return super().pieces(given)
+        return [(f"Task: {_one_line(given.goal)}\nCurrent Subgoal: {_one_line(given.subgoal)}.\nAction: ", True)]
+
+
+def discretize(state: np.ndarray) -> list[int]:
+    """Map each number of a normalised state, clipped to [-1, 1], to its level 0…255."""
+    edges = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
+    return (np.digitize(np.clip(state, -1, 1), edges) - 1).tolist()
+
+
+def encode_prompt(
+    prompt_format: PromptFormat, tokenizer: Tokenizer, given: PromptInput, max_length: int
+) -> tuple[Tensor, Tensor]:
+    """Turn a prompt into token ids.
+
+    Args:
+        prompt_format: which texts to build (`PROMPTS[name]()`).
+        tokenizer: its ids.
+        given: what the texts are made of.
+        max_length: l; a longer prompt loses its end, and a warning says so once.
+
+    Returns:
+        ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
+    """
+    tokens = [token for text, bos in prompt_format.pieces(given) for token in tokenizer.encode(text, bos=bos)]
+    if len(tokens) > max_length:
+        _warn_once(
+            f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise prompt_length. "
+            f"The first one, {len(tokens)} tokens long: {given.goal!r}.",
+            key=("truncated", max_length),
+        )
+        tokens = tokens[:max_length]
+    ids = torch.zeros(max_length, dtype=torch.int64)
+    ids[: len(tokens)] = torch.tensor(tokens, dtype=torch.int64)
+    return ids, torch.arange(max_length) < len(tokens)
+
+
+def _one_line(text: str) -> str:
+    return text.strip().replace("_", " ").replace("\n", " ")
+
+
+def _warn_once(message: str, key: object = None) -> None:
+    if (key or message) not in _warned:
+        _warned.add(key or message)
+        warnings.warn(message, stacklevel=3)

@@ -1,0 +1,90 @@
+"""Text to token ids with SentencePiece: PaliGemma's model for real weights, a small one of our own for the sample."""
+
+import hashlib
+from importlib.resources import files
+from pathlib import Path
+from typing import Self
+
+from mme_vla.errors import UserError
+
+SAMPLE = "sample"
+HUB = "hf://"
+
+
+class Tokenizer:
+    """A SentencePiece model with a beginning-of-sequence token.
+
+    Attributes:
+        spec: where it came from, in the words `Tokenizer.load` takes.
+        fingerprint: hash of the model file; two tokenizers with the same one give the same ids.
+    """
+
+    def __init__(self, model: bytes, spec: str) -> None:
+        from sentencepiece import SentencePieceProcessor
+
+        try:
+            self._processor = SentencePieceProcessor(model_proto=model)
+        except (RuntimeError, TypeError) as error:
+            raise UserError(f"Tokenizer {spec!r} is not a SentencePiece model file: {error}.") from None
+        if self._processor.bos_id() < 0:
+            raise UserError(f"Tokenizer {spec!r} has no beginning-of-sequence token, which every prompt starts with.")
+        self._model = model
+        self.spec = spec
+        self.fingerprint = hashlib.sha256(model).hexdigest()[:16]
+
+    @classmethod
+    def load(cls, spec: str | Path) -> Self:
+        """Load a tokenizer.
+
+        Args:
+            spec: "sample" for the small model shipped with the library, the path of a `.model` file, or
+                "hf://owner/repository/path/in/it.model" for a file on the Hugging Face hub.
+
+        Raises:
+            UserError: there is no such file, it is no SentencePiece model, or the hub cannot give it.
+        """
+        spec = str(spec)
+        if spec == SAMPLE:
+            return cls(files("mme_vla").joinpath("assets/tokenizer.model").read_bytes(), spec)
+        path = _download(spec) if spec.startswith(HUB) else Path(spec).expanduser()
+        if not path.is_file():
+            raise UserError(
+                f"No tokenizer at {spec!r}. Give {SAMPLE!r}, the path of a SentencePiece .model file, or "
+                f"{HUB}owner/repository/file.model (PaliGemma's: {HUB}google/paligemma-3b-pt-224/tokenizer.model)."
+            )
+        return cls(path.read_bytes(), spec)
+
+    @property
+    def vocab_size(self) -> int:
+        """How many ids there are; the text embedding needs at least as many rows."""
+        return self._processor.vocab_size()
+
+    def encode(self, text: str, bos: bool = True) -> list[int]:
+        """Turn a text into ids, after the beginning-of-sequence token if `bos`."""
+        return self._processor.encode(text, add_bos=bos)
+
+    def decode(self, ids: list[int]) -> str:
+        """Turn ids back into text; special tokens vanish."""
+        return self._processor.decode(ids)
+
+    def save(self, path: Path | str) -> None:
+        """Write the SentencePiece model file."""
+        Path(path).write_bytes(self._model)
+
+
+def _download(spec: str) -> Path:
+    from huggingface_hub import hf_hub_download
+    from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
+
+    owner, _, rest = spec.removeprefix(HUB).partition("/")
+    name, _, filename = rest.partition("/")
+    if not (owner and name and filename):
+        raise UserError(f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.")
+    try:
+        return Path(hf_hub_download(f"{owner}/{name}", filename))
+    except (HfHubHTTPError, HFValidationError, LocalEntryNotFoundError, OSError) as error:
+        raise UserError(
+            f"The hub did not give the tokenizer {spec!r} ({type(error).__name__}: {str(error).splitlines()[0]}). "
+            "Check the name, the network and `hf auth login` (PaliGemma's files ask you to accept a licence), "
+            "or download the file by hand and give its path."
+        ) from None

@@ -1,0 +1,35 @@
+"""The full-size policies map one to one onto the released parameter trees, on the meta device."""
+
+import json
+import math
+
+import pytest
+
+from mme_vla import build_policy
+from mme_vla.naming import write
+from mme_vla.weights.released import released_table, released_unread
+
+VARIANTS = {"pi05": "pi05_baseline"} | {
+    f"{memory}_{integration}": f"perceptual-{memory}-{integration}"
+    for memory in ("framesamp", "tokendrop")
+    for integration in ("context", "modul", "expert")
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
+    tree = json.loads((shared / "spec" / f"param_tree_{VARIANTS[variant]}.json").read_text())
+    policy = build_policy(variant, backbone="pi05", device="meta")
+    ours = policy.state_dict()
+    table = released_table(policy)
+    assert set(table) == set(ours), "every tensor of ours has a released place, and no place is invented"
+    written = write(table, released_unread(policy), ours)
+    assert {k: tuple(v.shape) for k, v in written.items()} == {k: tuple(v["shape"]) for k, v in tree["params"].items()}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_parameter_count_is_the_released_one_less_what_no_action_reads(variant: str, shared):
+    summary = json.loads((shared / "spec" / "param_tree_summary.json").read_text())[VARIANTS[variant]]
+    policy = build_policy(variant, backbone="pi05", device="meta")
+    unread = sum(math.prod(gap.shape) for gap in released_unread(policy))
+    assert sum(p.numel() for p in policy.parameters()) == summary["total_parameters"] - unread

@@ -1,0 +1,50 @@
+"""The worked example of docs/add-a-memory.md: a memory outside the package builds, streams and trains."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from conftest import REPOSITORY
+from helpers import open_gates, random_batch, unit_stats
+
+from mme_vla import build_policy
+
+EXAMPLE = REPOSITORY / "examples" / "last_frames"
+
+
+@pytest.fixture
+def policy(monkeypatch):
+    monkeypatch.syspath_prepend(EXAMPLE)
+    policy = build_policy("last_frames_context", config_dir=EXAMPLE / "configs")
+    policy.processor.stats = unit_stats()
+    open_gates(policy)
+    return policy
+
+
+def test_the_page_shows_the_files_that_are_tested():
+    page = (REPOSITORY / "docs" / "add-a-memory.md").read_text()
+    for file in ("last_frames.py", "configs/model/last_frames_context.yaml"):
+        assert (EXAMPLE / file).read_text().strip() in page, file
+
+
+def test_own_memory_gets_a_loss_and_acts(policy):
+    batch = random_batch(policy, valid=32)
+    loss, _ = policy(batch)
+    loss.backward()
+    assert policy.memory.encoder.project.weight.grad.abs().sum() > 0
+    episode = policy.start_episode("press the button")
+    frames = np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), dtype=np.uint8)
+    episode.observe({"image": frames, "wrist_image": frames}, np.zeros((9, 8), np.float32))
+    recalled = episode.recall()
+    assert sorted(set(recalled.positions[recalled.mask][:, 0].tolist())) == [0, 4, 8]
+    assert torch.isfinite(torch.from_numpy(policy.act([episode]))).all()
+
+
+def test_own_memory_trains_through_the_same_command(tmp_path):
+    command = [sys.executable, "-m", "mme_vla.train", "--config-dir", str(EXAMPLE / "configs")]
+    options = ["model=last_frames_context", "train.steps=2", f"hydra.run.dir={tmp_path / 'run'}"]
+    done = subprocess.run([*command, *options], cwd=EXAMPLE, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert list((tmp_path / "run").rglob("model.safetensors"))
