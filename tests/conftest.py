@@ -15,6 +15,16 @@ def _folder(variable: str, default: Path, what: str) -> Path:
     return folder
 
 
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of docs/parity.md."""
+    if os.environ.get("MME_VLA_PARITY_TABLE"):
+        import golden
+
+        terminalreporter.write_line("| test | largest absolute error |\n|---|---|")
+        for test, worst in sorted(golden.ERRORS.items()):
+            terminalreporter.write_line(f"| `{test}` | {worst:.1e} |")
+
+
 @pytest.fixture(scope="session")
 def shared() -> Path:
     """The folder with specifications and reference data that developers have beside the repository."""

@@ -1,6 +1,7 @@
 """Golden cases of the released implementation: files, and policies built to their sizes with their parameters."""
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,14 @@ def memory_tokens(policy: MMEPolicy, tensors: dict[str, Tensor]) -> MemoryTokens
     return MemoryTokens(tokens, tensors["in/static_mask"])
 
 
+ERRORS: dict[str, float] = {}
+"""Largest error seen per test, for the table in docs/parity.md (`MME_VLA_PARITY_TABLE=1`, see conftest.py)."""
+
+
 def error(ours: Tensor, golden: Tensor) -> float:
-    """Largest absolute difference."""
+    """Largest absolute difference; also kept under the running test's name."""
     assert ours.shape == golden.shape, (ours.shape, golden.shape)
-    return float((ours.double() - golden.double()).abs().max())
+    worst = float((ours.double() - golden.double()).abs().max())
+    test = os.environ.get("PYTEST_CURRENT_TEST", "").rsplit(" ", 1)[0].rsplit("::", 1)[-1]
+    ERRORS[test] = max(worst, ERRORS.get(test, 0.0))
+    return worst

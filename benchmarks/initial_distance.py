@@ -1,0 +1,44 @@
+"""How far a freshly added memory moves a memoryless π0.5: relative distance of the predicted velocity.
+
+    python benchmarks/initial_distance.py
+
+Every variant gets the same weights as a `pi05` whose adaptive gates are open (a fresh π0.5 has them shut, which would
+hide everything); only the memory's own parameters are as initialised. Mean over eight random batches.
+"""
+
+import sys
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from helpers import PERCEPTUAL, random_batch, random_history, small_policy  # noqa: E402
+
+
+@torch.no_grad()
+def distance(name: str, **overrides: object) -> float:
+    """Mean of |v_memory − v_plain| / |v_plain|."""
+    plain, remembering = small_policy("pi05"), small_policy(name, **overrides)
+    remembering.load_state_dict(plain.state_dict(), strict=False)
+    distances = []
+    for seed in range(8):
+        batch = random_batch(plain, seed=seed)
+        noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(seed))
+        time = torch.full((len(noise),), 0.5)
+        before = plain.velocity(batch, noise, time)
+        batch.history = random_history(remembering, len(noise), remembering.memory.budget, seed)
+        after = remembering.velocity(batch, noise, time)
+        distances.append(float((after - before).norm() / before.norm()))
+    return sum(distances) / len(distances)
+
+
+def main() -> None:
+    print("| model | relative distance at initialisation |\n|---|---:|")
+    for name in PERCEPTUAL:
+        print(f"| `{name}` | {distance(name):.1e} |")
+    exact = distance("framesamp_modul", integration={"exact_identity": True})
+    print(f"| `framesamp_modul integration.exact_identity=true` | {exact:.1e} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""Parameters and memory of every model at full size, counted on the meta device.
+
+    python benchmarks/sizes.py [--backbone pi05]
+
+Training memory is weights, gradients, AdamW's two moments and the EMA in float32 for what is trained, plus the frozen
+tower; activations come on top.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from mme_vla import build_policy
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from helpers import MODELS  # noqa: E402
+
+GIB = 2**30
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backbone", default="pi05")
+    args = parser.parse_args()
+    print("| model | parameters | of these frozen | weights bf16 | weights float32 | training |")
+    print("|---|---:|---:|---:|---:|---:|")
+    for name in MODELS:
+        policy = build_policy(name, backbone=args.backbone, device="meta")
+        total = sum(p.numel() for p in policy.parameters())
+        frozen = sum(p.numel() for p in policy.backbone.vision.parameters())
+        training = (total - frozen) * 5 * 4 + frozen * 4
+        sizes = [f"{size / GIB:.1f} GiB" for size in (2 * total, 4 * total, training)]
+        print(f"| `{name}` | {total / 1e6:,.1f} M | {frozen / 1e6:,.1f} M | {' | '.join(sizes)} |")
+
+
+if __name__ == "__main__":
+    main()

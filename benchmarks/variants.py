@@ -1,0 +1,79 @@
+"""What each memory variant adds to `pi05`, for a training step and for a sampled chunk, at one backbone size.
+
+    python benchmarks/variants.py [--backbone tiny] [--batch 4] [--threads 2] [--rounds 7]
+
+All variants take turns in one process. The modulator's line also counts how often memory keys are computed per chunk.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+import torch
+from timing import alternate, machine
+
+from mme_vla import build_policy
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from helpers import MODELS, random_batch  # noqa: E402
+
+
+def training_step(policy, batch):  # noqa: ANN001, ANN201
+    """One step of AdamW on a frozen tower."""
+    policy.backbone.vision.requires_grad_(False)
+    optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=1e-5, fused=True)
+
+    def step() -> None:
+        policy.train()
+        optimizer.zero_grad(set_to_none=True)
+        policy(batch)[0].backward()
+        optimizer.step()
+
+    return step
+
+
+def chunk(policy, batch):  # noqa: ANN001, ANN201
+    """One sampled chunk of ten Euler steps."""
+
+    def sample() -> None:
+        policy.eval()
+        policy.sample_actions(batch)
+
+    return sample
+
+
+def memory_key_computations(policy, batch) -> int:  # noqa: ANN001
+    """How often the modulator projects memory to keys and values while a chunk is sampled."""
+    calls = []
+    handle = policy.integration.layers[0].kv.register_forward_hook(lambda *_: calls.append(1))
+    chunk(policy, batch)()
+    handle.remove()
+    return len(calls)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--backbone", default="tiny")
+    parser.add_argument("--batch", type=int, default=4)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=7)
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    policies = {name: build_policy(name, backbone=args.backbone, device=device) for name in MODELS}
+    batches = {name: random_batch(p, args.batch, valid=p.memory.budget if p.memory else 0).to(device)
+               for name, p in policies.items()}  # fmt: skip
+    print(f"{machine()}; backbone {args.backbone}, batch {args.batch}, median of {args.rounds}")
+    steps = alternate({n: training_step(p, batches[n]) for n, p in policies.items()}, args.rounds)
+    chunks = alternate({n: chunk(p, batches[n]) for n, p in policies.items()}, args.rounds)
+    print("| model | training step | over pi05 | sampled chunk | over pi05 |\n|---|---:|---:|---:|---:|")
+    for name in MODELS:
+        cells = [f"{1e3 * t[name]:.0f} ms | {t[name] / t['pi05']:.2f}x" for t in (steps, chunks)]
+        print(f"| `{name}` | {' | '.join(cells)} |")
+    modulated = policies["framesamp_modul"]
+    count = memory_key_computations(modulated, batches["framesamp_modul"])
+    print(f"memory keys and values are computed {count} time(s) per chunk of 10 steps (first layer of framesamp_modul)")
+
+
+if __name__ == "__main__":
+    main()
