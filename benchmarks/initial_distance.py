@@ -6,13 +6,9 @@ Every variant gets the same weights as a `pi05` whose adaptive gates are open (a
 hide everything); only the memory's own parameters are as initialised. Mean over eight random batches.
 """
 
-import sys
-from pathlib import Path
-
 import torch
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from helpers import PERCEPTUAL, random_batch, random_history, small_policy  # noqa: E402
+from mme_vla.testing import PERCEPTUAL, random_batch, random_history, small_policy
 
 
 @torch.no_grad()

@@ -7,13 +7,9 @@ tower; activations come on top.
 """
 
 import argparse
-import sys
-from pathlib import Path
 
 from mme_vla import build_policy
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from helpers import MODELS  # noqa: E402
+from mme_vla.testing import MODELS
 
 GIB = 2**30
 

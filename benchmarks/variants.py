@@ -6,19 +6,15 @@ All variants take turns in one process. The modulator's line also counts how oft
 """
 
 import argparse
-import sys
-from pathlib import Path
 
 import torch
 from timing import alternate, machine
 
 from mme_vla import build_policy
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from helpers import MODELS, random_batch  # noqa: E402
+from mme_vla.testing import MODELS, random_batch
 
 
-def training_step(policy, batch):  # noqa: ANN001, ANN201
+def training_step(policy, batch):
     """One step of AdamW on a frozen tower."""
     policy.backbone.vision.requires_grad_(False)
     optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=1e-5, fused=True)
@@ -32,7 +28,7 @@ def training_step(policy, batch):  # noqa: ANN001, ANN201
     return step
 
 
-def chunk(policy, batch):  # noqa: ANN001, ANN201
+def chunk(policy, batch):
     """One sampled chunk of ten Euler steps."""
 
     def sample() -> None:
@@ -42,7 +38,7 @@ def chunk(policy, batch):  # noqa: ANN001, ANN201
     return sample
 
 
-def memory_key_computations(policy, batch) -> int:  # noqa: ANN001
+def memory_key_computations(policy, batch) -> int:
     """How often the modulator projects memory to keys and values while a chunk is sampled."""
     calls = []
     handle = policy.integration.layers[0].kv.register_forward_hook(lambda *_: calls.append(1))

@@ -67,11 +67,10 @@ class Episode:
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
-        memory, history = self._policy.memory, self.history
-        if memory is None or history is None:
-            raise UserError("This policy has no memory to recall from.")
+        memory = self._policy.require_memory()
         self._require_observation()
-        return memory.recall(history, len(history) - 1)
+        assert self.history is not None
+        return memory.recall(self.history, len(self.history) - 1)
 
     @property
     def images(self) -> Tensor:

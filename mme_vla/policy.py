@@ -14,7 +14,7 @@ import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone import flow
 from mme_vla.backbone.config import BackboneConfig
-from mme_vla.backbone.gemma import Conditioning, Hook, KVCache
+from mme_vla.backbone.gemma import Conditioning, Hook, KVCache, Layout
 from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.episode import Episode
 from mme_vla.errors import UserError
@@ -135,12 +135,11 @@ class MMEPolicy(nn.Module):
         with self.autocast():
             memory = self.encode_memory(batch.history) if memory is None else memory
             blocks = self.integration.blocks(self.backbone.observation_blocks(batch, self._views(batch)), memory)
-            answer, _ = self.backbone.transformer(
-                [*blocks, self.backbone.action_block(x_t)],
-                self.integration.visibility,
-                self.backbone.time_condition(time),
-                self.integration.hook(memory),
-            )
+            blocks = [*blocks, self.backbone.action_block(x_t)]
+            transformer = self.backbone.transformer
+            layout = transformer.layout(blocks, self.integration.visibility)
+            condition = self.backbone.time_condition(time)
+            answer, _ = transformer(blocks, layout, condition, self.integration.hook(memory))
             return self.backbone.velocity(answer)
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
@@ -178,23 +177,27 @@ class MMEPolicy(nn.Module):
             shape = (len(batch.prompt), config.horizon, config.action_dim)
             noise = torch.randn(shape, device=self.device, generator=generator)
         with self.autocast():
+            transformer = self.backbone.transformer
             prefix, hook = self.prefill(batch, memory)
+            layout = transformer.layout([self.backbone.action_block(noise)], self.integration.visibility, prefix)
             times = flow.euler_times(steps, self.device)
-            modulations = self.backbone.transformer.conditioning(self.backbone.time_condition(times))
-            return flow.euler(noise, steps, lambda x, i: self.denoise(x, modulations.at(i), prefix, hook))
+            conditions = transformer.conditioning(self.backbone.time_condition(times))
+            return flow.euler(noise, steps, lambda x, i: self.denoise(x, conditions.at(i), layout, prefix, hook))
 
     def prefill(self, batch: Batch, memory: MemoryTokens | None = None) -> tuple[KVCache, Hook | None]:
         """Run what a chunk's steps share: keys and values of the prefix, and the memory's hook."""
         memory = self.encode_memory(batch.history) if memory is None else memory
         blocks = self.integration.blocks(self.backbone.observation_blocks(batch, self._views(batch)), memory)
-        _, prefix = self.backbone.transformer(blocks, self.integration.visibility, keep=True)
+        layout = self.backbone.transformer.layout(blocks, self.integration.visibility)
+        _, prefix = self.backbone.transformer(blocks, layout, keep=True)
         return prefix, self.integration.hook(memory)
 
-    def denoise(self, x_t: Tensor, condition: Tensor | Conditioning, prefix: KVCache, hook: Hook | None) -> Tensor:
+    def denoise(
+        self, x_t: Tensor, condition: Tensor | Conditioning, layout: Layout, prefix: KVCache, hook: Hook | None
+    ) -> Tensor:
         """The velocity at one flow time, from the cached prefix: what one Euler step costs."""
-        answer, _ = self.backbone.transformer(
-            [self.backbone.action_block(x_t)], self.integration.visibility, condition, hook, past=prefix
-        )
+        block = self.backbone.action_block(x_t)
+        answer, _ = self.backbone.transformer([block], layout, condition, hook, past=prefix)
         return self.backbone.velocity(answer)
 
     # Episodes
@@ -234,9 +237,7 @@ class MMEPolicy(nn.Module):
     @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        if self.memory is None:
-            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
-        storage, encoded = self.memory.storage, []
+        storage, encoded = self.require_memory().storage, []
         for start in range(0, len(frames), batch_size):
             images = self.require_processor().memory_images(frames[start : start + batch_size], device=self.device)
             with self.autocast():
@@ -254,6 +255,12 @@ class MMEPolicy(nn.Module):
             digest.update(name.encode())
             digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
+
+    def require_memory(self) -> MemoryModule:
+        """Return the memory, or say that there is none."""
+        if self.memory is None:
+            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+        return self.memory
 
     def require_processor(self) -> "Processor":
         """Return the processor, or say what it takes to have one."""

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPOSITORY
-from helpers import open_gates, random_batch, unit_stats
 
 from mme_vla import build_policy
+from mme_vla.testing import open_gates, random_batch, unit_stats
 
 EXAMPLE = REPOSITORY / "examples" / "last_frames"
 

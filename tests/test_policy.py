@@ -4,10 +4,10 @@ import time
 
 import pytest
 import torch
-from helpers import MODELS, PERCEPTUAL, random_batch, random_history, small_policy
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy import MMEPolicy
+from mme_vla.testing import MODELS, PERCEPTUAL, random_batch, random_history, small_policy
 
 TOLERANCE = 2e-5
 
@@ -43,7 +43,9 @@ def test_cached_prefix_equals_the_joint_pass(policy):
     noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(2))
     time_ = torch.full((2,), 0.7)
     prefix, hook = policy.prefill(batch)
-    cached = policy.denoise(noise, policy.backbone.time_condition(time_), prefix, hook)
+    action = policy.backbone.action_block(noise)
+    layout = policy.backbone.transformer.layout([action], policy.integration.visibility, prefix)
+    cached = policy.denoise(noise, policy.backbone.time_condition(time_), layout, prefix, hook)
     assert (cached - policy.velocity(batch, noise, time_)).abs().max() < TOLERANCE
 
 
@@ -144,7 +146,7 @@ def test_vision_and_language_run_once_per_chunk(policy):
 
 def test_exact_identity_modulator_is_the_memoryless_policy_to_the_bit():
     plain, modulated = small_policy("pi05"), small_policy("framesamp_modul", integration={"exact_identity": "true"})
-    shared = {k: v for k, v in plain.state_dict().items()}
+    shared = plain.state_dict()
     assert not modulated.load_state_dict(shared, strict=False).unexpected_keys
     batch = random_batch(plain)
     before = velocity(plain, batch)

@@ -15,7 +15,7 @@ PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
-    "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy", "episode", "subgoal",
+    "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy", "episode", "subgoal",
     "processing", "integration", "memory", "backbone",
     "config", "config_errors", "pretrained", "naming", "types", "registry", "errors",
 ]  # fmt: skip

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
-from helpers import PERCEPTUAL, cached_history, moving_frames, online_history, small_policy
 
 from mme_vla import UserError
 from mme_vla.memory.base import stack_history
+from mme_vla.testing import PERCEPTUAL, cached_history, moving_frames, online_history, small_policy
 from mme_vla.types import Batch
 
 FRAMES = 90

@@ -1,4 +1,4 @@
-"""Small policies and batches for behaviour tests."""
+"""Small policies, batches and episodes for testing a memory or an integration: the library's own tests use them."""
 
 from typing import Any
 
@@ -28,7 +28,7 @@ def unit_stats() -> NormStats:
 def small_policy(name: str, **overrides: Any) -> MMEPolicy:
     """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive norms are shut)."""
     policy = build_policy(name, **{"backbone": "tiny", **overrides})
-    policy.processor.stats = unit_stats()
+    policy.require_processor().stats = unit_stats()
     open_gates(policy)
     return policy
 
@@ -86,7 +86,8 @@ def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
 
 def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -> CachedHistory:
     """What a cache of this whole episode would hold, encoded in one go."""
-    spec, scorer = policy.memory.storage, policy.memory.make_scorer()
+    memory = policy.require_memory()
+    spec, scorer = memory.storage, memory.make_scorer()
     kept = spec.kept_frames(len(frames))
     tokens = policy.encode_frames(frames[kept])
     rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
@@ -102,7 +103,8 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
 
 def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int) -> OnlineHistory:
     """The same episode as an environment would deliver it, `chunk` frames at a time."""
-    history = OnlineHistory(policy.memory.storage, policy.memory.make_scorer())
+    memory = policy.require_memory()
+    history = OnlineHistory(memory.storage, memory.make_scorer())
     for start in range(0, len(frames), chunk):
         part = frames[start : start + chunk]
         history.append(part, policy.encode_frames(part[history.wanted(len(part))]))

@@ -1,0 +1,52 @@
+"""Small HDF5 files in the layout of RoboMME's recorder, and small datasets, for tests that need no other data."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+
+@dataclass
+class Recorded:
+    """What a written episode holds, for comparison."""
+
+    front: np.ndarray
+    wrist: np.ndarray
+    state: np.ndarray
+    actions: np.ndarray
+
+
+def write_file(
+    path: Path, lengths: Sequence[int], videos: Sequence[int] = (), numbers: Sequence[int] = (), size: int = 16
+) -> list[Recorded]:
+    """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for the last steps."""
+    rng = np.random.default_rng(len(path.stem))
+    videos, numbers = videos or [0] * len(lengths), numbers or range(len(lengths))
+    recorded = []
+    with h5py.File(path, "w") as file:
+        for length, video, number in zip(lengths, videos, numbers, strict=True):
+            episode = file.create_group(f"episode_{number}")
+            episode["setup/task_goal"] = np.array([f"Do Task {number}", "Another wording"], dtype=h5py.string_dtype())
+            episode["setup/seed"], episode["setup/difficulty"] = 100 * number, "easy"
+            background = rng.integers(0, 255, (2, size, size, 3), np.uint8)
+            frames = np.repeat(background[:, None], length, axis=1)
+            for t in range(length):
+                frames[:, t, t % size, :4] = 255
+            joints, actions = rng.normal(size=(length, 7)), rng.normal(size=(length, 8))
+            for t in range(length):
+                step = episode.create_group(f"timestep_{t}")
+                step["obs/front_rgb"], step["obs/wrist_rgb"] = frames[0, t], frames[1, t]
+                step["obs/joint_state"] = joints[t].astype(np.float32)
+                step["obs/gripper_state"] = np.array([0.04, 0.03], np.float32)
+                step["action/joint_action"] = actions[t]
+                done = t >= length - 2
+                for name in ("simple_subgoal", "grounded_subgoal"):
+                    text = f"Pick Up {t // 4}" + (" at <1, 2>" if name.startswith("grounded") else "")
+                    step[f"info/{name}"] = "Complete" if done else text
+                    step[f"info/{name}_online"] = "Complete" if done else text + " online"
+                step["info/is_video_demo"], step["info/is_completed"] = t < video, done
+            state = np.concatenate([joints, np.full((length, 1), 0.04)], axis=1).astype(np.float32)
+            recorded.append(Recorded(frames[0], frames[1], state, actions))
+    return recorded

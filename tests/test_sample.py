@@ -1,0 +1,46 @@
+"""The embedded sample: small, complete, and what its README says."""
+
+from pathlib import Path
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import EpisodeRef, open_episode
+from mme_vla.data.layout import SAMPLE
+from mme_vla.data.sample import EPISODES
+
+
+def test_the_sample_is_small_and_documented() -> None:
+    assert sum(file.stat().st_size for file in SAMPLE.rglob("*") if file.is_file()) < 6_000_000
+    assert "Stale pictures" in (SAMPLE / "README.md").read_text()
+
+
+def test_the_sample_holds_four_real_demonstrations() -> None:
+    source = EpisodeSource("sample")
+    assert source.video_views == ("image", "wrist_image") and source.fps == 20
+    assert [source.task(e) for e in range(4)] == ["VideoUnmask", "PatternLock", "PickXtimes", "VideoUnmask"]
+    assert source.lengths.tolist() == [173, 148, 332, 263] and source.exec_starts.tolist() == [66, 74, 0, 66]
+    assert source.frames(0, [0, 172], "wrist_image").shape == (2, 256, 256, 3)
+
+
+def test_the_first_episode_has_its_own_picture_wherever_something_moved(shared: Path) -> None:
+    source = EpisodeSource("sample")
+    with open_episode(EpisodeRef(shared / "robomme_h5_full/record_dataset_VideoUnmask.h5", 6, "VideoUnmask")) as raw:
+        recorded = np.stack([frame.front for frame in raw]).astype(int)
+    stored = source.frames(0, np.arange(173)).astype(int)
+    moved = np.abs(np.diff(recorded, axis=0)).any(axis=(1, 2, 3))
+    assert np.array_equal(np.abs(np.diff(stored, axis=0)).any(axis=(1, 2, 3)), moved)
+    assert np.abs(stored - recorded).mean() < 4  # colours at half resolution
+
+
+def test_the_sample_equals_the_recorded_episodes(shared: Path) -> None:
+    source = EpisodeSource("sample")
+    folders = {"full": shared / "robomme_h5_full", "thinned": shared / "robomme_h5"}
+    for e, (folder, task, number) in enumerate(EPISODES):
+        ref = EpisodeRef(folders[folder] / f"record_dataset_{task}.h5", number, task)
+        with open_episode(ref) as raw:
+            frames = list(raw)
+            assert source.goal(e) == raw.goals[0] and source.exec_starts[e] == raw.exec_start
+        assert np.array_equal(source.states(e), np.stack([frame.state for frame in frames]))
+        assert np.array_equal(source.actions(e), np.stack([frame.action for frame in frames]).astype(np.float32))
+        assert source.subgoals(e, 100) == frames[100].subgoals
