@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from mme_vla import build_policy
+from mme_vla.build import build_policy
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy import MMEPolicy
 from mme_vla.processing.normalize import NormStats, QuantileStats

@@ -172,6 +172,15 @@ class KVCache:
     mask: Tensor  # [b, past] bool
 
 
+class Layout(NamedTuple):
+    """What attention needs to know of a pass beside its tokens; the same for every Euler step of a chunk."""
+
+    spans: list[Span]  # of this pass and the cached ones before it
+    valid: Tensor  # [b, past + n] bool
+    mask: Tensor  # additive [b, 1, n, past + n]
+    turn: Rotation
+
+
 @dataclass
 class Conditioning:
     """Time modulations of all layers, made once for the fixed times of a sampler (`JointTransformer.conditioning`)."""
@@ -210,19 +219,29 @@ class JointTransformer(nn.Module):
             layers.append(LayerModulation(*(norm.modulation(condition) for norm in norms)))
         return Conditioning(layers, self.final_norm.modulation(condition))
 
+    def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
+        """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
+        spans = [Span(block.name, len(block)) for block in blocks]
+        asking = torch.cat([block.mask for block in blocks], 1)
+        positions = token_positions(asking, past.mask if past else None)
+        all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
+        seen = attention_mask(spans, all_spans, asking, valid, table)
+        mask = additive_mask(seen, compute_dtype(blocks[0].tokens))
+        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim))
+
     def forward(
         self,
         blocks: Sequence[Block],
-        table: Visibility,
+        layout: Layout,
         condition: Tensor | Conditioning | None = None,
         hook: Hook | None = None,
         past: KVCache | None = None,
         keep: bool = False,
     ) -> tuple[Tensor | None, KVCache | None]:
-        """Run blocks, after those of `past`, under a visibility table.
+        """Run blocks, after those of `past`.
 
         Args:
-            blocks: in sequence order. table: see `blocks.Visibility`.
+            blocks: in sequence order. layout: of these blocks after this past.
             condition: time condition [b, c] of the answering expert, or its modulations; unread without that expert.
             hook: the per-layer hook. past: an earlier pass's cache.
             keep: whether to return a cache of `past` and this pass.
@@ -230,20 +249,12 @@ class JointTransformer(nn.Module):
         Returns:
             The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
         """
-        spans = [Span(block.name, len(block)) for block in blocks]
-        valid = torch.cat([block.mask for block in blocks], 1)
-        dtype = compute_dtype(blocks[0].tokens)
-        positions = token_positions(valid, past.mask if past else None)
-        all_spans, all_valid = (past.spans + spans, torch.cat([past.mask, valid], 1)) if past else (spans, valid)
-        mask = additive_mask(attention_mask(spans, all_spans, valid, all_valid, table), dtype)
-        turn = rotation(positions, self.head_dim)
-
-        segments = _segments(blocks, dtype)
+        segments = _segments(blocks, layout.mask.dtype)
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
             of_hook = None if hook is None else _bind(hook, i)
-            args = (segments, turn, mask, of_layer, of_hook, past.layers[i] if past else None)
+            args = (segments, layout.turn, layout.mask, of_layer, of_hook, past.layers[i] if past else None)
             if self.gradient_checkpointing and torch.is_grad_enabled():
                 segments, kv = checkpoint(block, *args, use_reentrant=False)
             else:
@@ -255,7 +266,7 @@ class JointTransformer(nn.Module):
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
             answer, _ = self.final_norm(segments[-1].tokens, final)
-        return answer, KVCache(cached, all_spans, all_valid) if keep else None
+        return answer, KVCache(cached, layout.spans, layout.valid) if keep else None
 
 
 def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
