@@ -220,7 +220,8 @@ def ensure_cache(
                 f"{error} (It is not built here because {source.name} has {frames} frames, more than "
                 f"data.cache.max_build_frames={max_build_frames}; add dry_run=true to see size and time first.)"
             ) from None
-    build_cache(source, memory, encode, folder, expected, batch_size=batch_size)
+    # All of it here, also under torchrun, where training has its first process prepare the data for the others.
+    build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
     return VisionCache(folder, source, expected, command)
 
 
