@@ -18,9 +18,9 @@ INTRODUCTION = """# Configuration
 Written by `python docs/configuration.py` from the comments in [`configs/`](../configs); a test keeps the two equal.
 
 Every command takes `key=value` and `group=file` words: `python -m mme_vla.train model=framesamp_modul train.lr=1e-3`.
-`--cfg job` prints the whole configuration and runs nothing, `--help` lists the groups, `--config-dir DIR` adds YAML files of
-your own, `--multirun` sweeps (`model=framesamp_modul,tokendrop_modul`). A misspelt key is answered with the near ones. In
-Python the same words are keyword arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 256})`.
+`--cfg job` prints the whole configuration and runs nothing, `--help` lists the groups, `--config-dir DIR` adds YAML
+files of your own, `--multirun` sweeps (`model=framesamp_modul,tokendrop_modul`). A misspelt key is answered with the near
+ones. In Python the same words are keyword arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 256})`.
 """
 
 
@@ -65,7 +65,8 @@ def page() -> str:
     """The whole page."""
     parts = [INTRODUCTION.strip(), "## Commands"]
     for file in sorted(CONFIGS.glob("*.yaml")):
-        parts.append(section(file, f"### `{COMMANDS.get(file.stem, file.stem)}` ([{file.name}](../configs/{file.name}))"))
+        link = f"[{file.name}](../configs/{file.name})"
+        parts.append(section(file, f"### `{COMMANDS.get(file.stem, file.stem)}` ({link})"))
     for group in sorted(folder for folder in CONFIGS.iterdir() if folder.is_dir()):
         files = sorted(group.glob("*.yaml"))
         parts.append(f"## Group `{group.name}`")
