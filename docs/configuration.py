@@ -19,8 +19,9 @@ Written by `python docs/configuration.py` from the comments in [`configs/`](../c
 
 Every command takes `key=value` and `group=file` words: `python -m mme_vla.train model=framesamp_modul train.lr=1e-3`.
 `--cfg job` prints the whole configuration and runs nothing, `--help` lists the groups, `--config-dir DIR` adds YAML
-files of your own, `--multirun` sweeps (`model=framesamp_modul,tokendrop_modul`). A misspelt key is answered with the near
-ones. In Python the same words are keyword arguments: `build_policy("framesamp_modul", backbone="pi05", memory={"budget": 256})`.
+files of your own, `--multirun` sweeps (`model=framesamp_modul,tokendrop_modul`). A misspelt key is answered with the
+near ones. In Python the same words are keyword arguments:
+`build_policy("framesamp_modul", backbone="pi05", memory={"budget": 256})`.
 """
 
 

@@ -159,7 +159,7 @@ def draw_memory(
     console: "Console",
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
-    from mme_vla.inspect_picture import contact_sheet
+    from mme_vla.data.pictures import contact_sheet
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))

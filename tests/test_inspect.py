@@ -10,6 +10,7 @@ from rich.console import Console
 from mme_vla import UserError, build_policy
 from mme_vla.config import compose
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.pictures import MARGIN, TILE, contact_sheet
 from mme_vla.inspect import (
     build_memory,
     check_place,
@@ -19,7 +20,6 @@ from mme_vla.inspect import (
     show_dataset,
     show_episode,
 )
-from mme_vla.inspect_picture import MARGIN, TILE, contact_sheet
 
 
 @pytest.fixture
