@@ -101,6 +101,22 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return ours
 
 
+def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
+    """Make sure that the constants a checkpoint stores are the ones this configuration gives.
+
+    Raises:
+        UserError: one is not. Real parts count, to bfloat16's precision: some writers rounded or cast them.
+    """
+    for constant in derived:
+        if constant.path in source:
+            stored, ours = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
+            if stored.shape != ours.shape or not torch.allclose(stored, ours, rtol=1e-2, atol=1e-2):
+                raise UserError(
+                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
+                    f"gives {tuple(ours.shape)}: it was trained with other sizes or rates; set the same here."
+                )
+
+
 def write(
     table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor], derived: Iterable[Derived] = ()
 ) -> dict[str, Tensor]:

@@ -76,10 +76,15 @@ def recurrence(about: dict[str, Any]) -> dict[str, Any]:
         "max_video": about["max_pretraj_steps"],
         "chunk": about["max_recur_steps"] // about["remat_n_mini_batches"],
     }
-    if about["type"] == "rmt":
-        names = {"heads": "num_attn_heads", "kv_heads": "num_kv_heads"}
-    else:
-        names = {"heads": "num_ttt_heads", "base_rate": "base_lr", "max_rate": "max_lr", "max_grad_norm": "max_grad_norm"}
+    names = {
+        "rmt": {"heads": "num_attn_heads", "kv_heads": "num_kv_heads"},
+        "ttt": {
+            "heads": "num_ttt_heads",
+            "base_rate": "base_lr",
+            "max_rate": "max_lr",
+            "max_grad_norm": "max_grad_norm",
+        },
+    }[about["type"]]
     return options | {ours: about[f"{about['type']}_config"][theirs] for ours, theirs in names.items()}
 
 

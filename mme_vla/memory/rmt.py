@@ -120,7 +120,7 @@ class RMTLayer(RecurrentLayer):
 
 
 def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
-    """Attention that rounds where the released code does: inputs, weights and result to `dtype`, the softmax in float32.
+    """Attention that rounds where the released code does: inputs, weights and result to `dtype`; softmax in float32.
 
     Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over a window.
     """

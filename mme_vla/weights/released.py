@@ -11,7 +11,7 @@ import mme_vla.backbone.names as backbone_names
 import mme_vla.integration.names as integration_names
 import mme_vla.memory.names as memory_names
 from mme_vla.errors import UserError
-from mme_vla.naming import Derived, NameTable, Unread, prefixed, read, write
+from mme_vla.naming import Derived, NameTable, Unread, check, prefixed, read, write
 from mme_vla.policy import MMEPolicy
 from mme_vla.pretrained import assign_tensors
 
@@ -53,6 +53,7 @@ def from_released(policy: MMEPolicy, tree: Mapping[str, Tensor]) -> MMEPolicy:
     extra = sorted(set(tree) - known - {d.path for d in released_derived(policy)})
     if extra:
         raise UserError(f"The checkpoint holds {len(extra)} tensors this policy has no place for: {', '.join(extra)}")
+    check(released_derived(policy), tree)
     assign_tensors(policy, read(table, tree), "the released tree")
     return policy
 
