@@ -118,13 +118,8 @@ class RecurrentMemory(MemoryModule):
             )
         self.budget, self.capacity = budget, max_steps * grid**2
         self.storage = StorageSpec(grid, pooling)
-        self.max_steps, self.max_video, self.stride, self.jitter, self.chunk = (
-            max_steps,
-            max_video,
-            stride,
-            jitter,
-            chunk,
-        )
+        self.max_steps, self.max_video, self.stride = max_steps, max_video, stride
+        self.jitter, self.chunk = jitter, chunk
         self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden)
         self.layer = layer
         self.output = nn.Linear(hidden, width)
@@ -158,23 +153,15 @@ class RecurrentMemory(MemoryModule):
 
         Gradients flow through every step. Between chunks only the state is kept for the backward pass.
         """
+        advance = self.layer.advance
         start = state = self.init_state(len(x))
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             if torch.is_grad_enabled():
-                state, numbers = checkpoint(
-                    self.layer.advance,
-                    state,
-                    part,
-                    real,
-                    following,
-                    True,
-                    use_reentrant=False,
-                    preserve_rng_state=False,
-                )
+                state, numbers = checkpoint(advance, state, part, real, following, True, use_reentrant=False)
             else:
-                state, numbers = self.layer.advance(state, part, real, following, True)
+                state, numbers = advance(state, part, real, following, True)
             statistics.append(numbers)
         tokens = self.read(state)
         tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
@@ -219,16 +206,17 @@ class RecurrentMemory(MemoryModule):
                 stream.frames, stream.state = frames[:0], None
             new = frames[len(stream.frames) :]
             if len(new):
-                pending[len(new)].append((history, stream, whole_frames(new, self.storage.grid)))
-                stream.frames, stream.updates = frames, stream.updates + len(new)
+                pending[len(new)].append((history, stream, new))
         for group in pending.values():
             state = _stack([self.init_state(1) if stream.state is None else stream.state for _, stream, _ in group])
-            features = torch.stack([history.gather(indices) for history, _, indices in group])
-            positions = np.stack([token_positions(indices, self.storage.grid) for _, _, indices in group])
+            indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
+            features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
+            positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
             everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
             state = self.update(state, features, torch.from_numpy(positions).to(features.device), everywhere)
-            for i, (_, stream, _) in enumerate(group):
+            for i, (_, stream, new) in enumerate(group):
                 stream.state = tuple(tensor[i : i + 1] for tensor in state)
+                stream.frames, stream.updates = np.append(stream.frames, new), stream.updates + len(new)
         return self.read(_stack([stream.state for stream in streams]))
 
     def _by_frame(self, x: Tensor) -> Tensor:
