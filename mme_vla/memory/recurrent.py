@@ -159,7 +159,8 @@ class RecurrentMemory(MemoryModule):
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             if torch.is_grad_enabled():
-                state, numbers = checkpoint(advance, state, part, real, following, True, use_reentrant=False)
+                inputs = (state, part, real, following, True)
+                state, numbers = checkpoint(advance, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
                 state, numbers = advance(state, part, real, following, True)
             statistics.append(numbers)
