@@ -8,7 +8,7 @@ hide everything); only the memory's own parameters are as initialised. Mean over
 
 import torch
 
-from mme_vla.testing import PERCEPTUAL, random_batch, random_history, small_policy
+from mme_vla.testing import NEURAL, random_batch, random_history, small_policy
 
 
 @torch.no_grad()
@@ -30,7 +30,7 @@ def distance(name: str, **overrides: object) -> float:
 
 def main() -> None:
     print("| model | relative distance at initialisation |\n|---|---:|")
-    for name in PERCEPTUAL:
+    for name in NEURAL:
         print(f"| `{name}` | {distance(name):.1e} |")
     exact = distance("framesamp_modul", integration={"exact_identity": True})
     print(f"| `framesamp_modul integration.exact_identity=true` | {exact:.1e} |")

@@ -57,7 +57,7 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     policies = {name: build_policy(name, backbone=args.backbone, device=device) for name in MODELS}
-    batches = {name: random_batch(p, args.batch, valid=p.memory.budget if p.memory else 0).to(device)
+    batches = {name: random_batch(p, args.batch, valid=p.memory.capacity if p.memory else 0).to(device)
                for name, p in policies.items()}  # fmt: skip
     print(f"{machine()}; backbone {args.backbone}, batch {args.batch}, median of {args.rounds}")
     steps = alternate({n: training_step(p, batches[n]) for n, p in policies.items()}, args.rounds)

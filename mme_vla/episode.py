@@ -29,6 +29,8 @@ class Episode:
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
         memory = policy.memory
         self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
+        self.stream = None if memory is None else memory.start_stream()
+        """What the memory carries from one `act` to the next, where it has something to carry."""
         self.frames_seen = 0
 
     def observe(self, frames: Mapping[str, np.ndarray], states: np.ndarray, is_demo: bool | np.ndarray = False) -> None:
@@ -67,10 +69,19 @@ class Episode:
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
-        memory = self._policy.require_memory()
+        history = self.required_history()
+        return self._policy.require_memory().recall(history, len(history) - 1)
+
+    def required_history(self) -> OnlineHistory:
+        """The history, once there is something in it.
+
+        Raises:
+            UserError: the policy has no memory, or the episode has seen no frame.
+        """
+        self._policy.require_memory()
         self._require_observation()
         assert self.history is not None
-        return memory.recall(self.history, len(self.history) - 1)
+        return self.history
 
     @property
     def images(self) -> Tensor:

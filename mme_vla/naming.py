@@ -5,7 +5,7 @@ A room supplies a table for its own modules; an adapter in `weights/` applies th
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -60,6 +60,14 @@ class Unread:
     layer: int | None = None
 
 
+@dataclass(frozen=True)
+class Derived:
+    """A foreign tensor that follows from the configuration: recomputed, never read, and written for other readers."""
+
+    path: str
+    make: Callable[[], Tensor]
+
+
 def prefixed(prefix: str, table: NameTable) -> NameTable:
     """Return the table of a module that sits at `prefix` in its parent."""
     return {f"{prefix}.{name}": pieces for name, pieces in table.items()}
@@ -93,7 +101,25 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return ours
 
 
-def write(table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
+    """Make sure that the constants a checkpoint stores are the ones this configuration gives.
+
+    Raises:
+        UserError: one is not. Real parts count, to bfloat16's precision: some writers rounded or cast them.
+    """
+    for constant in derived:
+        if constant.path in source:
+            stored, ours = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
+            if stored.shape != ours.shape or not torch.allclose(stored, ours, rtol=1e-2, atol=1e-2):
+                raise UserError(
+                    f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
+                    f"gives {tuple(ours.shape)}: it was trained with other sizes or rates; set the same here."
+                )
+
+
+def write(
+    table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor], derived: Iterable[Derived] = ()
+) -> dict[str, Tensor]:
     """Translate our tensors into the foreign names and layouts; what no action reads is written as zeros."""
     layers: dict[str, dict[int, Tensor]] = defaultdict(dict)
     theirs: dict[str, Tensor] = {}
@@ -113,4 +139,5 @@ def write(table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor]
         put(gap.path, gap.layer, example.new_zeros(gap.shape))
     for path, by_layer in layers.items():
         theirs[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
+    theirs |= {constant.path: constant.make() for constant in derived}
     return theirs

@@ -19,7 +19,7 @@ from mme_vla.backbone.pi05 import Pi05Backbone
 from mme_vla.episode import Episode
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
-from mme_vla.memory.base import MemoryModule, stack_history
+from mme_vla.memory.base import MemoryModule
 from mme_vla.pretrained import assign_tensors, load_tensors, save_tensors
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens
@@ -114,7 +114,7 @@ class MMEPolicy(nn.Module):
             memory: memory tokens encoded beforehand; by default they are made from `batch.history`.
 
         Returns:
-            The mean loss, and metrics to log (detached).
+            The mean loss, and metrics to log (detached); the memory's own begin with `memory/`.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
@@ -123,12 +123,15 @@ class MMEPolicy(nn.Module):
         if time is None:
             time = flow.sample_time(len(actions), self.backbone.config.time_distribution, actions.device)
         x_t, target = flow.interpolate(actions, noise, time)
+        with self.autocast():
+            memory = self.encode_memory(batch.history) if memory is None else memory
         losses = flow.step_loss(self.velocity(batch, x_t, time, memory), target)  # b h
         if batch.action_mask is None:
             loss = losses.mean()
         else:
             loss = (losses * batch.action_mask).sum() / batch.action_mask.sum().clamp(min=1)
-        return loss, {"loss": loss.detach()}
+        reported = {} if memory is None else memory.metrics
+        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
         """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
@@ -223,16 +226,23 @@ class MMEPolicy(nn.Module):
             prompt_mask=torch.stack(masks),
         )
         batch = batch.without_prompt_padding().to(self.device)
-        if self.memory is not None:
-            batch.history = stack_history([e.recall() for e in episodes], self.device)
         noise = torch.stack([e.draw_noise() for e in episodes]).to(self.device)
         was_training = self.training
         self.eval()
         try:
-            chunk = self.sample_actions(batch, noise, steps).float().cpu()
+            memory = self._remember(episodes)
+            chunk = self.sample_actions(batch, noise, steps, memory=memory).float().cpu()
         finally:
             self.train(was_training)
         return processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy().astype(np.float32)
+
+    @torch.no_grad()
+    def _remember(self, episodes: Sequence[Episode]) -> MemoryTokens | None:
+        """Memory tokens of running episodes, through what their streams have already taken."""
+        if self.memory is None:
+            return None
+        with self.autocast():
+            return self.memory.remember([e.required_history() for e in episodes], [e.stream for e in episodes])
 
     @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:

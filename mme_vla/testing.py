@@ -12,7 +12,9 @@ from mme_vla.processing.normalize import NormStats, QuantileStats
 from mme_vla.types import Batch, HistoryTokens
 
 PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
-MODELS = ["pi05", *PERCEPTUAL]
+RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
+NEURAL = [*PERCEPTUAL, *RECURRENT]
+MODELS = ["pi05", *NEURAL]
 SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp_dim": 64, "num_heads": 2}
 
 
@@ -44,13 +46,16 @@ def open_gates(policy: MMEPolicy, scale: float = 0.5) -> None:
 
 
 def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> HistoryTokens | None:
-    """`valid` random tokens at random places, the rest padding."""
+    """`valid` random tokens at random places, the rest padding; whole frames where padding goes in front."""
     if policy.memory is None:
         return None
     generator = torch.Generator().manual_seed(seed)
-    n, d = policy.memory.capacity, policy.backbone.config.vlm.width
+    patches, d = policy.memory.storage.grid**2, policy.backbone.config.vlm.width
+    if policy.memory.pad_left:
+        valid = -(-valid // patches) * patches
+    n = policy.memory.padded_length(valid)
     mask = torch.zeros(batch, n, dtype=torch.bool)
-    mask[:, :valid] = True
+    mask[:, slice(n - valid, n) if policy.memory.pad_left else slice(valid)] = True
     features = torch.randn(batch, n, d, generator=generator) * mask[..., None]
     positions = torch.randint(0, 64, (batch, n, 3), generator=generator).float() * mask[..., None]
     return HistoryTokens(features, positions, mask)
@@ -101,10 +106,10 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     return CachedHistory(spec, stored, kept, len(frames), scores, exec_start)
 
 
-def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int) -> OnlineHistory:
+def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
     """The same episode as an environment would deliver it, `chunk` frames at a time."""
     memory = policy.require_memory()
-    history = OnlineHistory(memory.storage, memory.make_scorer())
+    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
     for start in range(0, len(frames), chunk):
         part = frames[start : start + chunk]
         history.append(part, policy.encode_frames(part[history.wanted(len(part))]))

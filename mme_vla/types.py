@@ -6,7 +6,7 @@ b batch · n tokens · d width · t frames · v views (cameras) · h action hori
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
 from torch import Tensor
@@ -23,14 +23,14 @@ class TensorStruct:
 
     def _map(self, fn: Any) -> Self:
         moved = {}
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+        for member in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, member.name)
             if isinstance(value, Tensor):
-                moved[field.name] = fn(value)
+                moved[member.name] = fn(value)
             elif isinstance(value, TensorStruct):
-                moved[field.name] = value._map(fn)
+                moved[member.name] = value._map(fn)
             else:
-                moved[field.name] = value
+                moved[member.name] = value
         return type(self)(**moved)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
@@ -43,8 +43,8 @@ class TensorStruct:
 
     def tensors(self) -> Iterator[Tensor]:
         """Yield every tensor, nested ones included."""
-        for field in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+        for member in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, member.name)
             if isinstance(value, Tensor):
                 yield value
             elif isinstance(value, TensorStruct):
@@ -71,10 +71,12 @@ class MemoryTokens(TensorStruct):
     """What every neural memory hands over: at most `budget` valid tokens.
 
     tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is undefined.
+    metrics: scalars a memory reports of how it came to these tokens, detached.
     """
 
     tokens: Tensor
     mask: Tensor
+    metrics: dict[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass

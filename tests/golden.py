@@ -14,7 +14,7 @@ from mme_vla.policy import MMEPolicy
 from mme_vla.types import Batch, MemoryTokens
 from mme_vla.weights.released import from_released
 
-MEMORY = {"frame_sampling": "framesamp", "token_dropping": "tokendrop"}
+MEMORY = {"frame_sampling": "framesamp", "token_dropping": "tokendrop", "ttt": "ttt", "rmt": "rmt"}
 INTEGRATION = {"context": "context", "modulation": "modulator", "expert": "expert"}
 
 
@@ -46,16 +46,19 @@ def config(about: dict[str, Any]) -> dict[str, Any]:
         horizon=about["action_horizon"],
     )
     sections: dict[str, Any] = {"backbone": {"name": "pi05", **vars(backbone)}, "policy": {"augment": False}}
-    if history.get("representation_type") != "perceptual":
+    if history.get("representation_type") not in ("perceptual", "recurrent"):
         return sections
     feature = history["memory_feature"]
+    kind_of_memory = history[f"{history['representation_type']}_memory"]
     sections["memory"] = {
-        "name": MEMORY[history["perceptual_memory"]["type"]],
+        "name": MEMORY[kind_of_memory["type"]],
         "budget": history["budget"],
         "grid": round(history["token_per_image"] ** 0.5),
         "position_dim": feature["pos"]["input_dim"],
         "position_hidden": feature["pos"]["hidden_dim"],
     }
+    if history["representation_type"] == "recurrent":
+        sections["memory"] |= recurrence(kind_of_memory)
     kind = INTEGRATION[history["integration_type"]]
     sections["integration"] = {"name": kind}
     if kind == "expert":
@@ -63,6 +66,26 @@ def config(about: dict[str, Any]) -> dict[str, Any]:
     if kind == "modulator":
         sections["integration"] |= {key: about["modulator"][key] for key in ("num_heads", "num_kv_heads", "head_dim")}
     return sections
+
+
+def recurrence(about: dict[str, Any]) -> dict[str, Any]:
+    """The options of a golden recurrent memory."""
+    options = {
+        "hidden": about["hidden_dim"],
+        "max_steps": about["max_recur_steps"],
+        "max_video": about["max_pretraj_steps"],
+        "chunk": about["max_recur_steps"] // about["remat_n_mini_batches"],
+    }
+    names = {
+        "rmt": {"heads": "num_attn_heads", "kv_heads": "num_kv_heads"},
+        "ttt": {
+            "heads": "num_ttt_heads",
+            "base_rate": "base_lr",
+            "max_rate": "max_lr",
+            "max_grad_norm": "max_grad_norm",
+        },
+    }[about["type"]]
+    return options | {ours: about[f"{about['type']}_config"][theirs] for ours, theirs in names.items()}
 
 
 def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
@@ -97,7 +120,11 @@ def memory_tokens(policy: MMEPolicy, tensors: dict[str, Tensor]) -> MemoryTokens
     """Encode the golden memory inputs."""
     if policy.memory is None:
         return None
-    encoder: Any = policy.memory.encoder
+    memory: Any = policy.memory
+    encoder = memory.encoder
+    if "in/recur_mask" in tensors:
+        features, positions = (tensors[f"in/recur_{name}"].flatten(2, 3) for name in ("image_emb", "pos_emb"))
+        return memory.run(encoder.encode(features, positions), tensors["in/recur_mask"])
     tokens = encoder.encode(tensors["in/static_image_emb"], tensors["in/static_pos_emb"])
     return MemoryTokens(tokens, tensors["in/static_mask"])
 

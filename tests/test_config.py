@@ -14,7 +14,7 @@ from mme_vla.config import check_overrides, cli, compose, config_dir, import_plu
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
-    f"{memory}_{how}" for memory in ("framesamp", "tokendrop") for how in ("context", "modul", "expert")
+    f"{memory}_{how}" for memory in ("framesamp", "tokendrop", "ttt", "rmt") for how in ("context", "modul", "expert")
 ]
 
 TREE = {

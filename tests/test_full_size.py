@@ -7,11 +7,16 @@ import pytest
 
 from mme_vla import build_policy
 from mme_vla.naming import write
-from mme_vla.weights.released import released_table, released_unread
+from mme_vla.weights.released import released_derived, released_table, released_unread
 
 VARIANTS = {"pi05": "pi05_baseline"} | {
-    f"{memory}_{integration}": f"perceptual-{memory}-{integration}"
-    for memory in ("framesamp", "tokendrop")
+    f"{memory}_{integration}": f"{kind}-{memory}-{integration}"
+    for kind, memory in (
+        ("perceptual", "framesamp"),
+        ("perceptual", "tokendrop"),
+        ("recurrent", "ttt"),
+        ("recurrent", "rmt"),
+    )
     for integration in ("context", "modul", "expert")
 }
 
@@ -23,13 +28,14 @@ def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
     ours = policy.state_dict()
     table = released_table(policy)
     assert set(table) == set(ours), "every tensor of ours has a released place, and no place is invented"
-    written = write(table, released_unread(policy), ours)
+    written = write(table, released_unread(policy), ours, released_derived(policy))
     assert {k: tuple(v.shape) for k, v in written.items()} == {k: tuple(v["shape"]) for k, v in tree["params"].items()}
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_parameter_count_is_the_released_one_less_what_no_action_reads(variant: str, shared):
+def test_parameter_count_is_the_released_one_less_unread_and_derived(variant: str, shared):
     summary = json.loads((shared / "spec" / "param_tree_summary.json").read_text())[VARIANTS[variant]]
     policy = build_policy(variant, backbone="pi05", device="meta")
     unread = sum(math.prod(gap.shape) for gap in released_unread(policy))
-    assert sum(p.numel() for p in policy.parameters()) == summary["total_parameters"] - unread
+    derived = sum(constant.make().numel() for constant in released_derived(policy))
+    assert sum(p.numel() for p in policy.parameters()) == summary["total_parameters"] - unread - derived

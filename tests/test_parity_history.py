@@ -14,6 +14,7 @@ from mme_vla.memory.encoder import position_features
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop, most_changed, ranked_patches
+from mme_vla.memory.ttt import TTT
 from mme_vla.naming import read
 from mme_vla.processing.images import resize_with_pad
 
@@ -87,6 +88,31 @@ def test_selected_tokens_and_positions(buffer, tokens):
             assert error(recalled.features, tensors[f"{key}/image_emb"]) <= TOLERANCE
             position = position_features(recalled.positions, about["pos_dim"]) * recalled.mask[:, None]
             assert error(position, tensors[f"{key}/pos_emb"]) <= TOLERANCE
+
+
+def recurrent(about, entry) -> TTT:
+    """A recurrent memory with the golden limits; which frames it reads does not depend on its layer."""
+    limits = {"max_steps": entry["max_steps"], "max_video": entry["max_video"], "stride": about["recurrent_horizon"]}
+    return TTT(about["img_dim"], 8, budget=64, hidden=8, position_dim=about["pos_dim"], **limits)
+
+
+def test_recurrent_selection_is_exact(buffer, tokens):
+    tensors, about = buffer
+    frames = tensors["in/frames"].numpy()
+    for entry in about["recurrent"]:
+        memory = recurrent(about, entry)
+        history = history_of(memory, frames, tokens, entry["step"])
+        history.exec_start = entry["exec_start"]
+        chosen = memory.select(history, entry["step"])
+        patches = memory.storage.grid**2
+        assert chosen.tolist() == [[f, p] for f in entry["indices"] for p in range(patches)], entry["step"]
+        key = f"out/recurrent_step{entry['step']}_exec{entry['exec_start']}"
+        if f"{key}/mask" in tensors:
+            recalled = memory.recall(history, entry["step"])
+            assert torch.equal(recalled.mask.unflatten(0, (-1, patches)).all(-1), tensors[f"{key}/mask"])
+            assert error(recalled.features, tensors[f"{key}/image_emb"].flatten(0, 2)) <= TOLERANCE
+            position = position_features(recalled.positions, about["pos_dim"]) * recalled.mask[:, None]
+            assert error(position, tensors[f"{key}/pos_emb"].flatten(0, 2)) <= TOLERANCE
 
 
 def test_pooled_tokens_of_a_frame(buffer, tokens):

@@ -7,7 +7,7 @@ import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy import MMEPolicy
-from mme_vla.testing import MODELS, PERCEPTUAL, random_batch, random_history, small_policy
+from mme_vla.testing import MODELS, NEURAL, random_batch, random_history, small_policy
 
 TOLERANCE = 2e-5
 
@@ -17,7 +17,7 @@ def policy(request):
     return small_policy(request.param)
 
 
-@pytest.fixture(params=PERCEPTUAL)
+@pytest.fixture(params=NEURAL)
 def remembering(request):
     return small_policy(request.param)
 
@@ -52,23 +52,26 @@ def test_cached_prefix_equals_the_joint_pass(policy):
 def test_masked_history_cannot_change_the_action(remembering):
     batch = random_batch(remembering, valid=100)
     before = velocity(remembering, batch)
-    batch.history.features[:, 100:] = 1e3
-    batch.history.positions[:, 100:] = 77
+    hidden = ~batch.history.mask
+    assert hidden.any()
+    batch.history.features[hidden] = 1e3
+    batch.history.positions[hidden] = 77
     assert torch.allclose(velocity(remembering, batch), before, atol=TOLERANCE)
 
 
 def test_remembered_history_changes_the_action(remembering):
     batch = random_batch(remembering, valid=100)
     before = velocity(remembering, batch)
-    batch.history.features[:, :100] += 3.0
+    batch.history.features[batch.history.mask] += 3.0
     assert (velocity(remembering, batch) - before).abs().max() > 1e-4
 
 
 def test_order_of_time_matters_through_positions_alone(remembering):
     batch = random_batch(remembering, valid=100)
     before = velocity(remembering, batch)
-    batch.history.positions[:, :100, 0] = batch.history.positions[:, :100, 0].flip(1)
-    assert (velocity(remembering, batch) - before).abs().max() > 1e-5
+    seen = batch.history.mask[0]
+    batch.history.positions[:, seen, 0] = batch.history.positions[:, seen, 0].flip(1)
+    assert (velocity(remembering, batch) - before).abs().max() > 1e-6  # fresh slots hardly move yet
 
 
 def test_padding_of_the_prompt_never_matters(policy):
@@ -186,7 +189,7 @@ def test_prompt_sees_memory_only_if_asked(integration):
 
 
 @pytest.mark.parametrize("budget", [64, 512, 2048])
-@pytest.mark.parametrize("memory", ["framesamp", "tokendrop"])
+@pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt"])
 def test_budget_is_a_number_in_the_config(memory, budget):
     policy = small_policy(f"{memory}_context", memory={"budget": budget})
     batch = random_batch(policy, batch=1, valid=64)
@@ -195,7 +198,9 @@ def test_budget_is_a_number_in_the_config(memory, budget):
     assert velocity(policy, batch).isfinite().all()
 
 
-@pytest.mark.parametrize(("memory", "budget"), [("framesamp", 500), ("tokendrop", 63), ("tokendrop", 4096)])
+@pytest.mark.parametrize(
+    ("memory", "budget"), [("framesamp", 500), ("tokendrop", 63), ("tokendrop", 4096), ("ttt", 4097), ("rmt", 0)]
+)
 def test_a_budget_that_cannot_be_held_is_refused(memory, budget):
     with pytest.raises(UserError, match=f"memory.budget={budget}"):
         build_policy(f"{memory}_context", memory={"budget": budget})

@@ -6,13 +6,13 @@ import torch
 
 from mme_vla import UserError
 from mme_vla.memory.base import stack_history
-from mme_vla.testing import PERCEPTUAL, cached_history, moving_frames, online_history, small_policy
+from mme_vla.testing import NEURAL, cached_history, moving_frames, online_history, small_policy
 from mme_vla.types import Batch
 
 FRAMES = 90
 
 
-@pytest.fixture(params=PERCEPTUAL, scope="module")
+@pytest.fixture(params=NEURAL, scope="module")
 def policy(request):
     return small_policy(request.param, policy={"history_dtype": "float32"})
 
@@ -35,9 +35,9 @@ def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upt
 
 @pytest.mark.parametrize("chunk", [1, 7, 16])
 def test_selection_is_the_same_online_and_from_the_cache(policy, frames, chunk):
-    offline = cached_history(policy, frames)
+    offline = cached_history(policy, frames, exec_start=20)
     for step in (0, 6, 7, 40, FRAMES - 1):
-        online = online_history(policy, frames[: step + 1], chunk)
+        online = online_history(policy, frames[: step + 1], chunk, exec_start=min(20, step + 1))
         assert np.array_equal(policy.memory.select(online, step), policy.memory.select(offline, step)), step
         a, b = policy.memory.recall(online, step), policy.memory.recall(offline, step)
         assert torch.equal(a.mask, b.mask)
@@ -57,7 +57,7 @@ def test_selections_respect_budget_and_time_order(policy, frames):
     history = cached_history(policy, frames)
     for step in range(0, FRAMES, 11):
         chosen = policy.memory.select(history, step)
-        assert len(chosen) <= policy.memory.budget
+        assert len(chosen) <= policy.memory.capacity
         assert (np.diff(chosen[:, 0]) >= 0).all()
         assert chosen[:, 0].max() <= step
         assert len(np.unique(chosen, axis=0)) == len(chosen)
@@ -67,7 +67,7 @@ def test_streaming_and_offline_give_the_same_actions(policy, frames):
     episode = feed(policy, frames)
     streamed = policy.act([episode])
     processor = policy.processor
-    history = stack_history([policy.memory.recall(cached_history(policy, frames), FRAMES - 1)])
+    history = stack_history([policy.memory.recall(cached_history(policy, frames, exec_start=30), FRAMES - 1)])
     prompt, prompt_mask = processor.prompt("pick up the cube")
     batch = Batch(
         images=processor.images([frames[-1], frames[-1][::-1]])[None],

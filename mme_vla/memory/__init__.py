@@ -3,6 +3,6 @@
 Importing this room registers the memories it ships.
 """
 
-from mme_vla.memory import framesamp, tokendrop
+from mme_vla.memory import framesamp, rmt, tokendrop, ttt
 
-__all__ = ["framesamp", "tokendrop"]
+__all__ = ["framesamp", "rmt", "tokendrop", "ttt"]

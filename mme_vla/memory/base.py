@@ -1,6 +1,7 @@
 """`MemoryModule`: choose stored tokens, then encode them into at most `budget` memory tokens."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -43,21 +44,28 @@ class MemoryModule(nn.Module):
         raise NotImplementedError
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        """Encode the selection [b, capacity, d_vision] into memory tokens [b, budget, d]."""
+        """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].
+
+        n is `capacity`, unless `padded_length` asks for less.
+        """
         raise NotImplementedError
 
     def make_scorer(self) -> FrameScorer | None:
         """Return a fresh scorer for one episode, or None when frames need no scores."""
         return None
 
+    def padded_length(self, count: int) -> int:
+        """The length to which a selection of `count` tokens is padded; only left-padded memories may choose it."""
+        return self.capacity
+
     def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        """Select, gather and pad: the unbatched tokens of one step ([capacity, …]), ready to be stacked."""
+        """Select, gather and pad: the unbatched tokens of one step ([padded_length, …]), ready to be stacked."""
         indices = self.select(history, step, rng)
         if len(indices) > self.capacity:
             raise ValueError(f"{type(self).__name__}.select returned {len(indices)} tokens; at most {self.capacity}.")
         features = history.gather(indices)
         positions = torch.from_numpy(token_positions(indices, self.storage.grid)).to(features.device)
-        missing = self.capacity - len(indices)
+        missing = self.padded_length(len(indices)) - len(indices)
         before, after = (missing, 0) if self.pad_left else (0, missing)
         mask = torch.ones(len(indices), dtype=torch.bool, device=features.device)
         return HistoryTokens(
@@ -65,6 +73,23 @@ class MemoryModule(nn.Module):
             positions=nn.functional.pad(positions, (0, 0, before, after)),
             mask=nn.functional.pad(mask, (before, after)),
         )
+
+    def start_stream(self) -> Any:
+        """Return what this memory carries through one episode besides its history; None for nothing."""
+        return None
+
+    def remember(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+        """Memory tokens [n, budget, d] of n running episodes at their latest frames.
+
+        Args:
+            histories: one per episode. streams: what `start_stream` gave each of them; updated in place.
+        """
+        return self(stack_history([self.recall(history, len(history) - 1) for history in histories]))
+
+
+def whole_frames(frames: np.ndarray, grid: int) -> np.ndarray:
+    """All patches of some frames as (frame, patch) [n·grid², 2], frame by frame."""
+    return np.stack(np.meshgrid(frames, np.arange(grid**2), indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
@@ -78,9 +103,12 @@ def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
 
 
 def stack_history(items: Sequence[HistoryTokens], device: torch.device | None = None) -> HistoryTokens:
-    """Stack unbatched selections into one batch [b, capacity, …]."""
+    """Stack unbatched selections into one batch [b, n, …]; shorter ones, of left-padded memories, are padded there."""
+    length = max(len(item.mask) for item in items)
 
     def stack(name: str) -> Tensor:
-        return torch.stack([getattr(item, name) for item in items]).to(device)
+        rows = [getattr(item, name) for item in items]
+        around = [0, 0] * (rows[0].ndim - 1)
+        return torch.stack([nn.functional.pad(row, (*around, length - len(row), 0)) for row in rows]).to(device)
 
     return HistoryTokens(stack("features"), stack("positions"), stack("mask"))

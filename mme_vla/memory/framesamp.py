@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.memory.base import whole_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.perceptual import PerceptualMemory
 from mme_vla.registry import MEMORIES
@@ -36,5 +37,4 @@ class FrameSamp(PerceptualMemory):
         self.frames = budget // grid**2
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        frames, patches = evenly_spaced_frames(step, self.frames), np.arange(self.storage.grid**2)
-        return np.stack(np.meshgrid(frames, patches, indexing="ij"), axis=-1).reshape(-1, 2)
+        return whole_frames(evenly_spaced_frames(step, self.frames), self.storage.grid)

@@ -1,0 +1,255 @@
+"""What the two recurrent memories share: frame after frame enters a small state, and the state is what is read.
+
+Two forms of the same computation: `forward` runs a whole window, for training and for ready batches; `init_state`,
+`update` and `read` take it frame by frame. `remember` uses the second while an episode's frame list grows.
+"""
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule, token_positions, whole_frames
+from mme_vla.memory.encoder import FeatureEncoder
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.sampling import jittered, recurrent_frames
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+State = tuple[Tensor, ...]
+"""What is carried from frame to frame; each tensor [b, …]."""
+
+Statistics = dict[str, Tensor]
+"""Numbers about each step, [b, t], detached."""
+
+
+class RecurrentLayer(nn.Module):
+    """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose."""
+
+    def initial(self, batch: int) -> State:
+        """The learned state before the first frame, for a batch of `batch`."""
+        raise NotImplementedError
+
+    def advance(
+        self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
+    ) -> tuple[State, Statistics]:
+        """Take t frames.
+
+        Args:
+            state: as `initial` or an earlier call gave it.
+            x: encoded frames [b, t, p, d], p tokens each. valid: [b, t]; a padding frame leaves the state as it is.
+            following: frames that come after these before anything is read.
+            statistics: also compute the numbers about each step, which cost time.
+        """
+        raise NotImplementedError
+
+    def read(self, state: State) -> tuple[Tensor, Tensor]:
+        """Tokens [b, budget, d] and their mask [b, budget]."""
+        raise NotImplementedError
+
+    def summary(self, start: State, end: State) -> dict[str, Tensor]:
+        """Numbers about a whole window, from the states around it."""
+        return {}
+
+
+@dataclass
+class RecurrentStream:
+    """How far one episode's recurrence has come.
+
+    frames: those the state has taken, in order. updates: frames taken since the episode began, repeated ones included.
+    """
+
+    frames: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    state: State | None = None
+    updates: int = 0
+
+
+class RecurrentMemory(MemoryModule):
+    """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
+
+    pad_left = True
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        layer: RecurrentLayer,
+        hidden: int,
+        budget: int,
+        grid: int = 8,
+        pooling: str = "mean",
+        max_steps: int = 64,
+        max_video: int = 40,
+        stride: int = 16,
+        jitter: int = 0,
+        chunk: int = 8,
+        position_dim: int | None = None,
+        position_hidden: int | None = None,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            layer: the recurrence, at width `hidden`.
+            budget: memory tokens handed over.
+            grid, pooling: a remembered frame is grid×grid tokens.
+            max_steps, max_video, stride: see `recurrent_frames`.
+            jitter: in training, past frames move at random by up to this many frames, if the data hand over
+                randomness (`data.jitter`).
+            chunk: frames that are recomputed together in the backward pass; windows are padded to a multiple of it.
+            position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
+
+        Raises:
+            UserError: sizes that do not fit together.
+        """
+        super().__init__()
+        sizes = {"max_steps": max_steps, "max_video": max_video, "stride": stride, "chunk": chunk}
+        for key, value in sizes.items():
+            if value < 1:
+                raise UserError(f"memory.{key}={value} must be at least 1.")
+        if not 0 <= 2 * jitter < stride:
+            raise UserError(
+                f"memory.jitter={jitter} must be less than half of memory.stride={stride}: frames keep order."
+            )
+        self.budget, self.capacity = budget, max_steps * grid**2
+        self.storage = StorageSpec(grid, pooling)
+        self.max_steps, self.max_video, self.stride = max_steps, max_video, stride
+        self.jitter, self.chunk = jitter, chunk
+        self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden)
+        self.layer = layer
+        self.output = nn.Linear(hidden, width)
+        nn.init.normal_(self.output.weight, std=0.02)
+        nn.init.zeros_(self.output.bias)
+
+    # Which frames
+
+    def frames(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        """Frames read at `step`, ascending; the last is `step`."""
+        frames = recurrent_frames(step, history.exec_start, self.max_steps, self.max_video, self.stride)
+        return frames if rng is None or not self.jitter else jittered(frames, history.exec_start, self.jitter, rng)
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        return whole_frames(self.frames(history, step, rng), self.storage.grid)
+
+    def padded_length(self, count: int) -> int:
+        """Whole chunks: the steps of a short episode are few, and nothing changes but the time they take."""
+        chunk = self.chunk * self.storage.grid**2
+        return min(-(-count // chunk) * chunk, self.capacity)
+
+    # The window
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        """Encode a window [b, n, d_vision] of whole frames; the result carries the layer's statistics as metrics."""
+        x = self.encoder(history.features, history.positions, history.mask)
+        return self.run(self._by_frame(x), self._by_frame(history.mask).all(-1))
+
+    def run(self, x: Tensor, valid: Tensor) -> MemoryTokens:
+        """Run the recurrence over encoded frames [b, t, p, d], of which `valid` [b, t] are real.
+
+        Gradients flow through every step. Between chunks only the state is kept for the backward pass.
+        """
+        advance = self.layer.advance
+        start = state = self.init_state(len(x))
+        statistics, following = [], x.shape[1]
+        for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
+            following -= part.shape[1]
+            if torch.is_grad_enabled():
+                inputs = (state, part, real, following, True)
+                state, numbers = checkpoint(advance, *inputs, use_reentrant=False, preserve_rng_state=False)
+            else:
+                state, numbers = advance(state, part, real, following, True)
+            statistics.append(numbers)
+        tokens = self.read(state)
+        tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
+        return tokens
+
+    # Frame by frame
+
+    def init_state(self, batch: int) -> State:
+        """The state before the first frame."""
+        return self.layer.initial(batch)
+
+    def update(self, state: State, features: Tensor, positions: Tensor, mask: Tensor) -> State:
+        """Let the next frame, or several whole frames, enter.
+
+        Args:
+            features: [b, n, d_vision], n a multiple of a frame's tokens. positions: [b, n, 3]. mask: [b, n].
+        """
+        x = self.encoder(features, positions, mask)
+        return self.layer.advance(state, self._by_frame(x), self._by_frame(mask).all(-1))[0]
+
+    def read(self, state: State) -> MemoryTokens:
+        """The memory tokens of a state."""
+        tokens, mask = self.layer.read(state)
+        return MemoryTokens(self.output(tokens.to(self.output.weight.dtype)), mask)
+
+    # Episodes
+
+    def start_stream(self) -> RecurrentStream:
+        return RecurrentStream()
+
+    def remember(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+        """Memory tokens of running episodes.
+
+        While an episode's frame list extends the one its stream has taken, only the new frames enter; where it does
+        not (a replan off the stride, or a list that lost its first frames), the stream starts again. Episodes with
+        equally many new frames go through the layer together.
+        """
+        pending: dict[int, list[tuple[History, RecurrentStream, np.ndarray]]] = defaultdict(list)
+        for history, stream in zip(histories, streams, strict=True):
+            frames = self.frames(history, len(history) - 1)
+            if not np.array_equal(frames[: len(stream.frames)], stream.frames):
+                stream.frames, stream.state = frames[:0], None
+            new = frames[len(stream.frames) :]
+            if len(new):
+                pending[len(new)].append((history, stream, new))
+        for group in pending.values():
+            state = _stack([self.init_state(1) if stream.state is None else stream.state for _, stream, _ in group])
+            indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
+            features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
+            positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
+            everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
+            state = self.update(state, features, torch.from_numpy(positions).to(features.device), everywhere)
+            for i, (_, stream, new) in enumerate(group):
+                stream.state = tuple(tensor[i : i + 1] for tensor in state)
+                stream.frames, stream.updates = np.append(stream.frames, new), stream.updates + len(new)
+        return self.read(_stack([stream.state for stream in streams]))
+
+    def _by_frame(self, x: Tensor) -> Tensor:
+        return x.unflatten(1, (-1, self.storage.grid**2))
+
+    @staticmethod
+    def _metrics(statistics: Sequence[Statistics], valid: Tensor) -> dict[str, Tensor]:
+        """Mean over the real frames of a batch."""
+        count = valid.sum().clamp(min=1)
+        names = statistics[0] if statistics else {}
+        return {name: (torch.cat([s[name] for s in statistics], 1) * valid).sum() / count for name in names}
+
+
+def _stack(states: Sequence[State]) -> State:
+    return tuple(torch.cat(tensors) for tensors in zip(*states, strict=True))
+
+
+def full_precision(x: Tensor) -> torch.autocast:
+    """The context recurrent layers run in: no autocast, so that hundreds of small steps do not round."""
+    return torch.autocast(x.device.type if x.device.type != "meta" else "cpu", enabled=False)
+
+
+def linear(layer: nn.Linear, x: Tensor) -> Tensor:
+    """Apply a linear layer in float32, whatever its weights are stored in."""
+    return nn.functional.linear(x, layer.weight.float(), None if layer.bias is None else layer.bias.float())
+
+
+def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
+    """Apply a layer norm in float32."""
+    return nn.functional.layer_norm(x, norm.normalized_shape, norm.weight.float(), norm.bias.float(), norm.eps)
+
+
+def default_hidden(d_vision: int, hidden: int | None) -> int:
+    """A quarter of the vision width, at least 64: 512 at full size, as released."""
+    return hidden or max(64, d_vision // 4)

@@ -1,0 +1,173 @@
+"""RMT: memory as a fixed set of slots that look at every frame and at each other (paper, section 4.2)."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError
+from mme_vla.memory.recurrent import (
+    RecurrentLayer,
+    RecurrentMemory,
+    State,
+    Statistics,
+    default_hidden,
+    full_precision,
+    layer_norm,
+    linear,
+)
+from mme_vla.registry import MEMORIES
+
+EPS = 1e-6
+BASE = 10_000.0
+ROTATIONS = ("full", "cosine_only")
+ATTENTION_DTYPES = {"bfloat16": torch.bfloat16, "float32": torch.float32}
+
+
+def angles(count: int, head_dim: int, device: torch.device | None = None) -> Tensor:
+    """p·10000^(−2i/h) for positions 0 … count − 1: [count, h/2] float32."""
+    exponent = torch.arange(0, head_dim, 2, device=device, dtype=torch.float32) / head_dim
+    return torch.arange(count, device=device, dtype=torch.float32)[:, None] / BASE**exponent
+
+
+class RMTLayer(RecurrentLayer):
+    """Slots m ← norm(m + attention(m → [frame | m])), queries from the slots alone, grouped keys.
+
+    State: the slots [b, budget, d], carried in the dtype their initial values are stored in.
+    """
+
+    def __init__(
+        self,
+        hidden: int,
+        heads: int,
+        kv_heads: int,
+        budget: int,
+        rotation: str = "full",
+        attention_dtype: str = "bfloat16",
+    ) -> None:
+        super().__init__()
+        if hidden % (2 * heads) or heads % kv_heads:
+            raise UserError(
+                f"memory.hidden={hidden}, memory.heads={heads}, memory.kv_heads={kv_heads} do not fit: hidden must be "
+                "an even multiple of heads, and heads a multiple of kv_heads."
+            )
+        if rotation not in ROTATIONS:
+            raise UserError(f"memory.rotation={rotation!r}: choose one of {', '.join(ROTATIONS)}.")
+        if attention_dtype not in ATTENTION_DTYPES:
+            raise UserError(f"memory.attention_dtype={attention_dtype!r}: choose one of {', '.join(ATTENTION_DTYPES)}.")
+        self.head_dim, self.kv_heads = hidden // heads, kv_heads
+        self.rotation, self.attention_dtype = rotation, ATTENTION_DTYPES[attention_dtype]
+        self.q = nn.Linear(hidden, hidden, bias=False)
+        self.kv = nn.Linear(hidden, 2 * kv_heads * self.head_dim, bias=False)
+        self.out = nn.Linear(hidden, hidden, bias=False)
+        self.pre_norm, self.post_norm = nn.LayerNorm(hidden, eps=EPS), nn.LayerNorm(hidden, eps=EPS)
+        self.slots = nn.Parameter(torch.randn(budget, hidden) * hidden**-0.5)
+        for layer, std in ((self.q, 0.02), (self.kv, 0.02), (self.out, 0.005)):
+            nn.init.normal_(layer.weight, std=std)
+
+    def initial(self, batch: int) -> State:
+        return (self.slots.expand(batch, *self.slots.shape),)
+
+    def advance(
+        self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
+    ) -> tuple[State, Statistics]:
+        with full_precision(x):
+            (slots,), patches, changes = state, x.shape[2], []
+            # Recomputed, not stored: frame tokens come first, and any number of slots after them.
+            turn = angles(patches + slots.shape[1], self.head_dim, x.device)
+            of_frame, of_slots = turn[:patches], turn[patches:]
+            frame_k, frame_v = self._keys_values(layer_norm(self.pre_norm, x.float()), of_frame)  # b t p kv h
+            for t in range(x.shape[1]):
+                seen = layer_norm(self.pre_norm, slots.float())
+                k, v = self._keys_values(seen, of_slots)
+                k, v = torch.cat([frame_k[:, t], k], 1), torch.cat([frame_v[:, t], v], 1)
+                q = self._rotate(linear(self.q, seen).unflatten(-1, (-1, self.head_dim)), of_slots)
+                answer = linear(self.out, self._attend(q, k, v)) + slots.float()
+                updated = layer_norm(self.post_norm, answer).to(slots.dtype)
+                new = torch.where(valid[:, t, None, None], updated, slots)
+                if statistics:
+                    changes.append(_relative_distance(slots, new))
+                slots = new
+            return (slots,), {"slot_change": torch.stack(changes, 1)} if statistics else {}
+
+    def read(self, state: State) -> tuple[Tensor, Tensor]:
+        (slots,) = state
+        return slots, torch.ones(slots.shape[:2], dtype=torch.bool, device=slots.device)
+
+    def _keys_values(self, x: Tensor, turn: Tensor) -> tuple[Tensor, Tensor]:
+        k, v = linear(self.kv, x).unflatten(-1, (2 * self.kv_heads, self.head_dim)).chunk(2, -2)
+        return self._rotate(k, turn), v
+
+    def _rotate(self, x: Tensor, turn: Tensor) -> Tensor:
+        """Turn the pairs (2i, 2i + 1) of [..., n, heads, h] by angles [n, h/2]."""
+        cos, sin = turn.cos()[:, None], turn.sin()[:, None]
+        a, b = x[..., 0::2], x[..., 1::2]
+        if self.rotation == "cosine_only":
+            return torch.stack([a * cos, b * cos], -1).flatten(-2)
+        return torch.stack([a * cos - b * sin, a * sin + b * cos], -1).flatten(-2)
+
+    def _attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Every slot looks at every key: q [b, n, heads, h], k and v [b, m, kv, h] → [b, n, heads·h] float32."""
+        b, n, heads, h = q.shape
+        # Without a mask, the queries that share a key head are simply more queries of that head.
+        q = q.unflatten(2, (self.kv_heads, -1)).permute(0, 2, 3, 1, 4).flatten(2, 3)  # b kv (g n) h
+        k, v = k.transpose(1, 2), v.transpose(1, 2)
+        if self.attention_dtype == torch.float32:
+            mixed = nn.functional.scaled_dot_product_attention(q, k, v)
+        else:
+            mixed = attend_rounded(q, k, v, self.attention_dtype)
+        return mixed.view(b, heads, n, h).transpose(1, 2).flatten(2)
+
+
+def attend_rounded(q: Tensor, k: Tensor, v: Tensor, dtype: torch.dtype) -> Tensor:
+    """Attention that rounds where the released code does: inputs, weights and result to `dtype`; softmax in float32.
+
+    Fused kernels round the weights before they are normalised, which moves a slot by up to 2 % over a window.
+    """
+    q, k, v = q.to(dtype), k.to(dtype), v.to(dtype)
+    weights = ((q.float() * q.shape[-1] ** -0.5) @ k.float().transpose(-1, -2)).softmax(-1)
+    return (weights.to(dtype) @ v).float()
+
+
+@torch.no_grad()
+def _relative_distance(before: Tensor, after: Tensor) -> Tensor:
+    before, after = before.float().flatten(1), after.float().flatten(1)
+    return (after - before).norm(dim=1) / before.norm(dim=1)
+
+
+@MEMORIES.register("rmt")
+class RMT(RecurrentMemory):
+    """`budget` slots after the last frame; all of them count."""
+
+    def __init__(
+        self,
+        d_vision: int,
+        width: int,
+        budget: int = 512,
+        hidden: int | None = None,
+        heads: int | None = None,
+        kv_heads: int = 1,
+        rotation: str = "full",
+        attention_dtype: str = "bfloat16",
+        **options: Any,
+    ) -> None:
+        """See `RecurrentMemory` and `RMTLayer`.
+
+        Args:
+            hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64.
+            heads, kv_heads: query and key heads of the slots' attention; None is a head for each 64 of `hidden`, at
+                least 2.
+            rotation: `full`, or `cosine_only`: what the released evaluation ran, because its loading dropped the
+                imaginary part of the rotary table.
+            attention_dtype: what queries, keys and values are cast to; `bfloat16` as released, `float32` faster on
+                a CPU.
+
+        Raises:
+            UserError: sizes that do not fit together, or an unknown choice.
+        """
+        if budget < 1:
+            raise UserError(f"memory.budget={budget} must be at least 1.")
+        hidden = default_hidden(d_vision, hidden)
+        heads = heads or max(2, hidden // 64)
+        layer = RMTLayer(hidden, heads, kv_heads, budget, rotation, attention_dtype)
+        super().__init__(d_vision, width, layer, hidden, budget, **options)

@@ -1,0 +1,291 @@
+"""What recurrent memories promise beyond every memory: the window and the stream are one, and cost what they should."""
+
+import numpy as np
+import pytest
+import torch
+
+from mme_vla import UserError, build_policy
+from mme_vla.memory.base import stack_history
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.recurrent import RecurrentMemory
+from mme_vla.memory.rmt import RMT
+from mme_vla.memory.sampling import jittered, recurrent_frames
+from mme_vla.memory.ttt import TTT
+from mme_vla.testing import moving_frames, random_batch, small_policy
+from mme_vla.types import HistoryTokens
+from mme_vla.weights.released import from_released, to_released
+
+GRID = 2
+D_VISION = 24
+TOLERANCE = 1e-5
+MEMORIES = {
+    "ttt": lambda **o: TTT(D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, **o}),
+    "rmt": lambda **o: RMT(
+        D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, "attention_dtype": "float32", **o}
+    ),
+}
+
+
+@pytest.fixture(params=MEMORIES)
+def make(request):
+    """Return the constructor of a small memory; every call draws the same weights, far from their tame start."""
+
+    def build(**options) -> RecurrentMemory:
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            memory = MEMORIES[request.param](**options).eval()
+            for parameter in memory.parameters():
+                torch.nn.init.normal_(parameter, std=0.5)
+        return memory
+
+    return build
+
+
+class RandomHistory(History):
+    """An endless episode of random tokens; counts the tokens that are asked for."""
+
+    def __init__(self, length: int, exec_start: int = 0) -> None:
+        super().__init__(StorageSpec(GRID), exec_start)
+        self.length, self.gathered = length, 0
+
+    def __len__(self) -> int:
+        return self.length
+
+    def gather(self, indices: np.ndarray) -> torch.Tensor:
+        self.gathered += len(indices)
+        rows = [np.random.default_rng([int(f), int(p)]).normal(size=D_VISION) for f, p in indices]
+        return torch.from_numpy(np.stack(rows)).float()
+
+
+def window(memory: RecurrentMemory, length: int, exec_start: int = 0) -> HistoryTokens:
+    return stack_history([memory.recall(RandomHistory(length, exec_start), length - 1)])
+
+
+def same_memory(a, b) -> bool:
+    return torch.equal(a.mask, b.mask) and torch.allclose(a.tokens[a.mask], b.tokens[b.mask], atol=TOLERANCE)
+
+
+@torch.no_grad()
+def test_frame_by_frame_equals_the_window(make):
+    memory = make()
+    tokens = window(memory, 150)
+    state = memory.init_state(1)
+    for part in zip(*(x.split(GRID**2, 1) for x in (tokens.features, tokens.positions, tokens.mask)), strict=True):
+        state = memory.update(state, *part)
+    assert same_memory(memory.read(state), memory(tokens))
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("exec_start", [0, 30])
+def test_a_growing_list_costs_one_update_a_frame(make, exec_start):
+    memory, stream = make(), None
+    history = RandomHistory(exec_start + 1, exec_start)
+    stream = memory.start_stream()
+    memory.remember([history], [stream])
+    before, gathered = stream.updates, history.gathered
+    for replan in range(1, 5):
+        history.length += 16
+        now = memory.remember([history], [stream])
+        assert stream.updates == before + replan
+        assert history.gathered == gathered + replan * GRID**2
+        assert same_memory(now, memory(window(memory, len(history), exec_start)))
+    memory.remember([history], [stream])
+    assert stream.updates == before + 4, "nothing new was seen"
+
+
+@torch.no_grad()
+def test_any_other_list_is_computed_anew(make):
+    memory = make(max_steps=6)
+    history, stream = RandomHistory(81), memory.start_stream()
+    memory.remember([history], [stream])
+    assert stream.updates == 6
+    for more, frames in ((5, 6), (16, 6)):  # off the stride; then on it, but the earliest frame has fallen out
+        before, history.length = stream.updates, history.length + more
+        now = memory.remember([history], [stream])
+        assert stream.updates == before + frames
+        assert same_memory(now, memory(window(memory, len(history))))
+
+
+@torch.no_grad()
+def test_episodes_at_different_places_share_a_call(make):
+    memory = make()
+    histories = [RandomHistory(20), RandomHistory(1), RandomHistory(90, 40), RandomHistory(20)]
+    streams = [memory.start_stream() for _ in histories]
+    for _ in range(2):
+        together = memory.remember(histories, streams)
+        for i, history in enumerate(histories):
+            alone = memory(window(memory, len(history), history.exec_start))
+            assert torch.equal(together.mask[i], alone.mask[0])
+            assert torch.allclose(together.tokens[i][alone.mask[0]], alone.tokens[alone.mask], atol=TOLERANCE)
+            history.length += 16
+
+
+def test_acting_carries_the_state_in_the_episode(monkeypatch):
+    policy = small_policy("ttt_modul")
+    counted = []
+    advance = policy.memory.layer.advance
+
+    def counting(state, x, *rest):
+        counted.append(x.shape[1])
+        return advance(state, x, *rest)
+
+    monkeypatch.setattr(policy.memory.layer, "advance", counting)
+    frames = moving_frames(50)
+    episode = policy.start_episode("press the button")
+    for start, stop in ((0, 1), (1, 17), (17, 33), (33, 40)):
+        view = {"image": frames[start:stop], "wrist_image": frames[start:stop]}
+        episode.observe(view, np.zeros((stop - start, 8), np.float32))
+        policy.act([episode])
+    assert counted == [1, 1, 1, 3]  # the last replan came off the stride
+    assert episode.stream.updates == 6
+
+
+@torch.no_grad()
+def test_front_padding_never_matters(make):
+    memory = make(max_steps=64)
+    tokens = window(memory, 40)
+    assert tokens.mask.shape[1] == 4 * GRID**2, "a short episode is padded to a chunk, not to 64 frames"
+    around = memory.capacity - tokens.mask.shape[1]
+    padded = HistoryTokens(
+        torch.nn.functional.pad(tokens.features, (0, 0, around, 0), value=9.0),
+        torch.nn.functional.pad(tokens.positions, (0, 0, around, 0), value=9.0),
+        torch.nn.functional.pad(tokens.mask, (around, 0)),
+    )
+    assert same_memory(memory(tokens), memory(padded))
+
+
+def test_selections_of_different_length_stack(make):
+    memory = make()
+    items = [memory.recall(RandomHistory(length), length - 1) for length in (10, 100)]
+    stacked = stack_history(items)
+    assert stacked.mask.sum(1).tolist() == [GRID**2, 7 * GRID**2]
+    assert stacked.mask[:, -(GRID**2) :].all()
+    with torch.no_grad():
+        both = memory(stacked)
+        short = memory(stack_history(items[:1]))
+    assert torch.allclose(both.tokens[0][short.mask[0]], short.tokens[short.mask], atol=TOLERANCE)
+
+
+def test_chunks_change_neither_numbers_nor_gradients(make):
+    results = []
+    for chunk in (1, 3, 64):
+        memory = make(chunk=chunk)
+        out = memory(window(memory, 200))
+        loss = (out.tokens * out.mask[..., None]).square().sum()
+        gradients = torch.autograd.grad(loss, memory.parameters())
+        results.append((loss.detach(), torch.cat([gradient.flatten() for gradient in gradients])))
+    for loss, gradient in results[1:]:
+        assert torch.allclose(loss, results[0][0], rtol=1e-5)
+        assert torch.allclose(gradient, results[0][1], rtol=1e-3, atol=1e-4 * float(gradient.abs().max()))
+
+
+def test_gradients_flow_through_every_step(make):
+    memory = make()
+    tokens = window(memory, 200)
+    tokens.features.requires_grad_(True)
+    memory(tokens).tokens[:, -1].sum().backward()
+    frames = tokens.features.grad.unflatten(1, (-1, GRID**2)).abs().sum((0, 2, 3))
+    real = tokens.mask.unflatten(1, (-1, GRID**2)).all(-1)[0]
+    assert (frames[real] > 0).all()
+    assert (frames[~real] == 0).all()
+
+
+def test_layers_compile_without_breaks(make):
+    memory = make()
+    x, valid = torch.randn(2, 4, GRID**2, 16), torch.tensor([[False, True, True, True], [True] * 4])
+    compiled = torch.compile(memory.layer.advance, backend="eager", fullgraph=True)
+    ours, theirs = (f(memory.init_state(2), x, valid)[0] for f in (memory.layer.advance, compiled))
+    assert all(torch.allclose(a, b, atol=TOLERANCE) for a, b in zip(ours, theirs, strict=True))
+
+
+TTT_METRICS = [
+    "inner_loss_before",
+    "inner_loss_after",
+    "step_size",
+    "clipped_rates",
+    "clipped_gradients",
+    "weight_change",
+]
+
+
+@pytest.mark.parametrize(("model", "names"), [("ttt_modul", TTT_METRICS), ("rmt_modul", ["slot_change"])])
+def test_inner_statistics_are_metrics(model, names):
+    policy = small_policy(model)
+    _, metrics = policy(random_batch(policy))
+    assert sorted(metrics) == sorted(["loss", *(f"memory/{name}" for name in names)])
+    assert all(value.ndim == 0 and torch.isfinite(value) and not value.requires_grad for value in metrics.values())
+    if "memory/step_size" in metrics:
+        assert float(metrics["memory/step_size"]) == pytest.approx(0.01, rel=0.5)
+        assert metrics["memory/inner_loss_after"] < metrics["memory/inner_loss_before"]
+
+
+def test_inner_updates_round_to_the_dtype_of_the_stored_state(make):
+    memory = make().to(torch.bfloat16)
+    state = memory.layer.advance(memory.init_state(1), torch.randn(1, 3, GRID**2, 16), torch.ones(1, 3).bool())[0]
+    assert state[0].dtype == torch.bfloat16
+    assert memory(window(memory, 40)).tokens.isfinite().all()
+
+
+def test_frames_of_a_running_video_are_those_of_the_finished_episode():
+    for step in range(60):
+        running = recurrent_frames(step, step + 1)
+        assert running.tolist() == recurrent_frames(step, 700).tolist()
+        assert (np.diff(running) > 0).all()
+        assert running[-1] == step
+
+
+def test_jitter_keeps_order_parts_and_the_current_frame():
+    memory = TTT(D_VISION, 16, jitter=5)
+    history = RandomHistory(400, exec_start=100)
+    fixed = memory.frames(history, 399)
+    assert np.array_equal(fixed, recurrent_frames(399, 100)), "without randomness nothing moves"
+    moved = memory.frames(history, 399, np.random.default_rng(0))
+    assert not np.array_equal(fixed, moved)
+    assert (np.diff(moved) > 0).all()
+    assert moved[-1] == 399
+    assert (moved < 100).sum() == (fixed < 100).sum()
+    assert np.abs(moved - fixed).max() <= 5
+    for step in range(40):
+        frames = jittered(recurrent_frames(step, 20), 20, 7, np.random.default_rng(step))
+        assert frames[0] >= 0
+        assert (np.diff(frames) > 0).all()
+        assert frames[-1] == step
+
+
+@torch.no_grad()
+def test_cosine_only_is_another_memory():
+    memory = MEMORIES["rmt"]()
+    torch.nn.init.normal_(memory.layer.q.weight)
+    torch.nn.init.normal_(memory.layer.kv.weight)
+    full = memory(window(memory, 100)).tokens
+    memory.layer.rotation = "cosine_only"
+    assert not torch.allclose(full, memory(window(memory, 100)).tokens, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "message"),
+    [
+        ("rmt_modul", {"rotation": "sine"}, "cosine_only"),
+        ("rmt_modul", {"attention_dtype": "int8"}, "bfloat16"),
+        ("rmt_modul", {"heads": 3}, "even multiple of heads"),
+        ("ttt_modul", {"heads": 3}, "multiple of memory.heads=3"),
+        ("ttt_modul", {"max_rate": 0}, "above 0"),
+        ("ttt_modul", {"jitter": 8}, "memory.jitter=8"),
+        ("ttt_modul", {"chunk": 0}, "memory.chunk=0"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(model, options, message):
+    with pytest.raises(UserError, match=message):
+        build_policy(model, memory=options)
+
+
+@pytest.mark.parametrize(("model", "constant"), [("ttt_modul", "ttt_base_lr_inv"), ("rmt_modul", "freqs_cis")])
+def test_derived_constants_are_written_and_checked(model, constant):
+    policy, path = small_policy(model), f"mem_encoder/recur_layer/{constant}"
+    tree = to_released(policy)
+    assert path in tree
+    assert not tree["mem_encoder/pre_norm/scale"].any()
+    assert from_released(small_policy(model), {k: v for k, v in tree.items() if k != path})
+    tree[path] = tree[path] + 1
+    with pytest.raises(UserError, match=constant):
+        from_released(small_policy(model), tree)
