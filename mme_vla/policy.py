@@ -232,7 +232,10 @@ class MMEPolicy(nn.Module):
             chunk = self.sample_actions(batch, noise, steps).float().cpu()
         finally:
             self.train(was_training)
-        return processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy().astype(np.float32)
+        actions = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy()
+        for episode, chosen in zip(episodes, actions, strict=True):
+            episode.acted(chosen)
+        return actions
 
     @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:

@@ -342,7 +342,9 @@ def test_no_loggers_write_nothing(tmp_path: Path) -> None:
 
 
 def test_loss_change_compares_both_ends() -> None:
-    lines = [{"step": step, "train/loss": float(100 - step)} for step in range(10, 101, 10)] + [{"step": 9, "val/loss": 7}]
+    lines = [{"step": step, "train/loss": float(100 - step)} for step in range(10, 101, 10)] + [
+        {"step": 9, "val/loss": 7}
+    ]
     assert loss_change(lines) == {"first_loss": 90.0, "last_loss": 0.0, "val_loss": 7}
     assert loss_change([]) == {}
 
