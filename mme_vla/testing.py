@@ -11,7 +11,7 @@ from mme_vla.policy import MMEPolicy
 from mme_vla.processing.normalize import NormStats, QuantileStats
 from mme_vla.types import Batch, HistoryTokens
 
-PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
+PERCEPTUAL = NEURAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
 MODELS = ["pi05", *PERCEPTUAL]
 SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp_dim": 64, "num_heads": 2}
 
