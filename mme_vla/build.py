@@ -13,7 +13,7 @@ from mme_vla.errors import UserError
 from mme_vla.policy import MMEPolicy
 from mme_vla.processing.processor import Processor
 
-SECTIONS = ("name", "plugins", "backbone", "memory", "integration", "policy", "processor")
+SECTIONS = ("name", "plugins", "backbone", "memory", "integration", "policy", "processor", "subgoal_text")
 
 
 def build_policy(

@@ -32,14 +32,24 @@ class Episode:
         self.stream = None if memory is None else memory.start_stream()
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.frames_seen = 0
+        self._chunk: np.ndarray | None = None
+        self._executed = np.zeros((0, 8), np.float32)
 
-    def observe(self, frames: Mapping[str, np.ndarray], states: np.ndarray, is_demo: bool | np.ndarray = False) -> None:
+    def observe(
+        self,
+        frames: Mapping[str, np.ndarray],
+        states: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+    ) -> None:
         """Take frames in order, each once, the current one last; the conditioning video comes first.
 
         Args:
             frames: `image` and `wrist_image`, each [t, H, W, 3] uint8.
             states: [t, 8]; seven joint angles and the first finger's position.
             is_demo: whether the frames belong to the conditioning video; one bool, or [t].
+            actions: [t, 8] absolute actions that led to these frames. By default they are the first t of the last
+                chunk, one action a frame; give them where something else was executed.
 
         Raises:
             UserError: a missing view, a wrong dtype or shape, or a video frame after execution has begun.
@@ -61,6 +71,7 @@ class Episode:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
             wanted = self.history.wanted(len(front))
             self.history.append(front, self._policy.encode_frames(front[wanted]))
+        self._remember_actions(int((~demo).sum()), actions)
         self._video_over = self._video_over or not bool(demo[-1])
         self.frames_seen += len(front)
         processor = self._policy.require_processor()
@@ -100,7 +111,24 @@ class Episode:
     @property
     def prompt(self) -> tuple[Tensor, Tensor]:
         """Token ids and mask of the goal, and the subgoal where the policy reads one."""
-        return self._policy.require_processor().prompt(self.goal, subgoal=self.subgoal, state=self._state)
+        processor = self._policy.require_processor()
+        return processor.prompt(self.goal, subgoal=self.subgoal, state=self._state, past_actions=self._executed)
+
+    def acted(self, chunk: np.ndarray) -> None:
+        """Note the chunk [h, 8] the policy chose; the frames that follow say how much of it was executed."""
+        self._chunk = chunk
+
+    def _remember_actions(self, count: int, actions: np.ndarray | None) -> None:
+        if actions is None:
+            executed = np.zeros((0, 8), np.float32) if self._chunk is None else self._chunk[:count]
+            self._chunk = None if self._chunk is None else self._chunk[count:]
+        else:
+            executed = np.asarray(actions, np.float32)[len(actions) - count :]
+            if executed.shape != (count, 8):
+                raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
+        longest = self._policy.require_processor().prompt_format.past_actions
+        executed = np.concatenate([self._executed, executed])
+        self._executed = executed[max(len(executed) - longest, 0) :]
 
     def draw_noise(self) -> Tensor:
         """The next chunk's starting noise [h, a], from this episode's own generator: batching cannot change it."""

@@ -234,7 +234,10 @@ class MMEPolicy(nn.Module):
             chunk = self.sample_actions(batch, noise, steps, memory=memory).float().cpu()
         finally:
             self.train(was_training)
-        return processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy().astype(np.float32)
+        actions = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy()
+        for episode, chosen in zip(episodes, actions, strict=True):
+            episode.acted(chosen)
+        return actions
 
     @torch.no_grad()
     def _remember(self, episodes: Sequence[Episode]) -> MemoryTokens | None:

@@ -20,6 +20,7 @@ from mme_vla.data.splits import split_episodes
 from mme_vla.data.stats import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.processing.processor import Processor
+from mme_vla.processing.subgoals import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
 
 PNG = ConvertOptions(images="png")
@@ -152,7 +153,7 @@ def test_an_item_decodes_its_two_current_pictures_only(data, processor, caches, 
 
 def test_subgoals_reach_the_prompt_through_the_choice_given(data) -> None:
     processor = Processor(28, Tokenizer.load("sample"), prompt="subgoal", stats=compute_norm_stats(data[0]))
-    dataset = TrainingDataset(data[0], processor, subgoal=lambda texts, rng: texts["simple_subgoal_online"])
+    dataset = TrainingDataset(data[0], processor, subgoal=SubgoalText("simple_subgoal", online_probability=1.0))
     assert torch.equal(dataset[0]["prompt"], processor.prompt("do task 0", "pick up 1 online")[0])
 
 

@@ -1,6 +1,6 @@
 """The training dataset: one item is one step of an execution phase."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,9 +14,8 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule, stack_history
 from mme_vla.processing.processor import Processor
+from mme_vla.processing.subgoals import SubgoalText
 from mme_vla.types import VIEWS, Batch
-
-SubgoalChoice = Callable[[Mapping[str, str], np.random.Generator], str | None]
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         action_offset: int = 0,
         mask_padding: bool = False,
         jitter: bool = False,
-        subgoal: SubgoalChoice | None = None,
+        subgoal: SubgoalText | None = None,
         seed: int = 42,
     ) -> None:
         """Arrange the samples; nothing is read yet.
@@ -87,6 +86,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             )
         if not 0 <= action_offset <= 1:
             raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
+        if processor.prompt_format.reads_subgoal and subgoal is None:
+            raise UserError(
+                f"The prompt format {processor.prompt_name!r} reads a subgoal: set subgoal_text.kind to "
+                "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain."
+            )
+        if subgoal is not None:
+            _check_subgoals(sources, subgoal)
         self.sources, self.processor, self.memory = list(sources), processor, memory
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
@@ -138,12 +144,22 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             recorded=recorded,
         )
 
+    def past_actions(self, step: Step) -> np.ndarray:
+        """The robot's own actions right before the chunk, [n, 8], as many as the prompt reads and there are."""
+        first = step.index + self.action_offset
+        start = max(step.exec_start, first - self.processor.prompt_format.past_actions)
+        if start >= first:
+            return np.zeros((0, 8), np.float32)
+        return self.sources[step.source].actions(step.episode, start, first)
+
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
         source = self.sources[step.source]
         rng = np.random.default_rng([self.seed, self.epoch, index])
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
-        prompt, prompt_mask = self.processor.prompt(step.goal, subgoal=subgoal, state=step.state)
+        prompt, prompt_mask = self.processor.prompt(
+            step.goal, subgoal=subgoal, state=step.state, past_actions=self.past_actions(step)
+        )
         item = {
             "images": self.processor.images([source.frames(step.episode, [step.index], view)[0] for view in VIEWS]),
             "prompt": prompt,
@@ -160,6 +176,16 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             history = self.caches[step.source].history(step.episode)
             item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
         return item
+
+
+def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:
+    for source in sources:
+        lacking = sorted(set(subgoal.columns) - set(source.subgoal_names))
+        if lacking:
+            raise UserError(
+                f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
+                f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}."
+            )
 
 
 def collate(items: Sequence[dict[str, Any]]) -> Batch:

@@ -6,6 +6,7 @@ from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_w
 from mme_vla.processing.normalize import NormStats, QuantileStats, RunningStats, normalize, unnormalize
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.prompt import PROMPTS, PromptFormat, PromptInput, encode_prompt
+from mme_vla.processing.subgoals import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
 
 __all__ = [
@@ -16,6 +17,7 @@ __all__ = [
     "PromptInput",
     "QuantileStats",
     "RunningStats",
+    "SubgoalText",
     "Tokenizer",
     "as_uint8_frames",
     "augment_views",

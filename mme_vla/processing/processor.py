@@ -115,7 +115,11 @@ class Processor:
         return resize_with_pad(array.to(device) if device is not None else array, self.image_size)
 
     def prompt(
-        self, goal: str, subgoal: str | None = None, state: np.ndarray | Tensor | None = None
+        self,
+        goal: str,
+        subgoal: str | None = None,
+        state: np.ndarray | Tensor | None = None,
+        past_actions: np.ndarray | Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Tokenise the prompt.
 
@@ -123,17 +127,23 @@ class Processor:
             goal: the task in words.
             subgoal: the language subgoal; formats that do not use one ignore it.
             state: [8] raw state; formats that do not use it ignore it.
+            past_actions: [n, 8] absolute actions executed so far, oldest first; formats that do not use them ignore
+                them, the others read the last ones, relative to `state`.
 
         Returns:
             ids [l] int64 and mask [l] bool.
 
         Raises:
-            UserError: the format needs a state and there is none, or no statistics to normalise it.
+            UserError: the format needs a state or actions that are not given, or statistics to normalise them.
         """
-        normalised = None
+        normalised, past = None, None
         if state is not None and self.prompt_format.reads_state:
             normalised = normalize(_float(state), self._need_stats().state).numpy()
-        given = PromptInput(goal, subgoal, normalised)
+        wanted = self.prompt_format.past_actions
+        if wanted and state is not None and past_actions is not None:
+            recent = to_deltas(_float(past_actions)[-wanted:], _float(state))
+            past = normalize(recent, self._need_stats().actions).numpy()
+        given = PromptInput(goal, subgoal, normalised, past)
         return encode_prompt(self.prompt_format, self.tokenizer, given, self.prompt_length)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:

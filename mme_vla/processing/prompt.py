@@ -11,7 +11,7 @@ from mme_vla.errors import UserError
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import Registry
 
-STATE_BINS = 256
+BINS = 256
 
 _warned: set[object] = set()  # what was said already, in this process
 
@@ -25,11 +25,13 @@ class PromptInput:
     goal: the task in words.
     subgoal: the language subgoal of this step, None if there is none.
     state: [d] normalised state, None if unknown.
+    past_actions: [n, d] normalised actions executed last, oldest first; empty before the first.
     """
 
     goal: str
     subgoal: str | None = None
     state: np.ndarray | None = None
+    past_actions: np.ndarray | None = None
 
 
 class PromptFormat:
@@ -40,6 +42,7 @@ class PromptFormat:
 
     reads_subgoal: bool = False
     reads_state: bool = False
+    past_actions: int = 0  # how many executed actions it reads
 
     def pieces(self, given: PromptInput) -> list[Piece]:
         """Return the texts in order; each is tokenised by itself."""
@@ -106,10 +109,34 @@ class SubgoalSentence(Subgoal):
         return [(f"Task: {_one_line(given.goal)}\nCurrent Subgoal: {_one_line(given.subgoal)}.\nAction: ", True)]
 
 
-def discretize(state: np.ndarray) -> list[int]:
-    """Map each number of a normalised state, clipped to [-1, 1], to its level 0…255."""
-    edges = np.linspace(-1, 1, STATE_BINS + 1)[:-1]
-    return (np.digitize(np.clip(state, -1, 1), edges) - 1).tolist()
+@PROMPTS.register("past_actions")
+class PastActions(PromptFormat):
+    """The goal and the last 16 executed actions as 256-level numbers: the memory baseline after UniVLA.
+
+    An action is written in the units of the chunk, joints relative to the current state. Before the first action
+    the list is empty.
+    """
+
+    past_actions = 16
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return one text.
+
+        Raises:
+            UserError: it was not told which actions were executed.
+        """
+        if given.past_actions is None:
+            raise UserError(
+                "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, 8])."
+            )
+        levels = " ".join(map(str, discretize(given.past_actions.reshape(-1))))
+        return [(f"Task: {_one_line(given.goal)}; Past actions: {levels};\nAction: ", True)]
+
+
+def discretize(values: np.ndarray) -> list[int]:
+    """Map each normalised number, clipped to [-1, 1], to its level 0…255."""
+    edges = np.linspace(-1, 1, BINS + 1)[:-1]
+    return (np.digitize(np.clip(values, -1, 1), edges) - 1).tolist()
 
 
 def encode_prompt(

@@ -15,6 +15,7 @@ from mme_vla.errors import UserError
 from mme_vla.policy import MMEPolicy
 from mme_vla.processing.normalize import NormStats
 from mme_vla.processing.processor import STATS_FILE
+from mme_vla.processing.subgoals import SubgoalText
 
 
 @dataclass(frozen=True)
@@ -49,15 +50,16 @@ def prepare_data(
         processor.stats = NormStats.load(stats_from / STATS_FILE)
     else:
         processor.stats = compute_norm_stats(sources, split.train, processor.horizon, offset, seed)
+    subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
-        cache = data["cache"]
+        cache, encoder = data["cache"], policy.vision_fingerprint()
         caches = [
             ensure_cache(
                 source,
                 policy.memory,
                 policy.encode_frames,
-                policy.vision_fingerprint(),
+                encoder,
                 root=cache["root"],
                 dtype=str(policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
@@ -70,7 +72,7 @@ def prepare_data(
     def side(episodes: list[Any], jitter: bool) -> TrainingDataset:
         return TrainingDataset(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
-            mask_padding=data["mask_padding"], jitter=jitter, seed=seed,
+            mask_padding=data["mask_padding"], jitter=jitter, subgoal=subgoal, seed=seed,
         )  # fmt: skip
 
     held_out = sum(map(len, split.val))
