@@ -3,9 +3,9 @@
     python examples/memory_matters.py                         # every neural variant and pi05, about two minutes each
     python examples/memory_matters.py framesamp_modul pi05 --seconds 60
 
-In the video a square of one of four colours passes over the scene; when execution begins it is gone, and the right action
-depends on its colour alone. The current view, the goal and the state say nothing, so a policy without memory can only
-guess. Prints the open-loop error of each policy on episodes it has not seen, and draws it.
+In the video a square of one of four colours passes over the scene; when execution begins it is gone, and the right
+action depends on its colour alone. The current view, the goal and the state say nothing, so a policy without memory can
+only guess. Prints the open-loop error of each policy on episodes it has not seen, and draws it.
 """
 
 import argparse
@@ -32,7 +32,7 @@ VIDEO, LENGTH = 24, 48  # frames of conditioning video, and of the whole episode
 
 @dataclass
 class Stream:
-    """One synthetic episode: which colour it showed, its frames [t, h, w, 3], and its tokens where there is a memory."""
+    """One synthetic episode: the colour it showed, its frames [t, h, w, 3], and its tokens for a memory."""
 
     colour: int
     frames: np.ndarray
@@ -129,7 +129,9 @@ def plot(results: list[dict], path: Path) -> None:
 
     figure, axes = pyplot.subplots(figsize=(7, 0.4 * len(results) + 1.4), layout="constrained")
     names = [r["model"] for r in results]
-    bars = axes.barh(names, [r["error"] for r in results], color=["#9a9a9a" if n == "pi05" else "#2b6cb0" for n in names])
+    bars = axes.barh(
+        names, [r["error"] for r in results], color=["#9a9a9a" if n == "pi05" else "#2b6cb0" for n in names]
+    )
     axes.bar_label(bars, fmt="%.2f", padding=3)
     axes.axvline(0.75, color="#c05621", linestyle="--", linewidth=1, label="guessing a colour")
     axes.invert_yaxis()
