@@ -5,7 +5,7 @@ A room supplies a table for its own modules; an adapter in `weights/` applies th
 
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import torch
@@ -32,7 +32,7 @@ class Piece:
 
     def to_ours(self, theirs: Tensor) -> Tensor:
         if self.layer is not None:
-            theirs = theirs[self.layer]
+            theirs = theirs[self.layer].clone()  # a tensor of its own, which keeps no other layer in memory
         return rearrange(theirs, self.pattern, **self.axes) if self.pattern else theirs
 
     def to_theirs(self, ours: Tensor) -> Tensor:
@@ -43,8 +43,9 @@ class Piece:
 
     def rows(self) -> int:
         """How many rows of our tensor this piece fills; asked only where several pieces share one."""
-        first = self.pattern.split("->")[1].strip().split(")")[0].strip("( ").split()
-        return math.prod(self.axes[axis] for axis in first)
+        right = self.pattern.split("->")[1].strip()
+        first = right[1:].split(")")[0] if right.startswith("(") else right.split()[0]
+        return math.prod(self.axes[axis] for axis in first.split())
 
 
 NameTable = dict[str, list[Piece]]
@@ -58,6 +59,14 @@ class Unread:
     path: str
     shape: tuple[int, ...]
     layer: int | None = None
+
+
+@dataclass(frozen=True)
+class Derived:
+    """A foreign tensor that follows from the configuration: recomputed, never read, and written for other readers."""
+
+    path: str
+    make: Callable[[], Tensor]
 
 
 def prefixed(prefix: str, table: NameTable) -> NameTable:
@@ -93,7 +102,9 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return ours
 
 
-def write(table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def write(
+    table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor], derived: Iterable[Derived] = ()
+) -> dict[str, Tensor]:
     """Translate our tensors into the foreign names and layouts; what no action reads is written as zeros."""
     layers: dict[str, dict[int, Tensor]] = defaultdict(dict)
     theirs: dict[str, Tensor] = {}
@@ -113,4 +124,5 @@ def write(table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor]
         put(gap.path, gap.layer, example.new_zeros(gap.shape))
     for path, by_layer in layers.items():
         theirs[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
+    theirs |= {constant.path: constant.make() for constant in derived}
     return theirs

@@ -2,7 +2,7 @@
 
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.perceptual import PerceptualMemory
-from mme_vla.naming import NameTable, linear, prefixed
+from mme_vla.naming import Derived, NameTable, Unread, linear, prefixed
 
 ENCODER = "mem_encoder/feature_encoder"
 
@@ -14,3 +14,13 @@ def released_names(memory: MemoryModule) -> NameTable | None:
             "encoder.project", linear(f"{ENCODER}/encoder_static")
         )
     return None
+
+
+def released_unread(memory: MemoryModule | None) -> list[Unread]:
+    """What released checkpoints hold of a memory and no action reads."""
+    return []
+
+
+def released_derived(memory: MemoryModule | None) -> list[Derived]:
+    """Constants that released checkpoints store of a memory."""
+    return []
