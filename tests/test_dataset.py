@@ -132,7 +132,7 @@ def test_workers_give_the_same_batches_as_the_main_process(data, processor, cach
     batch = batches[0][0]
     assert batch.images.shape == (8, 2, 3, 28, 28) and batch.image_mask.all() and batch.actions.shape == (8, 20, 32)
     assert batch.history.features.shape == (8, 12, 6) and batch.action_mask.shape == (8, 20)
-    assert batch.state.shape == (8, 8) and batch.prompt.shape == batch.prompt_mask.shape == (8, 64)
+    assert batch.state.shape == (8, 8) and batch.prompt.shape == batch.prompt_mask.shape == (8, 16)
 
 
 def test_without_options_a_batch_has_no_history_and_no_action_mask(data, processor) -> None:

@@ -78,13 +78,18 @@ class ExpertLayer(nn.Module):
         self.mlp = GatedMLP(expert.width, expert.mlp_dim)
 
     def project(
-        self, x: Tensor, condition: Tensor | Modulation | None
+        self, x: Tensor, turn: Rotation, condition: Tensor | Modulation | None
     ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
-        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate."""
+        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate.
+
+        Queries and keys come back rotated, by `turn` at their positions.
+        """
         x, gate = self.attention_norm(x, condition)
-        projected = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
-        k, v = projected[..., -2 * self.kv_heads :, :].chunk(2, dim=-2)
-        return None if self.keys_only else projected[..., : self.heads, :], k, v, gate
+        heads = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
+        v = heads[..., -self.kv_heads :, :]
+        qk = rotate(heads[..., : -self.kv_heads, :], turn)  # in one go: queries first, keys last
+        k = qk[..., -self.kv_heads :, :]
+        return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
 
     def finish(
         self,
@@ -101,7 +106,7 @@ class ExpertLayer(nn.Module):
 
 
 def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
-    return x + (update if gate is None else update * gate)
+    return x + update if gate is None else torch.addcmul(x, update, gate)
 
 
 class JointBlock(nn.Module):
@@ -141,20 +146,20 @@ class JointBlock(nn.Module):
         for segment in segments:
             layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
             adaptive = segment.expert == self.answering
-            q, k, v, gate = layer.project(segment.tokens, of_attention if adaptive else None)
-            rows = slice(row, row + k.shape[1])
+            rows = slice(row, row + segment.tokens.shape[1])
+            q, k, v, gate = layer.project(segment.tokens, turn.rows(rows), of_attention if adaptive else None)
             keys.append(k)
             values.append(v)
             if q is not None:
                 asked.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
-                queries.append(rotate(q, turn.rows(rows)))
+                queries.append(q)
             row = rows.stop
-        k, v = rotate(torch.cat(keys, 1), turn), torch.cat(values, 1)
+        k, v = _join(keys), _join(values)
         if not asked:
             return [], (k, v)
         all_k, all_v = (k, v) if past is None else (torch.cat([past[0], k], 1), torch.cat([past[1], v], 1))
         seen = mask if len(asked) == len(segments) else torch.cat([mask[:, :, rows] for *_, rows in asked], 2)
-        attended = attend(torch.cat(queries, 1), all_k, all_v, seen)
+        attended = attend(_join(queries), all_k, all_v, seen)
         pieces = attended.split([rows.stop - rows.start for *_, rows in asked], dim=1)
         updated = [
             Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
@@ -269,6 +274,11 @@ class JointTransformer(nn.Module):
         return answer, KVCache(cached, layout.spans, layout.valid) if keep else None
 
 
+def _join(parts: list[Tensor]) -> Tensor:
+    """Concatenate along the sequence, without a copy where there is one part."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
 def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
     """Join neighbouring blocks of one expert, in the compute dtype."""
     runs: list[tuple[str, list[Tensor]]] = []
@@ -276,7 +286,7 @@ def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
         if not runs or runs[-1][0] != block.expert:
             runs.append((block.expert, []))
         runs[-1][1].append(block.tokens.to(dtype))
-    return [Segment(expert, torch.cat(tokens, 1) if len(tokens) > 1 else tokens[0]) for expert, tokens in runs]
+    return [Segment(expert, _join(tokens)) for expert, tokens in runs]
 
 
 def _bind(hook: Hook, layer: int) -> Callable[[Tensor], Tensor]:

@@ -12,7 +12,8 @@ EPS = 1e-6
 
 def rms_normalise(x: Tensor) -> Tensor:
     """Return x / √(mean(x²) + ε) over the last axis, in float32."""
-    return nn.functional.rms_norm(x.float(), x.shape[-1:], eps=EPS)
+    x = x.float()
+    return x * (x.square().mean(-1, keepdim=True) + EPS).rsqrt()
 
 
 class RMSNorm(nn.Module):
@@ -51,4 +52,4 @@ class AdaRMSNorm(nn.Module):
     def forward(self, x: Tensor, condition: Tensor | Modulation) -> tuple[Tensor, Tensor]:
         """Normalise [b, n, d]. `condition` is the raw [b, c] or, when sampling, a modulation made beforehand."""
         m = condition if isinstance(condition, Modulation) else self.modulation(condition)
-        return (rms_normalise(x) * (1 + m.scale) + m.shift).to(x.dtype), m.gate.to(x.dtype)
+        return torch.addcmul(m.shift, rms_normalise(x), 1 + m.scale).to(x.dtype), m.gate.to(x.dtype)

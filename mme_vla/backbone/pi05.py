@@ -43,6 +43,8 @@ class Pi05Backbone(nn.Module):
 
     def compile(self, **options: Any) -> None:
         """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still."""
+        # Layers share one code: each passes it in training, prefill and denoising, with and without gradients.
+        torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
         for module in (self.vision, *self.transformer.layers):
             module.compile(**options)
 

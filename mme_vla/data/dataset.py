@@ -1,0 +1,182 @@
+"""The training dataset: one item is one step of an execution phase."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from mme_vla.data.cache import VisionCache
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule, stack_history
+from mme_vla.processing.processor import Processor
+from mme_vla.types import VIEWS, Batch
+
+SubgoalChoice = Callable[[Mapping[str, str], np.random.Generator], str | None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What is recorded of one step, before any processing.
+
+    source, episode, index: where it lies; index counts the episode's frames, video included.
+    exec_start: the episode's first execution frame. goal: the task in words. subgoals: the texts of this step by name.
+    state: [8] float32. actions: [h, 8] float32, the chunk, its last recorded action repeated past the end.
+    recorded: [h] bool, False on repeated actions.
+    """
+
+    source: int
+    episode: int
+    index: int
+    exec_start: int
+    goal: str
+    subgoals: dict[str, str]
+    state: np.ndarray
+    actions: np.ndarray
+    recorded: np.ndarray
+
+
+class TrainingDataset(Dataset[dict[str, Any]]):
+    """Execution steps of several datasets, source by source, episode by episode, step by step.
+
+    Items are dictionaries of tensors for `collate`, with the step's goal, subgoals and place beside them. They depend
+    on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data: tables and token
+    caches are memory-mapped, and an item decodes its two current pictures only.
+    """
+
+    def __init__(
+        self,
+        sources: Sequence[EpisodeSource],
+        processor: Processor,
+        memory: MemoryModule | None = None,
+        caches: Sequence[VisionCache] | None = None,
+        *,
+        episodes: Sequence[np.ndarray] | None = None,
+        action_offset: int = 0,
+        mask_padding: bool = False,
+        jitter: bool = False,
+        subgoal: SubgoalChoice | None = None,
+        seed: int = 42,
+    ) -> None:
+        """Arrange the samples; nothing is read yet.
+
+        Args:
+            sources: the datasets.
+            processor: turns what is recorded into what the network reads; needs normalisation statistics.
+            memory: chooses the history of a step; None for policies without memory.
+            caches: the vision tokens of each source, needed with a memory.
+            episodes: which of each source's episodes to use (one side of a `Split`); None uses all.
+            action_offset: observation k is paired with actions k + offset, … 0 as released; 1 leaves out action k,
+                which the recorder had already executed when it took the observation.
+            mask_padding: leave repeated actions past the end of an episode out of the loss (released: they count).
+            jitter: hand the memory a random generator, for memories that vary their selection in training.
+            subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
+            seed: of all randomness.
+
+        Raises:
+            UserError: a memory without caches, an impossible offset, or no execution step at all.
+        """
+        if memory is not None and (caches is None or len(caches) != len(sources)):
+            raise UserError(
+                "A policy with memory trains on cached vision tokens, one cache a source: build them with "
+                "`python -m mme_vla.data.cache model=<model> data=<data>` and pass `caches`."
+            )
+        if not 0 <= action_offset <= 1:
+            raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
+        self.sources, self.processor, self.memory = list(sources), processor, memory
+        self.caches = list(caches) if memory is not None and caches is not None else []
+        self.action_offset, self.mask_padding = action_offset, mask_padding
+        self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
+        chosen = [np.arange(len(source)) for source in sources] if episodes is None else episodes
+        self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(chosen)]).astype(np.int64)
+        self._episode = np.concatenate([np.asarray(part, np.int64) for part in chosen])
+        counts = [source.lengths[part] - source.exec_starts[part] for source, part in zip(sources, chosen, strict=True)]
+        self._ends = np.concatenate(counts).cumsum() if len(self._episode) else np.zeros(0, np.int64)
+        if not len(self):
+            raise UserError("The data hold no execution step.")
+
+    def __len__(self) -> int:
+        """Number of execution steps."""
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    @property
+    def total_frames(self) -> int:
+        """Frames of the chosen episodes, conditioning videos included."""
+        return int(sum(self.sources[s].lengths[e] for s, e in zip(self._source, self._episode, strict=True)))
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the epoch, which the random part of items depends on."""
+        self.epoch = epoch
+
+    def locate(self, index: int) -> tuple[int, int, int]:
+        """Return (source, episode, frame) of an item."""
+        if not 0 <= index < len(self):
+            raise IndexError(f"item {index} of {len(self)}")
+        at = int(np.searchsorted(self._ends, index, side="right"))
+        source, episode = int(self._source[at]), int(self._episode[at])
+        length = int(self.sources[source].lengths[episode])
+        return source, episode, length - (int(self._ends[at]) - index)
+
+    def step(self, index: int) -> Step:
+        """Return what is recorded of an item, unprocessed."""
+        s, episode, frame = self.locate(index)
+        source = self.sources[s]
+        actions, recorded = source.action_chunk(episode, frame + self.action_offset, self.processor.horizon)
+        return Step(
+            source=s,
+            episode=episode,
+            index=frame,
+            exec_start=int(source.exec_starts[episode]),
+            goal=source.goal(episode),
+            subgoals=source.subgoals(episode, frame),
+            state=source.states(episode, frame, frame + 1)[0],
+            actions=actions,
+            recorded=recorded,
+        )
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        step = self.step(index)
+        source = self.sources[step.source]
+        rng = np.random.default_rng([self.seed, self.epoch, index])
+        subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
+        prompt, prompt_mask = self.processor.prompt(step.goal, subgoal=subgoal, state=step.state)
+        item = {
+            "images": self.processor.images([source.frames(step.episode, [step.index], view)[0] for view in VIEWS]),
+            "prompt": prompt,
+            "prompt_mask": prompt_mask,
+            "state": torch.from_numpy(step.state),
+            "actions": self.processor.actions(step.actions, step.state),
+            "goal": step.goal,
+            "subgoals": step.subgoals,
+            "place": (step.source, step.episode, step.index),
+        }
+        if self.mask_padding:
+            item["action_mask"] = torch.from_numpy(step.recorded)
+        if self.memory is not None:
+            history = self.caches[step.source].history(step.episode)
+            item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
+        return item
+
+
+def collate(items: Sequence[dict[str, Any]]) -> Batch:
+    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([item[name] for item in items])
+
+    images = stack("images")
+    batch = Batch(
+        images=images,
+        image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
+        prompt=stack("prompt"),
+        prompt_mask=stack("prompt_mask"),
+        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+        actions=stack("actions"),
+        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
+        state=stack("state"),
+    )
+    return batch.without_prompt_padding()

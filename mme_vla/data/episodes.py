@@ -1,0 +1,239 @@
+"""`EpisodeSource`: one LeRobot v3.0 dataset, read episode by episode from a local folder.
+
+Tables are memory-mapped and videos opened on demand, so what stays in memory does not grow with the data except for a
+few numbers an episode.
+"""
+
+import io
+import json
+import logging
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.layout import (
+    SAMPLE,
+    VIEWS,
+    check_features,
+    content_fingerprint,
+    read_exec_starts,
+    resolve_root,
+)
+from mme_vla.data.video import VideoReader
+from mme_vla.errors import UserError
+
+SIDE_FILE = "meta/robomme_episodes.json"
+log = logging.getLogger(__name__)
+
+
+class EpisodeSource:
+    """The episodes of one dataset.
+
+    name: short name (the folder's, or `sample`). fps: frames per second.
+    lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0 without a video).
+    """
+
+    def __init__(
+        self,
+        root: str | Path,
+        exec_starts: str | Path | None = None,
+        name: str | None = None,
+        max_open_videos: int = 8,
+    ) -> None:
+        """Open a dataset; nothing is downloaded.
+
+        Args:
+            root: folder of a LeRobot v3.0 dataset with RoboMME's feature names, or `sample`.
+            exec_starts: side file with each episode's first execution frame (JSON or parquet), for datasets that
+                do not mark their conditioning video.
+            name: short name, which the validation split and the cache folder use; by default the folder's.
+            max_open_videos: most video files kept open.
+
+        Raises:
+            UserError: not a v3.0 dataset, a feature is missing, the demonstration flag is missing and no side file
+                is given, or the parts of the dataset contradict each other.
+        """
+        from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
+
+        self.root = resolve_root(root)
+        self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
+        meta = LeRobotDatasetMetadata(f"local/{self.name}", root=self.root)
+        columns = check_features(self.root, meta.features)
+        self.fps = float(meta.fps)
+        self.video_views = tuple(view for view in VIEWS if meta.features[view]["dtype"] == "video")
+        self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
+        episodes = meta.episodes.with_format("arrow")[:]
+        self._starts = episodes["dataset_from_index"].to_numpy().astype(np.int64)
+        self.lengths = episodes["dataset_to_index"].to_numpy().astype(np.int64) - self._starts
+        self._goals = [texts[0].lower() for texts in episodes["tasks"].to_pylist()]
+        self._videos = {view: _VideoFiles(self.root, meta.video_path, view, episodes) for view in self.video_views}
+        self._table = _open_table(self.root, columns, meta.features)
+        self._reader = VideoReader(max_open_videos)
+        self._check_rows()
+        self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
+
+    def __len__(self) -> int:
+        """Number of episodes."""
+        return len(self.lengths)
+
+    def __repr__(self) -> str:
+        return f"EpisodeSource({self.name!r}, {len(self)} episodes, {int(self.lengths.sum())} frames)"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Hash of the dataset's content, the same wherever the folder lies."""
+        return content_fingerprint(self.root)
+
+    @cached_property
+    def records(self) -> list[dict[str, Any]]:
+        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty."""
+        side = self.root / SIDE_FILE
+        return json.loads(side.read_text())["episodes"] if side.is_file() else []
+
+    def task(self, episode: int) -> str:
+        """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
+        return str(self.records[episode]["task"]) if episode < len(self.records) else ""
+
+    def goal(self, episode: int) -> str:
+        """The episode's goal in words, lower-case."""
+        return self._goals[episode]
+
+    def states(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Joint angles and first finger, [stop − start, 8] float32."""
+        return self._vectors("state", episode, start, stop)
+
+    def actions(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
+        """Absolute joint targets and gripper command, [stop − start, 8] float32."""
+        return self._vectors("actions", episode, start, stop)
+
+    def action_chunk(self, episode: int, start: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        """Actions start … start + horizon − 1, the last one repeated past the episode's end.
+
+        Returns:
+            actions [horizon, 8] float32, and [horizon] bool that is False on repeated ones.
+        """
+        length = int(self.lengths[episode])
+        steps = np.arange(start, start + horizon)
+        first = min(start, length - 1)
+        recorded = self.actions(episode, first, min(start + horizon, length) if start < length else length)
+        return recorded[np.minimum(steps, length - 1) - first], steps < length
+
+    def subgoals(self, episode: int, step: int) -> dict[str, str]:
+        """The subgoal texts of one step, lower-case, under the names in `subgoal_names`."""
+        row = self._rows(episode, step, step + 1)
+        return {name: str(_flat(row[name])[0].as_py()).lower() for name in self.subgoal_names}
+
+    def frames(self, episode: int, indices: Sequence[int] | np.ndarray, view: str = "image") -> np.ndarray:
+        """Decode pictures [n, H, W, 3] uint8 of `view` (`image`: front camera, `wrist_image`) at these frames.
+
+        Raises:
+            UserError: a frame outside the episode, or a damaged or missing video.
+        """
+        indices = np.asarray(indices, np.int64)
+        length = int(self.lengths[episode])
+        if not len(indices) or indices.min() < 0 or indices.max() >= length:
+            raise UserError(f"{self.name}, episode {episode}: frames {indices.tolist()[:5]} asked of {length}.")
+        if view in self._videos:
+            path, offset = self._videos[view].locate(episode)
+            return self._reader.read(path, offset + indices / self.fps, self.fps)
+        from PIL import Image
+
+        start = int(self._starts[episode])
+        cells = [self._table[start + int(i) : start + int(i) + 1][view][0].as_py() for i in indices]
+        return np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB")) for cell in cells])
+
+    def _rows(self, episode: int, start: int, stop: int | None) -> Any:
+        length = int(self.lengths[episode])
+        stop = length if stop is None else stop
+        if not 0 <= start < stop <= length:
+            raise UserError(f"{self.name}, episode {episode}: steps {start}…{stop - 1} asked of {length}.")
+        offset = int(self._starts[episode])
+        return self._table[offset + start : offset + stop]
+
+    def _vectors(self, column: str, episode: int, start: int, stop: int | None) -> np.ndarray:
+        values = _flat(self._rows(episode, start, stop)[column]).to_numpy(zero_copy_only=False)
+        return values.astype(np.float32).reshape(-1, 8)
+
+    def _check_rows(self) -> None:
+        """The tables hold the episodes back to back, as the metadata say."""
+        index = _flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
+        expected = np.repeat(np.arange(len(self)), self.lengths)
+        if not np.array_equal(index.to_numpy(), expected):
+            raise UserError(
+                f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {len(expected)} in "
+                f"{len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or convert it again."
+            )
+
+    def _read_exec_starts(self, columns: Sequence[str], side_file: Path | None) -> np.ndarray:
+        if side_file is not None:
+            starts = read_exec_starts(side_file, len(self))
+        elif "is_demo" in columns:
+            demo = self._column("is_demo").astype(bool)
+            starts = np.add.reduceat(demo, self._starts, dtype=np.int64)
+            frame = np.arange(len(demo)) - np.repeat(self._starts, self.lengths)
+            if not np.array_equal(demo, frame < np.repeat(starts, self.lengths)):
+                raise UserError(f"{self.root}: is_demo must be true for an episode's first frames only.")
+        elif "exec_start_idx" in columns:
+            log.warning("%s has no is_demo; its exec_start_idx says where the conditioning video ends.", self.root)
+            starts = self._column("exec_start_idx")[self._starts].astype(np.int64)
+        else:
+            raise UserError(
+                f"{self.root} does not mark its conditioning videos: it has neither is_demo nor exec_start_idx. "
+                "Without them video frames would be trained on as if the robot had acted. Give a side file: "
+                'exec_starts=<file>.json with {"<episode_index>": <first execution frame>, …}, or a parquet table '
+                "with the columns episode_index and exec_start_idx (0 for an episode without video)."
+            )
+        if (starts < 0).any() or (starts >= self.lengths).any():
+            episode = int(np.flatnonzero((starts < 0) | (starts >= self.lengths))[0])
+            raise UserError(
+                f"{side_file or self.root}: episode {episode} starts execution at frame {starts[episode]}, but has "
+                f"{self.lengths[episode]} frames."
+            )
+        return starts
+
+    def _column(self, name: str) -> np.ndarray:
+        return _flat(self._table.select_columns(name)[:][name]).to_numpy(zero_copy_only=False)
+
+
+class _VideoFiles:
+    """Which file, and from which second on, holds an episode's pictures of one view."""
+
+    def __init__(self, root: Path, template: str, view: str, episodes: Any) -> None:
+        self._root, self._template, self._view = root, template, view
+        chunk, file, self._offsets = (
+            episodes[f"videos/{view}/{key}"].to_numpy() for key in ("chunk_index", "file_index", "from_timestamp")
+        )
+        self._files = np.stack([chunk, file], axis=1).astype(np.int64)
+
+    def locate(self, episode: int) -> tuple[Path, float]:
+        chunk, file = (int(x) for x in self._files[episode])
+        name = self._template.format(video_key=self._view, chunk_index=chunk, file_index=file)
+        return self._root / name, float(self._offsets[episode])
+
+
+def _open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> Any:
+    """Memory-map these columns of all tables, as LeRobot does, through the cache folder of the `datasets` library."""
+    from contextlib import nullcontext
+
+    from datasets import Dataset, Features
+    from lerobot.datasets.feature_utils import get_hf_features_from_features
+    from lerobot.utils.utils import SuppressProgressBars
+
+    wanted = get_hf_features_from_features({name: features[name] for name in columns})
+    large = any(features[name]["dtype"] == "image" for name in columns)
+    files = [str(path) for path in sorted(root.glob("data/*/*.parquet"))]
+    with nullcontext() if large else SuppressProgressBars():
+        table = Dataset.from_parquet(files, columns=list(columns), features=Features(wanted))
+    return table.with_format("arrow")
+
+
+def _flat(column: Any) -> Any:
+    """A column of an arrow table as one flat array; columns of one number may be stored as lists of one."""
+    array = column.combine_chunks() if hasattr(column, "combine_chunks") else column
+    while hasattr(array, "flatten") and getattr(array.type, "num_fields", 0) == 1 and hasattr(array.type, "value_type"):
+        array = array.flatten()
+    return array

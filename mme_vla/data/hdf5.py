@@ -1,0 +1,171 @@
+"""Reading the official demonstration files, `record_dataset_<Task>.h5`, one episode at a time."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError
+
+SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
+_REQUIRED = (
+    "obs/front_rgb", "obs/wrist_rgb", "obs/joint_state", "obs/gripper_state", "action/joint_action",
+    "info/is_video_demo", "info/is_completed", *(f"info/{name}" for name in SUBGOALS),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class EpisodeRef:
+    """Where one recorded episode lies: `group` (episode_<index>) of `file`; `task` is taken from the file's name."""
+
+    file: Path
+    index: int
+    task: str
+
+    @property
+    def group(self) -> str:
+        return f"episode_{self.index}"
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """One recorded time step. The observation was taken after the action of the same step.
+
+    front, wrist: [H, W, 3] uint8. state: [8] float32, seven joint angles and the first finger's position.
+    action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
+    is_demo: the step belongs to the conditioning video.
+    subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
+    """
+
+    front: np.ndarray
+    wrist: np.ndarray
+    state: np.ndarray
+    action: np.ndarray
+    is_demo: bool
+    subgoals: dict[str, str]
+
+
+def find_files(inputs: Sequence[str | Path]) -> list[Path]:
+    """Expand files and folders into HDF5 files, sorted by name.
+
+    Raises:
+        UserError: an input does not exist, or a folder holds no .h5 file.
+    """
+    files: set[Path] = set()
+    for entry in map(Path, inputs):
+        found = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
+        if not found or not all(path.is_file() for path in found):
+            raise UserError(f"No HDF5 file at {str(entry)!r}: give record_dataset_<Task>.h5 files or their folder.")
+        files.update(found)
+    return sorted(files, key=lambda path: (path.name, str(path)))
+
+
+def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
+    """All episodes of these files: file by file, each in numerical order.
+
+    Raises:
+        UserError: a file is no HDF5 file or has no episode_<number> group.
+    """
+    refs = []
+    for file in files:
+        task = re.sub(r"^record_dataset_", "", file.stem)
+        with _open(file) as handle:
+            numbers = sorted(int(name[8:]) for name in handle if re.fullmatch(r"episode_\d+", name))
+        if not numbers:
+            raise UserError(f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.")
+        refs += [EpisodeRef(file, number, task) for number in numbers]
+    return refs
+
+
+class RawEpisode:
+    """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
+
+    def __init__(self, ref: EpisodeRef, group: Any) -> None:
+        self.ref = ref
+        self._group = group
+        steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d+", name))
+        if steps != list(range(len(steps))) or not steps:
+            raise UserError(
+                f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
+                f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged."
+            )
+        self.length = len(steps)
+        missing = [name for name in ("setup/task_goal", *(f"timestep_0/{x}" for x in _REQUIRED)) if name not in group]
+        if missing:
+            raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
+        demo = np.array([bool(self._step(k, "info/is_video_demo")) for k in range(self.length)])
+        self.exec_start = int(demo.sum())
+        if demo[self.exec_start :].any() or self.exec_start == self.length:
+            raise UserError(f"{ref.file} {ref.group}: video frames must come first, then at least one execution frame.")
+
+    def _step(self, step: int, name: str) -> Any:
+        try:
+            return self._group[f"timestep_{step}/{name}"][()]
+        except (KeyError, OSError) as error:
+            raise UserError(
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} cannot be read: {error}"
+            ) from None
+
+    @property
+    def goals(self) -> list[str]:
+        """All wordings of the goal, lower-case; the first is the one to train with."""
+        return [_text(goal).lower() for goal in np.atleast_1d(self._group["setup/task_goal"][()])]
+
+    @property
+    def seed(self) -> int | None:
+        return int(self._group["setup/seed"][()]) if "setup/seed" in self._group else None
+
+    @property
+    def difficulty(self) -> str | None:
+        return _text(self._group["setup/difficulty"][()]) if "setup/difficulty" in self._group else None
+
+    def __len__(self) -> int:
+        return self.length
+
+    def __iter__(self) -> Iterator[RawFrame]:
+        subgoals: dict[str, str] = {}
+        for k in range(self.length):
+            if not subgoals or not bool(self._step(k, "info/is_completed")):
+                subgoals = {name: _text(self._step(k, f"info/{name}")).lower() for name in SUBGOALS}
+            fingers = np.atleast_1d(self._step(k, "obs/gripper_state"))
+            yield RawFrame(
+                front=np.asarray(self._step(k, "obs/front_rgb")),
+                wrist=np.asarray(self._step(k, "obs/wrist_rgb")),
+                state=np.concatenate([self._step(k, "obs/joint_state"), fingers[:1]]).astype(np.float32),
+                action=np.asarray(self._step(k, "action/joint_action")),
+                is_demo=k < self.exec_start,
+                subgoals=subgoals,
+            )
+
+
+@contextmanager
+def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
+    """Open one episode for reading.
+
+    Raises:
+        UserError: the file or the episode is damaged or has another layout; the message names the place.
+    """
+    with _open(ref.file) as handle:
+        if ref.group not in handle:
+            raise UserError(f"{ref.file} has no {ref.group}.")
+        yield RawEpisode(ref, handle[ref.group])
+
+
+@contextmanager
+def _open(file: Path) -> Iterator[Any]:
+    import h5py
+
+    try:
+        handle = h5py.File(file, "r")
+    except OSError as error:
+        raise UserError(f"{file} cannot be opened as HDF5 ({error}); download or copy it again.") from None
+    with handle:
+        yield handle
+
+
+def _text(value: Any) -> str:
+    return value.decode("utf-8") if isinstance(value, bytes) else str(value)

@@ -1,0 +1,62 @@
+"""Which episodes train and which validate: whole episodes, decided by name or by a fixed hash."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+
+
+@dataclass(frozen=True)
+class Split:
+    """Episode numbers, one ascending int64 array for every source."""
+
+    train: list[np.ndarray]
+    val: list[np.ndarray]
+
+
+def split_episodes(
+    sources: Sequence[EpisodeSource],
+    val_fraction: float = 0.0,
+    val_episodes: Mapping[str, Sequence[int]] | None = None,
+) -> Split:
+    """Split every source by episode.
+
+    A source named in `val_episodes` holds out exactly those. Of any other, episode e validates if the first eight
+    bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
+    change when data are added, and needs no random numbers.
+
+    Raises:
+        UserError: an unknown source or episode, a fraction outside [0, 1), or nothing left to train on.
+    """
+    named = {name: sorted(set(numbers)) for name, numbers in (val_episodes or {}).items()}
+    unknown = set(named) - {source.name for source in sources}
+    if unknown:
+        raise UserError(
+            f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
+            f"{', '.join(source.name for source in sources)}."
+        )
+    if not 0 <= val_fraction < 1:
+        raise UserError(f"val_fraction={val_fraction} must lie in [0, 1).")
+    split = Split([], [])
+    for source in sources:
+        episodes = np.arange(len(source))
+        if source.name in named:
+            wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
+            if wrong:
+                raise UserError(f"val_episodes.{source.name}: {wrong} of {len(source)} episodes (0…{len(source) - 1}).")
+            held_out = np.isin(episodes, named[source.name])
+        else:
+            held_out = np.array([_fraction(f"{source.name}/{e}") < val_fraction for e in episodes], bool)
+        split.train.append(episodes[~held_out])
+        split.val.append(episodes[held_out])
+    if not sum(map(len, split.train)):
+        raise UserError("The split leaves no episode to train on; lower val_fraction or shorten val_episodes.")
+    return split
+
+
+def _fraction(text: str) -> float:
+    return int.from_bytes(sha256(text.encode()).digest()[:8], "big") / 2**64

@@ -1,0 +1,100 @@
+"""Pictures out of video files, by time stamp, with PyAV.
+
+PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's libraries from the
+system and is not used. Files stay open between calls, at most `max_open` of them.
+"""
+
+import os
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError
+
+_SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nearer one is decoded up to
+
+
+class VideoReader:
+    """Decodes single pictures from a bounded number of open files. Safe across `fork`: a child opens its own."""
+
+    def __init__(self, max_open: int = 8) -> None:
+        self.max_open = max_open
+        self._open: OrderedDict[Path, Any] = OrderedDict()
+        self._process = os.getpid()
+
+    def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
+        """Return the pictures nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for.
+
+        Raises:
+            UserError: the file cannot be decoded, or holds no picture within half a frame of a time stamp.
+        """
+        order = np.argsort(np.asarray(timestamps), kind="stable")
+        wanted = np.asarray(timestamps, np.float64)[order]
+        pictures: list[np.ndarray] = []
+        try:
+            for picture in self._decode(self._container(path), wanted, fps):
+                pictures.append(picture)
+        except UserError:
+            raise
+        except (OSError, ValueError) as error:  # PyAV's errors derive from these
+            self._drop(path)
+            raise UserError(f"{path} cannot be decoded ({error}); copy or convert it again.") from None
+        if len(pictures) < len(wanted):
+            self._drop(path)
+            raise UserError(
+                f"{path} holds no picture at {wanted[len(pictures)]:.3f} s ({fps:g} frames per second): the video is "
+                "shorter than the table beside it, or damaged. Copy or convert the dataset again."
+            )
+        out = np.empty((len(wanted), *pictures[0].shape), np.uint8)
+        out[order] = pictures
+        return out
+
+    @staticmethod
+    def _decode(container: Any, wanted: np.ndarray, fps: float) -> Iterator[np.ndarray]:
+        stream = container.streams.video[0]
+        tolerance, near = 0.5 / fps, _SEEK_BEYOND / fps
+        frames: Iterator[Any] = iter(())
+        time, picture = -np.inf, None
+        for target in wanted:
+            if target > time + near or target < time - tolerance or picture is None:
+                # One tick early, so that rounding never lands behind the picture's own key frame.
+                container.seek(max(round(target / stream.time_base) - 1, 0), stream=stream)
+                frames = container.decode(stream)
+                time, picture = -np.inf, None
+            while time < target - tolerance:
+                frame = next(frames, None)
+                if frame is None:
+                    return
+                time, picture = float(frame.pts * stream.time_base), frame
+            if time > target + tolerance or picture is None:
+                return
+            yield picture.to_ndarray(format="rgb24")
+
+    def _container(self, path: Path) -> Any:
+        import av
+
+        if self._process != os.getpid():  # open files of a parent process share their position with it
+            self._open, self._process = OrderedDict(), os.getpid()
+        if path not in self._open:
+            if not path.is_file():
+                raise UserError(f"{path} is missing: the dataset is incomplete. Copy or download it again.")
+            container = av.open(str(path))
+            container.streams.video[0].codec_context.thread_count = 1  # parallelism is across workers
+            self._open[path] = container
+            while len(self._open) > self.max_open:
+                self._open.popitem(last=False)[1].close()
+        self._open.move_to_end(path)
+        return self._open[path]
+
+    def _drop(self, path: Path) -> None:
+        if path in self._open:
+            self._open.pop(path).close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"max_open": self.max_open}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(**state)  # type: ignore[misc]

@@ -1,0 +1,223 @@
+"""Training checkpoints: `save_pretrained`'s folder with the EMA weights, and beside them what exact resume needs.
+
+    checkpoints/step_000500/
+        model.safetensors, config.json, processor.json, norm_stats.json, …   the policy, EMA weights
+        raw.safetensors          the trained weights themselves; frozen ones are in model.safetensors
+        optimizer.safetensors    Adam's moments and step counts
+        training_state.json      step, configuration, versions
+
+All randomness is a function of (seed, step), so there is no generator state and no data position to keep. Nothing is
+pickled: a checkpoint from a stranger cannot run code.
+"""
+
+import importlib.metadata
+import json
+import os
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError
+from mme_vla.policy import MMEPolicy
+from mme_vla.pretrained import load_tensors, replace_folder
+from mme_vla.training.ema import EMA
+from mme_vla.training.settings import KeepRule
+
+FORMAT = "mme_vla training checkpoint 1"
+STATE, RAW, OPTIMIZER = "training_state.json", "raw.safetensors", "optimizer.safetensors"
+_STEP = re.compile(r"step_(\d+)")
+_MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+
+
+def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
+    """The parameters that receive gradients, by name, in the module's order."""
+    return {name: p for name, p in module.named_parameters() if p.requires_grad}
+
+
+def save_checkpoint(
+    folder: Path,
+    step: int,
+    policy: MMEPolicy,
+    ema: EMA,
+    optimizer: torch.optim.Optimizer,
+    config: Mapping[str, Any],
+    keep: KeepRule,
+) -> Path:
+    """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold on to."""
+    from safetensors.torch import save_file
+
+    target = folder / checkpoint_name(step)
+    draft = folder / f".{target.name}.partial"
+    shutil.rmtree(draft, ignore_errors=True)
+    with ema.applied():
+        policy.save_pretrained(draft)
+    parameters = trainable(policy)
+    save_file({name: _on_cpu(p) for name, p in parameters.items()}, draft / RAW)
+    moments = {
+        f"{name}/{key}": _on_cpu(optimizer.state[p][key])
+        for name, p in parameters.items()
+        for key in _MOMENTS
+        if p in optimizer.state
+    }
+    save_file(moments, draft / OPTIMIZER)
+    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": _versions()}
+    (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    _flush(draft)
+    replace_folder(draft, target)
+    _prune(folder, keep)
+    return target
+
+
+def restore(folder: Path, policy: MMEPolicy, ema: EMA, optimizer: torch.optim.Optimizer) -> None:
+    """Put everything back as it was when `folder` was written.
+
+    Raises:
+        UserError: a damaged file, or tensors that do not fit this policy.
+    """
+    parameters = trainable(policy)
+    averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
+    _check_fit(folder / "model.safetensors", averaged, policy.state_dict())
+    _check_fit(folder / RAW, raw, parameters)
+    like = {f"{name}/{key}": p for name, p in parameters.items() for key in _MOMENTS if f"{name}/{key}" in moments}
+    _check_fit(folder / OPTIMIZER, moments, like, scalar="/step")
+    ema.load(averaged)
+    policy.load_state_dict({**averaged, **raw})
+    state = optimizer.state_dict()
+    state["state"] = {
+        i: {key: moments[f"{name}/{key}"] for key in _MOMENTS}
+        for i, name in enumerate(parameters)
+        if f"{name}/step" in moments
+    }
+    optimizer.load_state_dict(state)
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """The finished checkpoints in a `checkpoints` folder, oldest step first."""
+    found = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
+    return sorted(found, key=step_of)
+
+
+def checkpoint_name(step: int) -> str:
+    """The folder name of the checkpoint after `step` updates."""
+    return f"step_{step:06d}"
+
+
+def step_of(checkpoint: Path) -> int:
+    """The step in a checkpoint folder's name."""
+    match = _STEP.fullmatch(checkpoint.name)
+    return int(match[1]) if match else -1
+
+
+def resolve_checkpoint(path: Path) -> Path:
+    """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
+
+    Raises:
+        UserError: there is no checkpoint.
+    """
+    for folder in (path, path / "checkpoints"):
+        found = checkpoints_in(folder)
+        if found:
+            return found[-1]
+    if (path / "config.json").is_file():
+        return path
+    raise UserError(
+        f"No checkpoint at {path}: expected a folder such as outputs/<model>/<date>/checkpoints/step_000500, "
+        "or the run folder above it."
+    )
+
+
+def read_state(checkpoint: Path) -> dict[str, Any]:
+    """What `training_state.json` says.
+
+    Raises:
+        UserError: the folder holds weights only, or the file is damaged or of another program.
+    """
+    path = checkpoint / STATE
+    if not path.is_file():
+        raise UserError(
+            f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
+            f"To start a new run from its weights use init_from={checkpoint}."
+        )
+    try:
+        state = json.loads(path.read_text())
+    except ValueError as error:
+        raise UserError(f"{path} is damaged: {error}. Resume from an older checkpoint.") from None
+    if not isinstance(state, dict) or state.get("format") != FORMAT:
+        raise UserError(f"{path} was not written by this library's training (format {FORMAT!r} expected).")
+    for name in (RAW, OPTIMIZER):
+        if not (checkpoint / name).is_file():
+            raise UserError(f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint.")
+    return state
+
+
+def check_disk(folder: Path, policy: MMEPolicy, keep: KeepRule) -> None:
+    """Refuse to begin a run whose first checkpoints would not fit on the disk.
+
+    Raises:
+        UserError: saying how much is needed and free.
+    """
+    weights = sum(p.numel() * p.element_size() for p in policy.parameters())
+    trained = sum(p.numel() * p.element_size() for p in trainable(policy).values())
+    needed = (weights + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
+    existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    free = shutil.disk_usage(existing).free
+    if needed > free:
+        raise UserError(
+            f"Checkpoints would take {needed / 1e9:.1f} GB in {folder} (train.keep.last={keep.last} and the one being "
+            f"written), but {free / 1e9:.1f} GB are free: make room, keep fewer, or choose another output."
+        )
+
+
+def _prune(folder: Path, keep: KeepRule) -> None:
+    for path in checkpoints_in(folder)[: -keep.last]:
+        if not keep.every or step_of(path) % keep.every:
+            shutil.rmtree(path)
+
+
+def _on_cpu(tensor: Tensor) -> Tensor:
+    return tensor.detach().cpu().contiguous()
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(path)
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{path} is damaged or missing: {error}. Resume from an older checkpoint.") from None
+
+
+def _check_fit(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = "") -> None:
+    """Refuse tensors that are missing, left over, misshapen or of another dtype."""
+    names = set(found) ^ set(expected)
+    wrong = sorted(names) + [
+        f"{name}: {tuple(found[name].shape)} {found[name].dtype}"
+        for name in sorted(set(found) & set(expected))
+        if not (scalar and name.endswith(scalar))
+        and (found[name].shape, found[name].dtype) != (expected[name].shape, expected[name].dtype)
+    ]
+    if wrong:
+        raise UserError(
+            f"{path} does not fit this policy: {len(wrong)} tensors differ, such as {', '.join(wrong[:4])}. "
+            "It belongs to another model or other settings."
+        )
+
+
+def _versions() -> dict[str, str]:
+    return {name: importlib.metadata.version(name) for name in ("mme-vla", "torch", "numpy")}
+
+
+def _flush(folder: Path) -> None:
+    """Have the disk hold what was written before the folder gets its final name."""
+    for path in (*folder.iterdir(), folder):
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)

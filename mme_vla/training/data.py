@@ -1,0 +1,100 @@
+"""From the section `data` to the two sides of the split, with statistics and vision caches in place."""
+
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mme_vla.data.cache import ensure_cache
+from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.sources import open_sources
+from mme_vla.data.splits import split_episodes
+from mme_vla.data.stats import compute_norm_stats
+from mme_vla.errors import UserError
+from mme_vla.policy import MMEPolicy
+from mme_vla.processing.normalize import NormStats
+from mme_vla.processing.processor import STATS_FILE
+
+
+@dataclass(frozen=True)
+class SplitData:
+    """The training steps and the held-out ones (None where the split holds nothing out)."""
+
+    train: TrainingDataset
+    val: TrainingDataset | None
+
+
+def prepare_data(
+    policy: MMEPolicy,
+    data: Mapping[str, Any],
+    seed: int,
+    stats_from: Path | None = None,
+    say: Callable[[str], None] = print,
+) -> SplitData:
+    """Open and check the datasets, give the policy's processor its statistics, and build or open the vision caches.
+
+    Args:
+        policy: with the vision weights it will train with. data: the section `data` of a configuration.
+        stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
+        say: takes a line for the user.
+
+    Raises:
+        UserError: whatever is wrong with the data, before any training.
+    """
+    sources = open_sources(data["sources"])
+    split = split_episodes(sources, data["val_fraction"], data["val_episodes"])
+    processor, offset = policy.require_processor(), data["action_offset"]
+    if stats_from is not None:
+        processor.stats = NormStats.load(stats_from / STATS_FILE)
+    else:
+        processor.stats = compute_norm_stats(sources, split.train, processor.horizon, offset, seed)
+    caches = None
+    if policy.memory is not None:
+        cache = data["cache"]
+        caches = [
+            ensure_cache(
+                source,
+                policy.memory,
+                policy.encode_frames,
+                policy.vision_fingerprint(),
+                root=cache["root"],
+                dtype=str(policy.history_dtype).removeprefix("torch."),
+                max_build_frames=cache["max_build_frames"],
+                batch_size=cache["batch_size"],
+                command=_cache_command(policy.config, data),
+            )
+            for source in sources
+        ]
+
+    def side(episodes: list[Any], jitter: bool) -> TrainingDataset:
+        return TrainingDataset(
+            sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
+            mask_padding=data["mask_padding"], jitter=jitter, seed=seed,
+        )  # fmt: skip
+
+    held_out = sum(map(len, split.val))
+    prepared = SplitData(side(split.train, data["jitter"]), side(split.val, False) if held_out else None)
+    say(
+        f"data {data['name']}: {len(prepared.train)} training steps in {sum(map(len, split.train))} episodes, "
+        f"{0 if prepared.val is None else len(prepared.val)} held-out steps in {held_out}"
+    )
+    return prepared
+
+
+def check_frozen(policy: MMEPolicy, freeze_vision: bool) -> None:
+    """Refuse to train the vision tower under a memory, whose cached tokens would not follow it.
+
+    Raises:
+        UserError: that combination.
+    """
+    if policy.memory is not None and not freeze_vision:
+        raise UserError(
+            "train.freeze_vision=false changes the vision tower while the memory reads tokens that were cached before: "
+            "at test time the memory would see other tokens than in training. Keep it frozen, or use model=pi05."
+        )
+
+
+def _cache_command(config: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+    words = [f"model={config.get('name', '<model>')}", f"data={data['name']}"]
+    return "python -m mme_vla.data.cache " + " ".join(shlex.quote(word) for word in words)

@@ -1,0 +1,44 @@
+"""The moving average of the trainable weights: what is evaluated, saved and released."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor, nn
+
+
+class EMA:
+    """average ← decay·average + (1 − decay)·weights after every update, begun with the initial weights as released."""
+
+    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
+        self.decay = decay
+        self._parameters = dict(parameters)
+        self._average = [p.detach().clone() for p in self._parameters.values()]
+
+    @torch.no_grad()
+    def update(self) -> None:
+        """Move towards the current weights."""
+        torch._foreach_lerp_(self._average, list(self._parameters.values()), 1 - self.decay)
+
+    @torch.no_grad()
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Take the averages from `tensors`, which must name every parameter."""
+        for name, average in zip(self._parameters, self._average, strict=True):
+            average.copy_(tensors[name])
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The averages by parameter name."""
+        return dict(zip(self._parameters, self._average, strict=True))
+
+    @contextmanager
+    def applied(self) -> Iterator[None]:
+        """Within this context the module has the averaged weights. Storage is exchanged; nothing is copied."""
+        self._exchange()
+        try:
+            yield
+        finally:
+            self._exchange()
+
+    def _exchange(self) -> None:
+        for i, parameter in enumerate(self._parameters.values()):
+            parameter.data, self._average[i] = self._average[i], parameter.data

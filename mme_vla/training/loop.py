@@ -1,0 +1,211 @@
+"""The training loop: update, average, log, validate, save."""
+
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from mme_vla.policy import MMEPolicy
+from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, trainable
+from mme_vla.training.console import ProgressLine, memory_gib
+from mme_vla.training.ema import EMA
+from mme_vla.training.logging import Loggers
+from mme_vla.training.optim import clip_gradients, learning_rate, make_optimizer
+from mme_vla.training.order import BatchOrder, draw_flow, generator_for, seed_of
+from mme_vla.training.runs import Run
+from mme_vla.training.settings import TrainSettings
+from mme_vla.training.validation import Collate, Samples, Validation
+from mme_vla.training.window import Window
+
+
+class _InEpoch(Dataset[Any]):
+    """The samples under keys (epoch, index): that is how workers learn the epoch, which random items depend on."""
+
+    def __init__(self, samples: Samples) -> None:
+        self._samples = samples
+
+    def __getitem__(self, key: tuple[int, int]) -> Any:
+        epoch, index = key
+        if hasattr(self._samples, "set_epoch"):
+            self._samples.set_epoch(epoch)
+        return self._samples[index]
+
+
+class Trainer:
+    """One training run of one policy. Everything that can fail for the user's reasons fails while it is built."""
+
+    def __init__(
+        self,
+        policy: MMEPolicy,
+        samples: Samples,
+        collate: Collate,
+        validation: Validation | None,
+        settings: TrainSettings,
+        run: Run,
+        config: Mapping[str, Any],
+        accelerator: Accelerator,
+    ) -> None:
+        """Put the policy on its device, and back to where `run.checkpoint` left it.
+
+        Args:
+            samples: the training split. validation: held-out samples, if any.
+            config: the plain configuration, saved with every checkpoint.
+
+        Raises:
+            UserError: too few samples for the batch, or a checkpoint that does not fit.
+        """
+        self.settings, self.run_info, self.config = settings, run, config
+        self.accelerator, self.validation = accelerator, validation
+        self.order = BatchOrder(
+            len(samples), settings.batch_size, settings.seed, range(run.step, settings.steps), settings.accumulate,
+            accelerator.process_index, accelerator.num_processes,
+        )  # fmt: skip
+        self.loader = DataLoader(
+            _InEpoch(samples),
+            batch_sampler=self.order,
+            collate_fn=collate,
+            num_workers=settings.workers,
+            prefetch_factor=4 if settings.workers else None,
+            pin_memory=accelerator.device.type == "cuda",
+            worker_init_fn=_leave_signals_alone,
+            generator=generator_for(settings.seed, "workers"),
+        )
+        self.policy = policy.to(accelerator.device).train()
+        policy.backbone.vision.requires_grad_(not settings.freeze_vision)
+        policy.backbone.transformer.gradient_checkpointing = settings.gradient_checkpointing
+        parameters = trainable(policy)
+        self.optimizer = make_optimizer(parameters.values(), settings)
+        self.ema = EMA(parameters, settings.ema)
+        if run.checkpoint is not None:
+            restore(run.checkpoint, policy, self.ema, self.optimizer)
+        self.model = accelerator.prepare_model(policy)
+        self._parameters = list(parameters.values())
+        self.last_checkpoint = run.checkpoint
+
+    def describe(self) -> str:
+        """One line on what trains where."""
+        total, trained = (sum(p.numel() for p in part) for part in (self.policy.parameters(), self._parameters))
+        processes = f"{self.accelerator.num_processes} × " if self.accelerator.num_processes > 1 else ""
+        return (
+            f"{self.config.get('name', 'policy')}: {total / 1e6:.2f} M parameters, {trained / 1e6:.2f} M trained, on "
+            f"{processes}{self.accelerator.device}, in {self.run_info.folder}"
+        )
+
+    def run(self, line: ProgressLine, loggers: Loggers) -> bool:
+        """Train to the last step.
+
+        Returns:
+            Whether it got there; False when the user or the cluster asked it to stop, which saves a checkpoint first.
+        """
+        window, settings = Window(self.settings.batch_size), self.settings
+        batches = iter(self.loader)
+        with _stop_asked(enabled=self.accelerator.num_processes == 1) as stop:
+            for step in range(self.run_info.step, settings.steps):
+                window.add(self.update(step, batches, window))
+                line.advance()
+                done = step + 1
+                leaving = stop.is_set() or done == settings.steps
+                saving = leaving or done % settings.save_every == 0
+                # A window ends with every checkpoint, so that a resumed run has the same windows.
+                if saving or done % settings.log_every == 0:
+                    self._log(done, window, line, loggers)
+                with window.pause():
+                    if done % settings.val_every == 0 or done == settings.steps:
+                        self.validate(done, line, loggers)
+                    if saving:
+                        self.save(done)
+                if stop.is_set() and done < settings.steps:
+                    line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
+                    return False
+        return True
+
+    def update(self, step: int, batches: Iterator[Any], window: Window) -> dict[str, Tensor]:
+        """One optimizer update from the next `accumulate` pieces of `batches`; its metrics, detached."""
+        settings, device, config = self.settings, self.accelerator.device, self.policy.backbone.config
+        rate = learning_rate(step, settings.lr, settings.warmup)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        noise, time = draw_flow(
+            settings.batch_size, config.horizon, config.action_dim, config.time_distribution,
+            settings.seed, "train", step,
+        )  # fmt: skip
+        sums: dict[str, Tensor] = {}
+        for piece in range(settings.accumulate):
+            with window.waiting():
+                batch = next(batches).to(device, non_blocking=True)
+            rows = self.order.rows(piece)
+            # Whatever else draws (augmentation, a memory's dropout) takes it from the default generator.
+            torch.manual_seed(seed_of(settings.seed, "model", step, piece, self.accelerator.process_index))
+            last = piece == settings.accumulate - 1
+            with nullcontext() if last else self.accelerator.no_sync(self.model):
+                loss, metrics = self.model(batch, noise[rows].to(device), time[rows].to(device))
+                self.accelerator.backward(loss / settings.accumulate)
+            for name, value in metrics.items():
+                part = value.detach().float() / settings.accumulate
+                sums[name] = sums[name] + part if name in sums else part
+        norm = clip_gradients([p.grad for p in self._parameters if p.grad is not None], settings.clip_norm)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.ema.update()
+        return {**sums, "grad_norm": norm, "lr": torch.tensor(rate, device=device)}
+
+    def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> float | None:
+        """Log the loss of the averaged weights on held-out steps."""
+        if self.validation is None or not self.accelerator.is_main_process:
+            return None
+        with self.ema.applied():
+            loss = self.validation.loss(self.policy)
+        loggers.write(step, {"val/loss": loss})
+        line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
+        return loss
+
+    def save(self, step: int) -> Path:
+        """Write a checkpoint (the first process does)."""
+        folder = self.run_info.checkpoints
+        if self.accelerator.is_main_process:
+            keep = self.settings.keep
+            save_checkpoint(folder, step, self.policy, self.ema, self.optimizer, self.config, keep)
+        self.accelerator.wait_for_everyone()
+        self.last_checkpoint = folder / checkpoint_name(step)
+        return self.last_checkpoint
+
+    def _log(self, step: int, window: Window, line: ProgressLine, loggers: Loggers) -> None:
+        values = window.close(step, self.accelerator.reduce)
+        values["memory/gib"] = memory_gib(self.accelerator.device)
+        loggers.write(step, values)
+        line.numbers(step, values)
+
+
+def _leave_signals_alone(worker: int) -> None:
+    """Ctrl-C and a cluster's SIGTERM go to every process of a group: the training process alone answers them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+
+
+@contextmanager
+def _stop_asked(enabled: bool) -> Iterator[threading.Event]:
+    """An event that Ctrl-C or a cluster's SIGTERM sets; a second one ends the process as usual."""
+    event = threading.Event()
+    if not enabled or threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+    def ask(number: int, frame: Any) -> None:
+        event.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, ask)
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,85 @@
+"""What a training run may be told (`configs/train`), checked before anything starts."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+from mme_vla.errors import UserError, did_you_mean
+
+
+@dataclass(frozen=True)
+class KeepRule:
+    """Which checkpoints stay: the newest `last`, and every one whose step is a multiple of `every` (0: none)."""
+
+    last: int = 2
+    every: int = 0
+
+    def __post_init__(self) -> None:
+        if self.last < 1 or self.every < 0:
+            raise UserError(f"train.keep: last={self.last} must be at least 1 and every={self.every} not negative.")
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """The keys of `configs/train/*.yaml`, where each is explained."""
+
+    steps: int
+    batch_size: int
+    lr: float
+    warmup: int = 0
+    betas: tuple[float, float] = (0.9, 0.95)
+    eps: float = 1e-8
+    weight_decay: float = 1e-10
+    clip_norm: float = 1.0
+    ema: float = 0.999
+    freeze_vision: bool = True
+    accumulate: int = 1
+    gradient_checkpointing: bool = False
+    device: str = "auto"
+    workers: int = 1
+    log_every: int = 100
+    val_every: int = 1000
+    val_samples: int = 64
+    save_every: int = 1000
+    keep: KeepRule = field(default_factory=KeepRule)
+    open_loop_chunks: int = 32
+    seed: int = 42
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any], seed: int = 42) -> Self:
+        """Read the section `train` of a composed configuration.
+
+        Raises:
+            UserError: an unknown key or an impossible value.
+        """
+        known = {f.name for f in fields(cls)} - {"seed"}
+        for key in values:
+            if key not in known:
+                raise UserError(f"train has no key {key!r}. {did_you_mean(str(key), known)}")
+        given = dict(values)
+        given["keep"] = KeepRule(**given.get("keep", {}))
+        given["betas"] = tuple(given.get("betas", cls.betas))
+        return cls(**given, seed=seed)
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch_size", "accumulate", "log_every", "val_every", "save_every"):
+            _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
+        for name in ("warmup", "workers", "val_samples", "open_loop_chunks", "weight_decay"):
+            _check(name, getattr(self, name), getattr(self, name) >= 0, "not negative")
+        for name in ("lr", "eps", "clip_norm"):
+            _check(name, getattr(self, name), getattr(self, name) > 0, "positive")
+        _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
+        betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
+        _check("betas", self.betas, betas, "two numbers in [0, 1)")
+        _check("device", self.device, self.device in ("auto", "cpu"), "auto (a GPU where there is one) or cpu")
+        _check(
+            "batch_size",
+            self.batch_size,
+            self.batch_size % self.accumulate == 0,
+            f"a multiple of train.accumulate={self.accumulate}",
+        )
+
+
+def _check(name: str, value: Any, fits: bool, expected: str) -> None:
+    if not fits:
+        raise UserError(f"train.{name}={value!r} must be {expected}.")

@@ -1,0 +1,111 @@
+"""The command itself: killed in the middle and resumed, it goes on exactly where it was."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mme_vla import MMEPolicy, UserError
+from mme_vla.config import compose
+from mme_vla.train import main
+from mme_vla.training.logging import read_metrics
+
+STEPS, SAVE_EVERY = 9, 4
+SMALL = [
+    "model=tokendrop_expert", "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=32",
+    "backbone.vision.patch_size=2", "memory.budget=64", f"train.steps={STEPS}", f"train.save_every={SAVE_EVERY}",
+    "train.log_every=1", "train.val_every=3", "train.val_samples=2", "train.batch_size=2", "train.open_loop_chunks=2",
+    "train.device=cpu",
+]  # fmt: skip
+
+
+def start(cache: Path, *overrides: str) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "mme_vla.train", *SMALL, f"data.cache.root={cache}", *overrides]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, cwd=cache)
+
+
+def finish(process: "subprocess.Popen[str]") -> str:
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err[-3000:]
+    return out
+
+
+def numbers(folder: Path) -> list[dict[str, Any]]:
+    """What was logged, without what only tells time and memory."""
+    return [
+        {key: value for key, value in line.items() if not key.startswith(("speed/", "memory/"))}
+        for line in read_metrics(folder)
+    ]
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The runs `whole`, which nothing interrupts, and `killed`: the folder above them, and what the first printed."""
+    base = tmp_path_factory.mktemp("runs")
+    killed = start(base, "output=killed", "train.steps=500")
+    deadline = time.monotonic() + 200
+    while not any(line["step"] > SAVE_EVERY + 1 for line in read_metrics(base / "killed")):
+        assert killed.poll() is None, killed.communicate()[1][-3000:]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate()
+    return base, finish(start(base, "output=whole"))
+
+
+def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> None:
+    whole, killed = runs[0] / "whole", runs[0] / "killed"
+    # The killed run may have come further than one checkpoint: go on from the first.
+    for late in sorted((killed / "checkpoints").glob("step_*"))[1:]:
+        late.rename(runs[0] / f"late_{late.name}")
+    printed = finish(start(runs[0], f"resume={killed}", "output=unused"))
+    assert f"going on from {killed / 'checkpoints' / f'step_{SAVE_EVERY:06d}'}" in printed
+    assert numbers(killed) == numbers(whole)
+    assert not (runs[0] / "unused").exists()
+    ours, theirs = (json.loads((folder / "summary.json").read_text()) for folder in (killed, whole))
+    assert ours["open_loop"] == theirs["open_loop"]
+
+
+def test_a_finished_run_holds_everything(runs: tuple[Path, str]) -> None:
+    folder, printed = runs[0] / "whole", runs[1]
+    checkpoint = folder / "checkpoints" / f"step_{STEPS:06d}"
+    assert checkpoint.name in printed
+    assert "joint 1" in printed
+    assert (folder / "open_loop.png").stat().st_size > 20_000
+    assert list((folder / "tensorboard").glob("events*"))
+    assert (folder / "config.yaml").is_file()
+    lines = read_metrics(folder)
+    assert [line["step"] for line in lines if "train/loss" in line] == list(range(1, STEPS + 1))
+    assert [line["step"] for line in lines if "val/loss" in line] == [3, 6, 9]
+    assert MMEPolicy.from_pretrained(checkpoint).require_processor().stats is not None
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["output=whole"], "never overwritten"),
+        (["resume=whole", "train.steps=20", "train.lr=0.5"], r"train\.lr: 0.003 then, 0.5 now"),
+        (["resume=nowhere"], "No checkpoint at nowhere"),
+        (["output=new", "train.batch_size=3", "train.accumulate=2"], r"multiple of train\.accumulate=2"),
+        (["output=new", "train.batch_size=4000"], r"fewer than train\.batch_size=4000"),
+        (["output=new", "data.sources=[missing]"], "No LeRobot dataset at 'missing'"),
+        (["output=new", "init_from=nowhere"], "No checkpoint at nowhere"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_training(
+    runs: tuple[Path, str], monkeypatch: pytest.MonkeyPatch, overrides: list[str], message: str
+) -> None:
+    base, before = runs[0], numbers(runs[0] / "whole")
+    monkeypatch.chdir(base)
+    with pytest.raises(UserError, match=message):
+        main(compose("train", [*SMALL, f"data.cache.root={base}", *overrides]))
+    assert numbers(base / "whole") == before
+    assert not (base / "new").exists()
