@@ -56,14 +56,19 @@ def build_from_config(config: DictConfig, *, device: str | torch.device = "cpu",
     assert isinstance(plain, dict)
     sections = {key: plain[key] for key in SECTIONS if key in plain}
     # Shapes need no words: on meta the full-size tokenizer is not asked for.
-    processor = None if torch.device(device).type == "meta" else _processor(sections)
+    processor = None if torch.device(device).type == "meta" else build_processor(sections)
     with torch.random.fork_rng(devices=[]), torch.device(device):
         torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
         policy = MMEPolicy.from_config(sections, processor)
     return policy.eval()
 
 
-def _processor(sections: Mapping[str, Any]) -> Processor:
+def build_processor(sections: Mapping[str, Any]) -> Processor:
+    """Build the processor of a composed configuration, at its backbone's sizes.
+
+    Raises:
+        UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
+    """
     backbone = sections["backbone"]
     sizes = {"image_size": backbone["vision"]["image_size"], **{k: backbone[k] for k in ("action_dim", "horizon")}}
     processor = Processor.from_config({**sections["processor"], **sizes})

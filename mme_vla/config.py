@@ -125,7 +125,7 @@ def cli[T](
     def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
         @functools.wraps(main)
         def job(cfg: DictConfig) -> T:
-            with _print_user_errors():
+            with print_user_errors():
                 _require_values(cfg)
                 import_plugins(cfg)
                 return main(cfg)
@@ -135,7 +135,7 @@ def cli[T](
             if cfg is not None:
                 return main(cfg)
             tree = directory or config_dir()
-            with _print_user_errors():
+            with print_user_errors():
                 _check_command_line(config_name, tree)
             start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
             start(job)()
@@ -155,7 +155,8 @@ def _check_command_line(config_name: str, tree: Path) -> None:
 
 
 @contextmanager
-def _print_user_errors() -> Iterator[None]:
+def print_user_errors() -> Iterator[None]:
+    """Show a `UserError` as a sentence instead of a traceback, and end the process with code 2."""
     try:
         yield
     except UserError as error:

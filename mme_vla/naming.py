@@ -32,7 +32,7 @@ class Piece:
 
     def to_ours(self, theirs: Tensor) -> Tensor:
         if self.layer is not None:
-            theirs = theirs[self.layer]
+            theirs = theirs[self.layer].clone()  # a tensor of its own, which keeps no other layer in memory
         return rearrange(theirs, self.pattern, **self.axes) if self.pattern else theirs
 
     def to_theirs(self, ours: Tensor) -> Tensor:
@@ -43,8 +43,9 @@ class Piece:
 
     def rows(self) -> int:
         """How many rows of our tensor this piece fills; asked only where several pieces share one."""
-        first = self.pattern.split("->")[1].strip().split(")")[0].strip("( ").split()
-        return math.prod(self.axes[axis] for axis in first)
+        right = self.pattern.split("->")[1].strip()
+        first = right[1:].split(")")[0] if right.startswith("(") else right.split()[0]
+        return math.prod(self.axes[axis] for axis in first.split())
 
 
 NameTable = dict[str, list[Piece]]

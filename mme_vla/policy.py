@@ -1,14 +1,12 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
@@ -20,18 +18,16 @@ from mme_vla.episode import Episode
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
-from mme_vla.pretrained import assign_tensors, load_tensors, save_tensors
+from mme_vla.pretrained import dtype_of
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
+from mme_vla.saving import Saved
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
     from mme_vla.processing.processor import Processor
 
-CONFIG = "config.json"
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
-
-class MMEPolicy(nn.Module):
+class MMEPolicy(Saved):
     """One composition of backbone, memory and integration.
 
     The two independent choices meet here and nowhere else; no method asks which variant it is.
@@ -62,8 +58,8 @@ class MMEPolicy(nn.Module):
         self.backbone, self.memory, self.integration = backbone, memory, integration
         self.processor = processor
         self.config = dict(config or {})
-        self.compute_dtype = _dtype("compute_dtype", compute_dtype)
-        self.history_dtype = _dtype("history_dtype", history_dtype)
+        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
+        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
 
     @classmethod
@@ -283,49 +279,6 @@ class MMEPolicy(nn.Module):
                 "build_policy() or load it with MMEPolicy.from_pretrained()."
             )
         return self.processor
-
-    # Checkpoints
-
-    def save_pretrained(self, folder: str | Path) -> None:
-        """Write weights, configuration, normalisation statistics and tokenizer; `from_pretrained` needs no more."""
-        folder = Path(folder)
-        save_tensors(self.state_dict(), folder)
-        (folder / CONFIG).write_text(json.dumps(self.config, indent=2, ensure_ascii=False) + "\n")
-        if self.processor is not None:
-            self.processor.save(folder)
-
-    @classmethod
-    def from_pretrained(cls, folder: str | Path, *, device: str | torch.device = "cpu", **policy: Any) -> Self:
-        """Load what `save_pretrained` wrote; of a training checkpoint, the EMA weights.
-
-        Args:
-            folder: a folder on disk. device: where to put the weights.
-            policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
-
-        Raises:
-            UserError: no checkpoint there, a damaged file, or weights that do not fit the configuration.
-        """
-        from mme_vla.processing.processor import Processor
-
-        folder = Path(folder)
-        if not (folder / CONFIG).is_file():
-            raise UserError(f"No policy at {folder}: expected a folder with {CONFIG}, as save_pretrained() writes.")
-        try:
-            config = json.loads((folder / CONFIG).read_text())
-        except json.JSONDecodeError as error:
-            raise UserError(f"{folder / CONFIG} is not valid JSON: {error}") from error
-        config["policy"] = {**config.get("policy", {}), **policy}
-        with torch.device("meta"):
-            loaded = cls.from_config(config)
-        assign_tensors(loaded, load_tensors(folder), str(folder))
-        loaded.processor = Processor.load(folder)
-        return loaded.to(device).eval()
-
-
-def _dtype(key: str, name: str) -> torch.dtype:
-    if name not in DTYPES:
-        raise UserError(f"policy.{key}={name!r}: choose one of {', '.join(DTYPES)}.")
-    return DTYPES[name]
 
 
 def _construct(registry: Any, section: Mapping[str, Any] | None, *args: Any, **fixed: Any) -> Any:

@@ -1,6 +1,7 @@
 """The released (JAX) parameter trees: names to ours and back, for any composition whose rooms supply a name table.
 
 Leaves are named without the leading `params/` and the trailing `/value`; layers are stacked on the first axis.
+`orbax.py` reads and writes the files.
 """
 
 from collections.abc import Mapping
@@ -11,9 +12,25 @@ import mme_vla.backbone.names as backbone_names
 import mme_vla.integration.names as integration_names
 import mme_vla.memory.names as memory_names
 from mme_vla.errors import UserError
-from mme_vla.naming import Derived, NameTable, Unread, check, prefixed, read, write
+from mme_vla.naming import Derived, NameTable, Unread, prefixed
 from mme_vla.policy import MMEPolicy
 from mme_vla.pretrained import assign_tensors
+from mme_vla.weights.adapter import Adapter
+
+
+def released_adapter(policy: MMEPolicy) -> Adapter:
+    """The released tree of this policy.
+
+    Raises:
+        UserError: the memory is not one of the released ones.
+    """
+    return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
+
+
+def partial_adapter(policy: MMEPolicy) -> Adapter:
+    """The released tree as far as it has names for this policy: a memory of one's own is left out."""
+    table = _backbone_table(policy) | (_memory_table(policy) or {})
+    return Adapter(table, released_unread(policy), derived=released_derived(policy))
 
 
 def released_table(policy: MMEPolicy) -> NameTable:
@@ -22,14 +39,22 @@ def released_table(policy: MMEPolicy) -> NameTable:
     Raises:
         UserError: the memory is not one of the released ones.
     """
+    memory = _memory_table(policy)
+    if memory is None:
+        raise UserError(f"{type(policy.memory).__name__} has no released names: only released memories convert.")
+    return _backbone_table(policy) | memory
+
+
+def _backbone_table(policy: MMEPolicy) -> NameTable:
     table = prefixed("backbone", backbone_names.released_names(policy.backbone))
-    table |= prefixed("integration", integration_names.released_names(policy.integration))
-    if policy.memory is not None:
-        names = memory_names.released_names(policy.memory)
-        if names is None:
-            raise UserError(f"{type(policy.memory).__name__} has no released names: only released memories convert.")
-        table |= prefixed("memory", names)
-    return table
+    return table | prefixed("integration", integration_names.released_names(policy.integration))
+
+
+def _memory_table(policy: MMEPolicy) -> NameTable | None:
+    if policy.memory is None:
+        return {}
+    names = memory_names.released_names(policy.memory)
+    return None if names is None else prefixed("memory", names)
 
 
 def released_unread(policy: MMEPolicy) -> list[Unread]:
@@ -42,22 +67,16 @@ def released_derived(policy: MMEPolicy) -> list[Derived]:
     return memory_names.released_derived(policy.memory)
 
 
-def from_released(policy: MMEPolicy, tree: Mapping[str, Tensor]) -> MMEPolicy:
+def from_released(policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree") -> MMEPolicy:
     """Fill a policy (on meta or not) from a released tree.
 
     Raises:
         UserError: lists every leaf that is missing, left over or misshapen.
     """
-    table = released_table(policy)
-    known = {piece.path for pieces in table.values() for piece in pieces} | {u.path for u in released_unread(policy)}
-    extra = sorted(set(tree) - known - {d.path for d in released_derived(policy)})
-    if extra:
-        raise UserError(f"The checkpoint holds {len(extra)} tensors this policy has no place for: {', '.join(extra)}")
-    check(released_derived(policy), tree)
-    assign_tensors(policy, read(table, tree), "the released tree")
+    assign_tensors(policy, released_adapter(policy).translate(tree, policy.state_dict(), source), source)
     return policy
 
 
 def to_released(policy: MMEPolicy) -> dict[str, Tensor]:
     """Write a policy as a released tree; what no action reads is filled with zeros."""
-    return write(released_table(policy), released_unread(policy), policy.state_dict(), released_derived(policy))
+    return released_adapter(policy).export(policy.state_dict())

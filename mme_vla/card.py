@@ -1,0 +1,57 @@
+"""The model card that lies beside saved weights: what the policy is, and what is known of its training."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from torch import nn
+
+CARD_FILE = "README.md"
+
+
+def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
+    """Write a card from a policy's configuration.
+
+    Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is absent is said to be.
+    """
+    name, known = str(config.get("name", "policy")), config.get("card") or {}
+    backbone = config.get("backbone") or {}
+    rows = {
+        "memory": _part(config.get("memory")),
+        "integration": _part(config.get("integration")),
+        "backbone": f"{backbone.get('name', 'pi05')}, {backbone.get('depth', '?')} layers",
+        "action chunk": f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers",
+        "parameters": f"{sum(p.numel() for p in policy.parameters()) / 1e6:.1f} M",
+    }
+    if config.get("adapters"):
+        rows["adapters"] = f"LoRA, rank {config['adapters'].get('rank')}, not merged"
+    return "\n".join([
+        "---", "library_name: mme-vla", "pipeline_tag: robotics", "tags:", "- robotics",
+        "- vision-language-action", "- memory", f"- {name}", "---", "",
+        f"# {name}", "",
+        "A vision-language-action policy of the MME-VLA library: a π0.5 backbone"
+        + (" with a memory of the episode." if config.get("memory") else " without memory."), "",
+        *_table(rows), "",
+        "## Use", "",
+        "```python", "from mme_vla import MMEPolicy", "",
+        'policy = MMEPolicy.from_pretrained("<this repository or folder>")',
+        'episode = policy.start_episode("the goal in words")',
+        "```", "",
+        "## Data", "", str(known.get("data") or "Not recorded."), "",
+        "## Recipe", "", *(_table(known["recipe"]) if known.get("recipe") else ["Not recorded."]), "",
+        "## Results", "", *(_table(known["results"]) if known.get("results") else ["Not recorded."]), "",
+    ])  # fmt: skip
+
+
+def _part(section: Mapping[str, Any] | None) -> str:
+    if not section or section.get("name") in (None, "none"):
+        return "none"
+    options = ", ".join(f"{key} {value}" for key, value in section.items() if key != "name" and value is not None)
+    return f"{section['name']} ({options})" if options else str(section["name"])
+
+
+def _table(rows: Mapping[str, Any]) -> list[str]:
+    return ["| | |", "|---|---|", *(f"| {key} | {_cell(value)} |" for key, value in rows.items())]
+
+
+def _cell(value: Any) -> str:
+    return str(value).replace("|", "\\|").replace("\n", " ")

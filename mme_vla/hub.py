@@ -1,0 +1,65 @@
+"""Folders that live on the Hugging Face Hub: found by `owner/name`, and written there."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mme_vla.errors import UserError
+
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+
+
+def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
+    """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of that name.
+
+    Args:
+        source: a path, or `owner/name` of a hub repository.
+        revision: branch, tag or commit of the repository; its main branch by default.
+        token: for private repositories; the one stored by `hf auth login` by default.
+
+    Raises:
+        UserError: neither a path nor a repository that can be reached.
+    """
+    path = Path(source).expanduser()
+    if path.exists() or not _REPOSITORY.fullmatch(str(source)):
+        if revision is not None:
+            raise UserError(f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
+        return path
+    import httpx
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+
+    try:
+        return Path(snapshot_download(str(source), revision=revision, token=token))
+    except (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
+        at = "" if revision is None else f" at revision {revision!r}"
+        reason = str(error).strip().splitlines()
+        raise UserError(
+            f"{source} is not a path on this machine, and the hub repository of that name{at} could not be fetched "
+            f"({type(error).__name__}: {reason[0] if reason else 'no answer'}). Check the name, the network, and for a "
+            "private or gated repository your token (hf auth login)."
+        ) from error
+
+
+def push_folder(
+    folder: Path, repo_id: str, *, private: bool, token: str | None, revision: str | None, message: str
+) -> str:
+    """Create the repository if need be, upload the folder's files as one commit, and return its address.
+
+    Raises:
+        UserError: the id is not `owner/name`, or the hub refuses.
+    """
+    if not _REPOSITORY.fullmatch(repo_id):
+        raise UserError(f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul.")
+    import huggingface_hub
+    from huggingface_hub.errors import HfHubHTTPError
+
+    api: Any = huggingface_hub.HfApi(token=token)
+    try:
+        address = api.create_repo(repo_id, private=private, exist_ok=True)
+        if revision is not None:
+            api.create_branch(repo_id, branch=revision, exist_ok=True)
+        api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=message, revision=revision)
+    except HfHubHTTPError as error:
+        raise UserError(f"The hub refused to store {repo_id}: {error}. Is the token allowed to write there?") from error
+    return str(address)

@@ -1,0 +1,76 @@
+"""What every foreign format shares: one policy's name table with its three short lists, applied strictly."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.naming import Derived, NameTable, Unread, check, read, write
+from mme_vla.policy import MMEPolicy
+from mme_vla.pretrained import check_fit
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """How a foreign format names and lays out the tensors of one policy.
+
+    table: our name → the foreign tensors it is made of.
+    unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when written.
+    tied: foreign name → the foreign name it repeats: optional when read, written as a copy.
+    derived: foreign constants that follow from the configuration: dropped when read, recomputed when written.
+    """
+
+    table: NameTable
+    unread: list[Unread] = field(default_factory=list)
+    tied: Mapping[str, str] = field(default_factory=dict)
+    derived: list[Derived] = field(default_factory=list)
+
+    def needed(self) -> set[str]:
+        """Foreign names without which the policy cannot be filled."""
+        return {piece.path for pieces in self.table.values() for piece in pieces}
+
+    def export(self, ours: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Write our tensors in the foreign names and layouts, the three lists included.
+
+        Raises:
+            UserError: the policy has tensors that this format has no name for.
+        """
+        homeless = sorted(set(ours) - set(self.table))
+        if homeless:
+            raise UserError(
+                f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
+                "policies without adapters: convert another policy, merge the adapters first, or choose another format."
+            )
+        theirs = write(self.table, self.unread, ours, self.derived)
+        return theirs | {name: theirs[original] for name, original in self.tied.items()}
+
+    def shapes(self, ours: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+        """Every foreign name but the derived ones, with its shape, where ours have the shapes of `ours`."""
+        on_meta = {name: torch.empty_like(ours[name], device="meta") for name in self.table}
+        theirs = write(self.table, self.unread, on_meta)
+        theirs |= {name: theirs[original] for name, original in self.tied.items()}
+        return {name: tuple(tensor.shape) for name, tensor in theirs.items()}
+
+    def translate(self, theirs: Mapping[str, Tensor], ours: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+        """Read foreign tensors into our names; `ours` gives the shapes they must have.
+
+        Raises:
+            UserError: lists every foreign tensor that is missing, left over or misshapen; or a constant is another.
+        """
+        shapes, derived = self.shapes(ours), {constant.path for constant in self.derived}
+        found = {name: tensor for name, tensor in theirs.items() if name not in derived}
+        check_fit(found, shapes, source, optional=set(shapes) - self.needed())
+        check(self.derived, theirs)
+        return read(self.table, found)
+
+
+def memory_parameters(policy: MMEPolicy) -> set[str]:
+    """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the memory's own expert."""
+    extra = tuple(f".experts.{name}." for name in policy.integration.extra_experts())
+    return {
+        name
+        for name in policy.state_dict()
+        if name.startswith(("memory.", "integration.")) or any(part in name for part in extra)
+    }

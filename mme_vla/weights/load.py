@@ -1,0 +1,166 @@
+"""The front door: any checkpoint into a policy, whole or as a start for another variant."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.finetune import merge_state
+from mme_vla.policy import MMEPolicy
+from mme_vla.pretrained import assign_tensors, check_fit, dtype_of
+from mme_vla.processing.processor import CONFIG_FILE
+from mme_vla.weights.adapter import Adapter, memory_parameters
+from mme_vla.weights.ports import port_adapter
+from mme_vla.weights.released import partial_adapter, released_adapter
+from mme_vla.weights.source import Source, open_source
+from mme_vla.weights.stats import read_stats, stats_files
+
+ADAPTERS: dict[str, Callable[[MMEPolicy], Adapter]] = {
+    "lerobot": port_adapter,
+    "openpi": port_adapter,
+    "released": released_adapter,
+}
+
+# What a memory adds to π0.5, as our names and the released leaves tell.
+_OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
+_MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
+
+
+def load_into(
+    policy: MMEPolicy,
+    source: str | Path,
+    *,
+    dtype: str = "float32",
+    revision: str | None = None,
+    token: str | None = None,
+) -> MMEPolicy:
+    """Fill a policy with a checkpoint of the same variant, in any format this library knows.
+
+    The policy may lie on the meta device, so that no weight is drawn only to be replaced. A checkpoint that
+    carries the statistics of one dataset hands them to the policy's processor; LeRobot's are left (see `read_stats`).
+
+    Args:
+        source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
+        dtype: what the weights become, whatever they are stored in. revision, token: of a hub repository.
+
+    Raises:
+        UserError: no such checkpoint, a damaged one, or one that does not fit; every tensor that is missing, left over
+            or misshapen is listed, and nothing is changed.
+    """
+    kind = dtype_of(dtype)
+    found = open_source(source, revision, token)
+    if found.format in ("lerobot", "openpi") and policy.memory is not None:
+        raise UserError(
+            f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
+            "To begin training from it use start_from() (on the command line: init_from=…)."
+        )
+    stats = None
+    if policy.processor is not None and found.format != "lerobot" and len(stats_files(found.folder)) < 2:
+        stats = read_stats(found.folder)
+    assign_tensors(policy, read_as(policy, found), str(source), kind)
+    if stats is not None and policy.processor is not None:
+        policy.processor.stats = stats
+    return policy
+
+
+def read_as(policy: MMEPolicy, source: Source) -> dict[str, Tensor]:
+    """Read a checkpoint in the names of a policy of its own variant.
+
+    Raises:
+        UserError: as `load_into`.
+    """
+    tensors = source.tensors()
+    if source.format == "ours":
+        return merge_state(tensors, source.config.get("adapters"))
+    return ADAPTERS[source.format](policy).translate(tensors, policy.state_dict(), str(source.folder))
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a policy took from another's checkpoint.
+
+    taken, new: our names; new ones kept the values they had. left: the checkpoint's names that have no place here.
+    """
+
+    taken: list[str]
+    new: list[str]
+    left: list[str]
+
+    def __str__(self) -> str:
+        """A sentence for the screen."""
+        sentence = f"{len(self.taken)} tensors taken, {len(self.new)} new ({_groups(self.new)})"
+        return sentence + (f", {len(self.left)} left behind ({_groups(self.left)})" if self.left else "")
+
+
+def start_from(policy: MMEPolicy, source: str | Path, *, revision: str | None = None) -> list[str]:
+    """Copy into a built policy all that a checkpoint holds of it, and return the names of what stays new.
+
+    The source may be memoryless π0.5 in any format, or another variant. Only parameters of the memory (its integration
+    and its own expert included) may stay new; they keep the values they have. Statistics are not taken.
+
+    Raises:
+        UserError: no checkpoint, a weight of another shape, or weights missing that are not the memory's.
+    """
+    return transfer(policy, source, revision=revision).new
+
+
+def transfer(policy: MMEPolicy, source: str | Path, *, revision: str | None = None) -> Start:
+    """Do what `start_from` says, and tell in full what was taken, what is new and what was left behind."""
+    if policy.device.type == "meta":
+        raise UserError("Build the policy on a real device to start from a checkpoint: its memory needs fresh values.")
+    found = open_source(source, revision)
+    theirs, own, state = found.tensors(), memory_parameters(policy), policy.state_dict()
+    if found.format == "ours":
+        theirs = merge_state(theirs, found.config.get("adapters"))
+        _check_tokenizer(policy, found.folder)
+        left = sorted(name for name in set(theirs) - set(state) if _OF_MEMORY.search(name))
+        ours = {name: tensor for name, tensor in theirs.items() if name not in left}
+        check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
+    else:
+        of_format = partial_adapter(policy) if found.format == "released" else ADAPTERS[found.format](policy)
+        adapter = _reduced(of_format, own, theirs)
+        left = sorted(name for name in set(theirs) - set(adapter.shapes(state)) if _MEMORY_LEAF.search(name))
+        theirs = {name: tensor for name, tensor in theirs.items() if name not in left}
+        ours = adapter.translate(theirs, state, str(source))
+    policy.load_state_dict(ours, strict=False)
+    return Start(sorted(ours), sorted(set(state) - set(ours)), left)
+
+
+def _check_tokenizer(policy: MMEPolicy, folder: Path) -> None:
+    """Refuse a start from weights whose token ids mean other words."""
+    file = folder / CONFIG_FILE
+    if policy.processor is None or not file.is_file():
+        return
+    try:
+        theirs = json.loads(file.read_text()).get("tokenizer_fingerprint")
+    except (ValueError, AttributeError) as error:
+        raise UserError(f"{file} is damaged: {error}.") from None
+    ours = policy.processor.tokenizer
+    if theirs is not None and theirs != ours.fingerprint:
+        raise UserError(
+            f"{folder} was trained with another tokenizer ({theirs}) than {ours.spec!r} ({ours.fingerprint}): its ids "
+            "would mean other words. Set processor.tokenizer to that one."
+        )
+
+
+def _reduced(adapter: Adapter, own: set[str], theirs: dict[str, Tensor]) -> Adapter:
+    """Leave out the memory's parameters that the checkpoint does not hold."""
+    table = {
+        name: pieces
+        for name, pieces in adapter.table.items()
+        if name not in own or all(piece.path in theirs for piece in pieces)
+    }
+    return replace(adapter, table=table)
+
+
+def _groups(names: list[str]) -> str:
+    """Tensor names in short: numbers become *, and each stem is named once."""
+    stems = {
+        ".".join("*" if part.isdigit() else part for part in name.split(".")[:-1]) or name.rpartition("/")[0]
+        for name in names
+    }
+    return ", ".join(sorted(stems)) or "none"

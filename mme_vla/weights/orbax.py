@@ -1,0 +1,151 @@
+"""Orbax checkpoints without JAX: every leaf is a zarr array, which tensorstore reads and writes.
+
+The arrays lie in one OCDBT store or, in the plain layout, in a folder each. Layout of a released run:
+
+    <run>/history_config.txt                         which variant (absent for the memoryless baseline)
+    <run>/<step>/params/                             the arrays
+    <run>/<step>/assets/<dataset>/norm_stats.json    normalisation statistics
+"""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+
+MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
+_ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
+_DICT_KEY = 2  # Orbax's number for "this step of the path is a dictionary's key"
+
+
+def find_params(folder: Path) -> Path | None:
+    """The folder with the arrays of a run (its newest step), a step, or the arrays' folder itself; None without any."""
+    if _holds_arrays(folder):
+        return folder
+    if _holds_arrays(folder / "params"):
+        return folder / "params"
+    steps = [path for path in folder.glob("*") if path.name.isdigit() and _holds_arrays(path / "params")]
+    return max(steps, key=lambda path: int(path.name)) / "params" if steps else None
+
+
+def variant_of(params: Path) -> str | None:
+    """What `history_config.txt` says beside a released run's steps, such as `perceptual-framesamp-modul`."""
+    for folder in (params.parent, params.parent.parent):
+        note = folder / "history_config.txt"
+        if note.is_file():
+            return Path(note.read_text().strip()).name.removesuffix(".yaml")
+    return None
+
+
+def read_orbax(params: Path) -> dict[str, Tensor]:
+    """Read all arrays of a checkpoint, named by their path without the leading `params/` and the trailing `/value`.
+
+    Raises:
+        UserError: tensorstore is not installed, or the store is incomplete or damaged.
+    """
+    ts = _tensorstore()
+    ocdbt = (params / MANIFEST).is_file()
+    try:
+        arrays = _list_arrays(ts, params, ocdbt)
+        pending = {
+            name: ts.open({"driver": driver, "kvstore": _store(params, path, ocdbt)}, open=True, read=True)
+            for path, (name, driver) in arrays.items()
+        }
+        # All are asked for before the first is waited for, so that reading overlaps.
+        reads = {name: opened.result().read() for name, opened in pending.items()}
+        tree = {name: _to_tensor(read.result()) for name, read in reads.items()}
+    except ValueError as error:  # tensorstore's word for everything it cannot read
+        raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {error}") from error
+    if not tree:
+        raise UserError(f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
+    return tree
+
+
+def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
+    """Write a tree as Orbax does (OCDBT, zarr, full keys `params/…/value`), so that Orbax restores it.
+
+    Raises:
+        UserError: tensorstore is not installed.
+    """
+    ts = _tensorstore()
+    params.mkdir(parents=True)
+    leaves: dict[str, Any] = {}
+    arrays: dict[str, np.ndarray] = {}
+    for name, tensor in sorted(tree.items()):
+        path = ("params", *name.split("/"), "value")
+        arrays[".".join(path)] = _to_numpy(tensor)
+        leaves[str(path)] = {
+            "key_metadata": [{"key": key, "key_type": _DICT_KEY} for key in path],
+            "value_metadata": {"value_type": "np.ndarray", "skip_deserialize": False},
+        }
+    context = ts.Context()  # shared, and all writes at once: the store then gathers them into few files
+    layout = {"compressor": {"id": "zstd", "level": 1}}
+    opened = [
+        ts.open(
+            {"driver": "zarr", "kvstore": _store(params, path, True), "metadata": {**layout, "chunks": array.shape}},
+            create=True, dtype=array.dtype, shape=array.shape, context=context,
+        )
+        for path, array in arrays.items()
+    ]  # fmt: skip
+    writes = [store.result().write(array) for store, array in zip(opened, arrays.values(), strict=True)]
+    for write in writes:
+        write.result()
+    about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}
+    (params / METADATA).write_text(json.dumps(about))
+
+
+def _holds_arrays(folder: Path) -> bool:
+    return (folder / MANIFEST).is_file() or any(next(folder.glob(f"*{name}"), None) for name in _ARRAY_FILES)
+
+
+def _list_arrays(ts: Any, params: Path, ocdbt: bool) -> dict[str, tuple[str, str]]:
+    """Path in the store → (name, driver) of every array."""
+    if ocdbt:
+        keys = [key.decode() for key in ts.KvStore.open(_store(params, "", True)).result().list().result()]
+    else:
+        keys = [f"{file.parent.name}/{file.name}" for name in _ARRAY_FILES for file in params.glob(f"*{name}")]
+    arrays = {}
+    for key in keys:
+        path, slash, file = key.rpartition("/")
+        if slash + file in _ARRAY_FILES:
+            name = re.sub(r"^params/|/value$", "", path.replace(".", "/"))
+            arrays[path] = (name, _ARRAY_FILES[slash + file])
+    return arrays
+
+
+def _store(params: Path, path: str, ocdbt: bool) -> dict[str, Any]:
+    base = f"file://{params.resolve().as_posix()}/"
+    return {"driver": "ocdbt", "base": base, "path": f"{path}/" if path else ""} if ocdbt else {
+        "driver": "file", "path": f"{params.resolve().as_posix()}/{path}/",
+    }  # fmt: skip
+
+
+def _to_tensor(array: np.ndarray) -> Tensor:
+    if array.dtype.name == "bfloat16":  # which numpy knows only through an extension
+        return torch.from_numpy(np.array(array).view(np.uint16)).view(torch.bfloat16)
+    return torch.from_numpy(np.array(array))
+
+
+def _to_numpy(tensor: Tensor) -> np.ndarray:
+    tensor = tensor.detach().cpu().contiguous()
+    if tensor.dtype == torch.bfloat16:
+        import ml_dtypes  # comes with tensorstore
+
+        return tensor.view(torch.uint16).numpy().view(ml_dtypes.bfloat16)
+    return tensor.numpy()
+
+
+def _tensorstore() -> Any:
+    try:
+        import tensorstore
+    except ImportError:
+        raise UserError(
+            "Orbax checkpoints are read with tensorstore, which is not installed: pip install 'mme-vla[orbax]'."
+        ) from None
+    return tensorstore

@@ -1,0 +1,133 @@
+"""What a user points at: which format it is in, and its tensors under that format's names."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.hub import local_folder
+from mme_vla.pretrained import INDEX, WEIGHTS, read_safetensors, weight_files
+from mme_vla.weights.orbax import find_params, read_orbax, variant_of
+from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
+
+FORMATS = {
+    "ours": "save_pretrained() of this library",
+    "lerobot": "LeRobot's pi05 (safetensors)",
+    "openpi": "openpi's PyTorch π0.5 (safetensors)",
+    "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
+}
+
+VARIANTS = {
+    "pi05_baseline": "pi05",
+    "symbolic-simple-subgoal": "simplesg",
+    "symbolic-grounded-subgoal": "groundsg",
+} | {
+    f"{kind}-{memory}-{integration}": f"{memory}_{integration}"
+    for kind, memories in (("perceptual", ("framesamp", "tokendrop")), ("recurrent", ("rmt", "ttt")))
+    for memory in memories
+    for integration in ("context", "modul", "expert")
+}
+"""The released code's names of the variants, and ours."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A checkpoint that was found.
+
+    format: a key of `FORMATS`. folder: what belongs to it lies here: configuration, statistics.
+    files: its safetensors files; empty for an Orbax checkpoint. params: the Orbax arrays' folder.
+    """
+
+    format: str
+    folder: Path
+    files: tuple[Path, ...] = ()
+    params: Path | None = None
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Read all tensors, under the one spelling that the format's name table knows.
+
+        Raises:
+            UserError: a file that is damaged, incomplete or of another network.
+        """
+        if self.params is not None:
+            return read_orbax(self.params)
+        tensors = {name: tensor for file in self.files for name, tensor in read_safetensors(file).items()}
+        return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What `config.json` beside the weights says; empty without one."""
+        file = self.folder / "config.json"
+        if not file.is_file():
+            return {}
+        try:
+            config = json.loads(file.read_text())
+        except ValueError as error:
+            raise UserError(f"{file} is not valid JSON: {error}") from None
+        return config if isinstance(config, dict) else {}
+
+    @property
+    def model(self) -> str | None:
+        """Our name of the variant a released run says it is, or None where it does not say."""
+        said = variant_of(self.params) if self.params is not None else None
+        return None if said is None else VARIANTS.get(said, said)
+
+
+def detect_format(source: str | Path) -> str:
+    """Say what `source` is: `ours`, `lerobot`, `openpi` or `released`.
+
+    Raises:
+        UserError: nothing there, or nothing this library knows.
+    """
+    return open_source(source).format
+
+
+def open_source(source: str | Path, revision: str | None = None, token: str | None = None) -> Source:
+    """Find a checkpoint: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
+
+    Raises:
+        UserError: nothing there, or nothing this library knows.
+    """
+    path = local_folder(source, revision, token)
+    if not path.exists():
+        raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
+    if path.is_file():
+        return _of_files(path.parent, (path,))
+    if (path / WEIGHTS).is_file() or (path / INDEX).is_file():
+        return _of_files(path, tuple(weight_files(path)))
+    params = find_params(path)
+    if params is not None:
+        return Source("released", params.parent if params.name == "params" else params, params=params)
+    if (path / "adapter_model.safetensors").is_file():
+        raise UserError(f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first.")
+    raise UserError(f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}.")
+
+
+def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
+    names = [name for file in files for name in _names(file)]
+    if is_port(names):
+        lerobot = any(name.startswith(LEROBOT_PREFIX) for name in names)
+        described = Source("lerobot", folder).config.get("type") is not None
+        return Source("lerobot" if lerobot or described else "openpi", folder, files)
+    if any(name.startswith("backbone.") for name in names):
+        return Source("ours", folder, files)
+    if any(name.startswith("PaliGemma/") for name in names):
+        return Source("released", folder, files)
+    few = ", ".join(sorted(names)[:3]) or "none at all"
+    raise UserError(
+        f"{files[0]} is not a π0.5 policy: its tensors are called {few}. Known: {'; '.join(FORMATS.values())}."
+    )
+
+
+def _names(file: Path) -> list[str]:
+    """Tensor names in a safetensors file's header."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(file, "pt") as opened:
+            return list(opened.keys())
+    except (SafetensorError, OSError) as error:
+        raise UserError(f"{file} is damaged or not a safetensors file: {error}") from error

@@ -1,0 +1,127 @@
+"""A policy as a folder that another library loads: one writer a format."""
+
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.torch_names import EMBEDDING
+from mme_vla.errors import UserError
+from mme_vla.policy import MMEPolicy
+from mme_vla.pretrained import DTYPES, WEIGHTS, cast
+from mme_vla.processing.normalize import NormStats
+from mme_vla.processing.processor import STATS_FILE, VIEWS
+from mme_vla.weights.orbax import write_orbax
+from mme_vla.weights.ports import to_lerobot, to_openpi
+from mme_vla.weights.released import released_table, to_released
+from mme_vla.weights.source import VARIANTS
+
+ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
+_SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
+
+
+def check_target(policy: MMEPolicy, fmt: str) -> None:
+    """Refuse a format that has no place for this policy, before anything is read.
+
+    Raises:
+        UserError: a memory in a format of memoryless policies, or one without released names.
+    """
+    if fmt in ("lerobot", "openpi") and policy.memory is not None:
+        raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
+    if fmt == "released":
+        released_table(policy)
+
+
+def write_ours(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+    """`save_pretrained`; the processor carries the statistics."""
+    policy.save_pretrained(folder, dtype=_name(dtype))
+
+
+def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+    """Weights and `config.json` for LeRobot's `PI05Policy`; statistics as openpi writes them, beside them.
+
+    LeRobot's own processors write the state into the prompt, and know no RoboMME statistics: they are not part of this.
+    """
+    config = policy.backbone.config
+    size = config.vision.image_size
+    features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in VIEWS}
+    width = 8 if stats is None else len(stats.actions)
+    about = {
+        "type": "pi05",
+        "n_obs_steps": 1,
+        "input_features": {**features, "observation.state": {"type": "STATE", "shape": [width]}},
+        "output_features": {"action": {"type": "ACTION", "shape": [width]}},
+        **_SIZES,
+        "dtype": _name(dtype),
+        "chunk_size": config.horizon,
+        "n_action_steps": config.horizon,
+        "max_state_dim": config.action_dim,
+        "max_action_dim": config.action_dim,
+        "image_resolution": [size, size],
+        # Joints against the current state, the gripper as it is: what these weights answer with.
+        "use_relative_actions": True,
+        "relative_exclude_joints": ["gripper"],
+    }
+    _write_json(folder / "config.json", about)
+    _write_safetensors(to_lerobot(policy, policy.state_dict()), folder, dtype)
+    if stats is not None:
+        stats.save(folder / STATS_FILE)
+
+
+def write_openpi(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+    """Weights, `config.json` and statistics as openpi's PyTorch training writes them."""
+    config = policy.backbone.config
+    about = {"action_dim": config.action_dim, "action_horizon": config.horizon, **_SIZES, "precision": _name(dtype)}
+    _write_json(folder / "config.json", about)
+    tensors = to_openpi(policy, policy.state_dict())
+    del tensors[EMBEDDING]  # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more
+    _write_safetensors(tensors, folder, dtype)
+    _write_assets(folder, stats)
+
+
+def write_released(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+    """A run with one step, 0, as the released JAX code lays it out."""
+    names = {ours: theirs for theirs, ours in VARIANTS.items()}
+    variant = names.get(str(policy.config.get("name")))
+    if policy.memory is not None and variant is not None:
+        (folder / "history_config.txt").write_text(f"{variant}.yaml\n")
+    write_orbax({name: cast(tensor, dtype) for name, tensor in to_released(policy).items()}, folder / "0" / "params")
+    _write_assets(folder / "0", stats)
+
+
+WRITERS: dict[str, Callable[[MMEPolicy, Path, torch.dtype, NormStats | None], None]] = {
+    "ours": write_ours,
+    "lerobot": write_lerobot,
+    "openpi": write_openpi,
+    "released": write_released,
+}
+
+
+def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch.dtype) -> None:
+    """Write one file, as those libraries read it; a tensor under two names is written twice."""
+    from safetensors.torch import save_file
+
+    seen: set[int] = set()
+    apart = {}
+    for name, tensor in tensors.items():
+        tensor = cast(tensor.detach(), dtype).cpu()
+        apart[name] = tensor.clone() if tensor.data_ptr() in seen else tensor
+        seen.add(tensor.data_ptr())
+    save_file(apart, folder / WEIGHTS, metadata={"format": "pt"})
+
+
+def _write_assets(folder: Path, stats: NormStats | None) -> None:
+    if stats is not None:
+        (folder / "assets" / ASSET).mkdir(parents=True)
+        stats.save(folder / "assets" / ASSET / STATS_FILE)
+
+
+def _write_json(file: Path, content: dict[str, Any]) -> None:
+    file.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def _name(dtype: torch.dtype) -> str:
+    return next(name for name, kind in DTYPES.items() if kind == dtype)
