@@ -49,8 +49,18 @@ def build_policy(
     return build_from_config(compose("policy", words, extra_dirs=extra), device=device, seed=seed)
 
 
-def build_from_config(config: DictConfig, *, device: str | torch.device = "cpu", seed: int | None = None) -> MMEPolicy:
-    """Build the policy a composed configuration describes; other sections (data, train, …) are ignored."""
+def build_from_config(
+    config: DictConfig,
+    *,
+    device: str | torch.device = "cpu",
+    seed: int | None = None,
+    fresh_backbone: bool = True,
+) -> MMEPolicy:
+    """Build the policy a composed configuration describes; other sections (data, train, …) are ignored.
+
+    Args:
+        fresh_backbone: False where a checkpoint is loaded next: π0.5's own weights are then not drawn.
+    """
     import_plugins(config)
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
@@ -59,7 +69,7 @@ def build_from_config(config: DictConfig, *, device: str | torch.device = "cpu",
     processor = None if torch.device(device).type == "meta" else build_processor(sections)
     with torch.random.fork_rng(devices=[]), torch.device(device):
         torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
-        policy = MMEPolicy.from_config(sections, processor)
+        policy = MMEPolicy.from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -13,7 +14,7 @@ import mme_vla.memory  # noqa: F401  (importing the rooms registers what they sh
 from mme_vla.backbone import flow
 from mme_vla.backbone.config import BackboneConfig
 from mme_vla.backbone.gemma import Conditioning, Hook, KVCache, Layout
-from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.backbone.pi05 import Pi05Backbone, initialise
 from mme_vla.episode import Episode
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
@@ -63,8 +64,12 @@ class MMEPolicy(Saved):
         self.augment = augment
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any], processor: "Processor | None" = None) -> Self:
+    def from_config(
+        cls, config: Mapping[str, Any], processor: "Processor | None" = None, *, fresh_backbone: bool = True
+    ) -> Self:
         """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a registry's key.
+
+        With `fresh_backbone=False` no weight of π0.5 itself is drawn: they hold anything until a checkpoint is loaded.
 
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
@@ -75,7 +80,14 @@ class MMEPolicy(Saved):
         integration = _construct(INTEGRATIONS, config.get("integration"), backbone_config) or Integration(
             backbone_config
         )
-        backbone = backbone_cls(backbone_config, integration.extra_experts())
+        experts = integration.extra_experts()
+        with nullcontext() if fresh_backbone else torch.device("meta"):
+            backbone = backbone_cls(backbone_config, experts)
+        if not fresh_backbone:
+            backbone.to_empty(device=torch.get_default_device())
+            for block in backbone.transformer.layers:
+                for expert in experts:
+                    initialise(block.experts[expert])
         memory = _construct(
             MEMORIES, config.get("memory"), d_vision=backbone_config.vlm.width, width=integration.memory_width
         )

@@ -42,6 +42,7 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
 
     from mme_vla.build import build_from_config
     from mme_vla.data.dataset import collate
+    from mme_vla.finetune import apply_finetuning
     from mme_vla.pretrained import assign_tensors, load_tensors
     from mme_vla.training.checkpoint import check_disk
     from mme_vla.training.console import ProgressLine
@@ -64,16 +65,20 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
             folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
     first = accelerator.is_main_process
     line = ProgressLine(settings.steps, run.step, shown=first)
-    policy = build_from_config(cfg)
-    check_frozen(policy, settings.freeze_vision)
+    # A backbone whose weights are about to be replaced is not drawn first.
+    policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and not config["init_from"])
+    check_frozen(policy, config["finetune"]["freeze_vision"])
+    if run.checkpoint is None and config["init_from"]:
+        line.say(start_from(policy, config["init_from"]))
+    apply_finetuning(policy, **config["finetune"])
     if run.checkpoint is not None:
         assign_tensors(policy, load_tensors(run.checkpoint), str(run.checkpoint))
         line.say(f"going on from {run.checkpoint}")
-    elif config["init_from"]:
-        line.say(start_from(policy, config["init_from"]))
+    recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
+    policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
     policy.to(accelerator.device)
     with accelerator.main_process_first():
-        data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, line.say)
+        data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, config["init_from"], line.say)
     check_disk(run.folder, policy, settings.keep)
     validation = None
     if data.val is not None and settings.val_samples:

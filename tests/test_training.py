@@ -15,7 +15,9 @@ from accelerate import Accelerator
 from omegaconf import OmegaConf
 
 from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.build import build_from_config
 from mme_vla.config import compose
+from mme_vla.finetune import apply_finetuning
 from mme_vla.processing.normalize import NormStats, QuantileStats
 from mme_vla.training.checkpoint import check_disk, checkpoints_in, resolve_checkpoint
 from mme_vla.training.console import ProgressLine
@@ -78,6 +80,7 @@ def policy(name: str = "pi05", **overrides: Any) -> MMEPolicy:
     memory = {} if name == "pi05" else {"memory": {"budget": 64}}
     built = build_policy(name, backbone=SMALL, **memory, **overrides)
     built.require_processor().stats = NormStats(STATS, STATS)
+    apply_finetuning(built)
     return built
 
 
@@ -282,7 +285,7 @@ def test_a_memory_starts_from_the_memoryless_policy(tmp_path: Path, name: str) -
     base = policy(seed=5)
     base.save_pretrained(tmp_path)
     built = policy(name)
-    sentence = start_from(built, tmp_path)
+    sentence = start_from(built, str(tmp_path))
     assert "memory.encoder" in sentence
     assert all(torch.equal(built.state_dict()[key], value) for key, value in base.state_dict().items())
 
@@ -291,10 +294,10 @@ def test_starting_from_a_smaller_policy_is_refused(tmp_path: Path) -> None:
     build_policy("pi05", backbone={**SMALL, "depth": 2}).save_pretrained(tmp_path / "deeper")
     wide = build_policy("pi05", backbone={**SMALL, "action_dim": 16})
     wide.save_pretrained(tmp_path / "narrow")
-    with pytest.raises(UserError, match="another shape"):
-        start_from(policy(), tmp_path / "narrow")
-    with pytest.raises(UserError, match="not the memory's own"):
-        start_from(build_policy("pi05", backbone={**SMALL, "depth": 3}), tmp_path / "deeper")
+    with pytest.raises(UserError, match="misshapen"):
+        start_from(policy(), str(tmp_path / "narrow"))
+    with pytest.raises(UserError, match="missing"):
+        start_from(build_policy("pi05", backbone={**SMALL, "depth": 3}), str(tmp_path / "deeper"))
 
 
 def test_the_tower_under_a_memory_stays_frozen() -> None:
@@ -365,3 +368,17 @@ def test_the_papers_recipe_is_the_papers() -> None:
     assert config.policy.compute_dtype == "bfloat16"
     assert config.backbone.vlm.width == 2048
     assert config.name == "framesamp_modul"
+
+
+def test_weights_to_be_replaced_are_not_drawn_but_a_memory_is_fresh(tmp_path: Path) -> None:
+    base = policy(seed=5)
+    base.save_pretrained(tmp_path)
+    words = ["model=framesamp_expert", "memory.budget=64", *(f"backbone.{k}={v}" for k, v in (("depth", 1),))]
+    words += [f"backbone.vision.{key}={value}" for key, value in SMALL["vision"].items()]
+    built = build_from_config(compose("policy", words), fresh_backbone=False)
+    start_from(built, str(tmp_path))
+    fresh = built.state_dict()
+    assert all(torch.equal(fresh[key], value) for key, value in base.state_dict().items())
+    norm = next(value for key, value in fresh.items() if ".experts.memory.attention_norm.scale" in key)
+    weight = next(value for key, value in fresh.items() if ".experts.memory." in key and value.ndim == 2)
+    assert (norm == 0).all() and 0 < weight.std() < 1

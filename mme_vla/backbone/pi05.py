@@ -10,6 +10,7 @@ from mme_vla.backbone.blocks import Block
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import time_embedding
 from mme_vla.backbone.gemma import JointTransformer
+from mme_vla.backbone.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.precision import float32_linear
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.registry import BACKBONES
@@ -93,11 +94,14 @@ class Pi05Backbone(nn.Module):
 
 def initialise(module: nn.Module) -> None:
     """Fresh weights: LeCun normal matrices, zero biases, unit-variance embeddings; adaptive norms keep their zeros."""
-    from mme_vla.backbone.norms import AdaRMSNorm
-
     adaptive = {id(m.dense) for m in module.modules() if isinstance(m, AdaRMSNorm)}
     for m in module.modules():
-        if isinstance(m, nn.Linear | nn.Conv2d) and id(m) not in adaptive:
+        if isinstance(m, RMSNorm):
+            nn.init.zeros_(m.scale)
+        elif id(m) in adaptive:
+            for parameter in m.parameters():
+                nn.init.zeros_(parameter)
+        elif isinstance(m, nn.Linear | nn.Conv2d):
             fan_in = m.weight[0].numel()
             nn.init.normal_(m.weight, std=fan_in**-0.5)
             if m.bias is not None:

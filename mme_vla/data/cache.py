@@ -230,9 +230,11 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.build import build_from_config
     from mme_vla.data.cache_build import build_cache, clear_cache, estimate
     from mme_vla.data.sources import open_sources
-    from mme_vla.policy import MMEPolicy
+    from mme_vla.weights import transfer
 
-    policy = build_from_config(cfg) if cfg.checkpoint is None else MMEPolicy.from_pretrained(cfg.checkpoint)
+    policy = build_from_config(cfg, fresh_backbone=cfg.checkpoint is None)
+    if cfg.checkpoint is not None:
+        transfer(policy, cfg.checkpoint)
     memory = policy.to(cfg.device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")

@@ -31,12 +31,14 @@ def prepare_data(
     data: Mapping[str, Any],
     seed: int,
     stats_from: Path | None = None,
+    init_from: str | None = None,
     say: Callable[[str], None] = print,
 ) -> SplitData:
     """Open and check the datasets, give the policy's processor its statistics, and build or open the vision caches.
 
     Args:
         policy: with the vision weights it will train with. data: the section `data` of a configuration.
+        init_from: where the vision weights came from, for the command that builds a cache with them.
         stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
         say: takes a line for the user.
 
@@ -64,7 +66,7 @@ def prepare_data(
                 dtype=str(policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
-                command=_cache_command(policy.config, data),
+                command=_cache_command(policy.config, data, init_from),
             )
             for source in sources
         ]
@@ -92,11 +94,13 @@ def check_frozen(policy: MMEPolicy, freeze_vision: bool) -> None:
     """
     if policy.memory is not None and not freeze_vision:
         raise UserError(
-            "train.freeze_vision=false changes the vision tower while the memory reads tokens that were cached before: "
-            "at test time the memory would see other tokens than in training. Keep it frozen, or use model=pi05."
+            "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "
+            "before: at test time it would see other tokens than in training. Keep it frozen, or use model=pi05."
         )
 
 
-def _cache_command(config: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+def _cache_command(config: Mapping[str, Any], data: Mapping[str, Any], init_from: str | None) -> str:
     words = [f"model={config.get('name', '<model>')}", f"data={data['name']}"]
+    if init_from is not None:
+        words.append(f"checkpoint={init_from}")
     return "python -m mme_vla.data.cache " + " ".join(shlex.quote(word) for word in words)

@@ -55,7 +55,8 @@ class Trainer:
         """Put the policy on its device, and back to where `run.checkpoint` left it.
 
         Args:
-            samples: the training split. validation: held-out samples, if any.
+            policy: with the parameters frozen that shall not learn. samples: the training split.
+            validation: held-out samples, if any.
             config: the plain configuration, saved with every checkpoint.
 
         Raises:
@@ -78,7 +79,6 @@ class Trainer:
             generator=generator_for(settings.seed, "workers"),
         )
         self.policy = policy.to(accelerator.device).train()
-        policy.backbone.vision.requires_grad_(not settings.freeze_vision)
         policy.backbone.transformer.gradient_checkpointing = settings.gradient_checkpointing
         parameters = trainable(policy)
         self.optimizer = make_optimizer(parameters.values(), settings)
@@ -163,6 +163,7 @@ class Trainer:
         with self.ema.applied():
             loss = self.validation.loss(self.policy)
         loggers.write(step, {"val/loss": loss})
+        self.policy.config.setdefault("card", {})["results"] = {"validation loss": round(loss, 4), "at step": step}
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
         return loss
 

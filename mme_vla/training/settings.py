@@ -32,7 +32,6 @@ class TrainSettings:
     weight_decay: float = 1e-10
     clip_norm: float = 1.0
     ema: float = 0.999
-    freeze_vision: bool = True
     accumulate: int = 1
     gradient_checkpointing: bool = False
     device: str = "auto"
