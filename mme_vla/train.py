@@ -1,6 +1,7 @@
 """`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
 
 import os
+import shlex
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -78,7 +79,7 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
     policy.to(accelerator.device)
     with accelerator.main_process_first():
-        data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, config["init_from"], line.say)
+        data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
     check_disk(run.folder, policy, settings.keep)
     validation = None
     if data.val is not None and settings.val_samples:
@@ -99,6 +100,15 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     accelerator.end_training()
     assert trainer.last_checkpoint is not None
     return trainer.last_checkpoint
+
+
+def cache_command() -> str:
+    """The command that builds the vision cache of this run: the same words, but for those on resuming and output."""
+    from hydra.core.hydra_config import HydraConfig
+
+    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
+    words = [word for word in given if not word.startswith(("resume=", "output="))]
+    return shlex.join(["python", "-m", "mme_vla.data.cache", *words])
 
 
 if __name__ == "__main__":

@@ -230,11 +230,11 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.build import build_from_config
     from mme_vla.data.cache_build import build_cache, clear_cache, estimate
     from mme_vla.data.sources import open_sources
-    from mme_vla.weights import transfer
+    from mme_vla.training.start import start_from
 
-    policy = build_from_config(cfg, fresh_backbone=cfg.checkpoint is None)
-    if cfg.checkpoint is not None:
-        transfer(policy, cfg.checkpoint)
+    policy = build_from_config(cfg, fresh_backbone=cfg.init_from is None)
+    if cfg.init_from is not None:
+        print(start_from(policy, cfg.init_from))
     memory = policy.to(cfg.device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")

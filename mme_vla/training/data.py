@@ -1,12 +1,11 @@
 """From the section `data` to the two sides of the split, with statistics and vision caches in place."""
 
-import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.cache import ensure_cache
+from mme_vla.data.cache import COMMAND, ensure_cache
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes
@@ -31,14 +30,14 @@ def prepare_data(
     data: Mapping[str, Any],
     seed: int,
     stats_from: Path | None = None,
-    init_from: str | None = None,
+    cache_command: str = COMMAND,
     say: Callable[[str], None] = print,
 ) -> SplitData:
     """Open and check the datasets, give the policy's processor its statistics, and build or open the vision caches.
 
     Args:
         policy: with the vision weights it will train with. data: the section `data` of a configuration.
-        init_from: where the vision weights came from, for the command that builds a cache with them.
+        cache_command: what to tell the user to run where a cache is missing.
         stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
         say: takes a line for the user.
 
@@ -66,7 +65,7 @@ def prepare_data(
                 dtype=str(policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
-                command=_cache_command(policy.config, data, init_from),
+                command=cache_command,
             )
             for source in sources
         ]
@@ -97,10 +96,3 @@ def check_frozen(policy: MMEPolicy, freeze_vision: bool) -> None:
             "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "
             "before: at test time it would see other tokens than in training. Keep it frozen, or use model=pi05."
         )
-
-
-def _cache_command(config: Mapping[str, Any], data: Mapping[str, Any], init_from: str | None) -> str:
-    words = [f"model={config.get('name', '<model>')}", f"data={data['name']}"]
-    if init_from is not None:
-        words.append(f"checkpoint={init_from}")
-    return "python -m mme_vla.data.cache " + " ".join(shlex.quote(word) for word in words)
