@@ -54,29 +54,37 @@ class Episode:
         Raises:
             UserError: a missing view, a wrong dtype or shape, or a video frame after execution has begun.
         """
+        # Everything is checked before anything is remembered: after an error the same frames can be given again.
         front, wrist = (self._checked_view(frames, view) for view in VIEWS)
         states = np.asarray(states, np.float32)
-        demo = np.broadcast_to(np.asarray(is_demo, bool), (len(front),))
-        if states.shape != (len(front), 8) or len(wrist) != len(front):
+        demo = np.asarray(is_demo, bool)
+        if states.shape != (len(front), 8) or len(wrist) != len(front) or demo.shape not in ((), (len(front),)):
             raise UserError(
-                f"observe() needs as many wrist images and 8-number states as front images: got {len(front)} front, "
-                f"{len(wrist)} wrist and states of shape {states.shape}."
+                f"observe() needs as many wrist images, 8-number states and is_demo flags as front images: got "
+                f"{len(front)} front, {len(wrist)} wrist, states of shape {states.shape} and is_demo of {demo.shape}."
             )
+        if not np.isfinite(states).all():
+            raise UserError("observe() got states that are not finite numbers.")
         if len(front) == 0:
             return
+        demo = np.broadcast_to(demo, (len(front),))
         if demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any()):
             raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
+        executed = self._executed_now(int((~demo).sum()), actions)
+        processor = self._policy.require_processor()
+        images = processor.images([front[-1], wrist[-1]])
         if self.history is not None:
-            if not self._video_over:
-                self.history.exec_start = self.frames_seen + int(demo.sum())
             wanted = self.history.wanted(len(front))
             self.history.append(front, self._policy.encode_frames(front[wanted]))
-        self._remember_actions(int((~demo).sum()), actions)
+            if not self._video_over:
+                self.history.exec_start = self.frames_seen + int(demo.sum())
+        longest = processor.prompt_format.past_actions
+        past = np.concatenate([self._executed, executed])
+        self._executed = past[max(len(past) - longest, 0) :]
+        self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
         self.frames_seen += len(front)
-        processor = self._policy.require_processor()
-        self._images = processor.images([front[-1], wrist[-1]])
-        self._state = torch.from_numpy(states[-1].copy())
+        self._images, self._state = images, torch.from_numpy(states[-1].copy())
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -118,17 +126,14 @@ class Episode:
         """Note the chunk [h, 8] the policy chose; the frames that follow say how much of it was executed."""
         self._chunk = chunk
 
-    def _remember_actions(self, count: int, actions: np.ndarray | None) -> None:
+    def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
+        """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
         if actions is None:
-            executed = np.zeros((0, 8), np.float32) if self._chunk is None else self._chunk[:count]
-            self._chunk = None if self._chunk is None else self._chunk[count:]
-        else:
-            executed = np.asarray(actions, np.float32)[len(actions) - count :]
-            if executed.shape != (count, 8):
-                raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
-        longest = self._policy.require_processor().prompt_format.past_actions
-        executed = np.concatenate([self._executed, executed])
-        self._executed = executed[max(len(executed) - longest, 0) :]
+            return np.zeros((0, 8), np.float32) if self._chunk is None else self._chunk[:count]
+        executed = np.asarray(actions, np.float32)[max(len(actions) - count, 0) :]
+        if executed.shape != (count, 8):
+            raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
+        return executed
 
     def draw_noise(self) -> Tensor:
         """The next chunk's starting noise [h, a], from this episode's own generator: batching cannot change it."""

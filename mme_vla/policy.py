@@ -137,7 +137,9 @@ class MMEPolicy(Saved):
         if batch.action_mask is None:
             loss = losses.mean()
         else:
-            loss = (losses * batch.action_mask).sum() / batch.action_mask.sum().clamp(min=1)
+            # Per sample first: then it does not matter which samples are computed together.
+            counted = batch.action_mask.to(losses.dtype)
+            loss = ((losses * counted).sum(1) / counted.sum(1).clamp(min=1)).mean()
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
@@ -226,6 +228,7 @@ class MMEPolicy(Saved):
         if not episodes:
             return np.zeros((0, self.backbone.config.horizon, 8), np.float32)
         processor = self.require_processor()
+        processor.require_stats()  # before any episode's noise or memory moves on
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),

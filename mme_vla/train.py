@@ -2,6 +2,7 @@
 
 import os
 import shlex
+import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -108,6 +109,8 @@ def cache_command() -> str:
 
     given = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
     words = [word for word in given if not word.startswith(("resume=", "output="))]
+    if "--config-dir" in sys.argv[:-1]:
+        words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
     return shlex.join(["python", "-m", "mme_vla.data.cache", *words])
 
 

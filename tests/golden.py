@@ -107,11 +107,12 @@ def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
 def batch(tensors: dict[str, Tensor]) -> Batch:
     """The golden inputs as a batch (without history: golden memories come with ready-made position features)."""
     cameras = ("base_0_rgb", "left_wrist_0_rgb")
+    prompt = "symbolic_tokenized_prompt" if "in/symbolic_tokenized_prompt" in tensors else "tokenized_prompt"
     return Batch(
         images=torch.stack([tensors[f"in/image/{c}"] for c in cameras], 1).permute(0, 1, 4, 2, 3),
         image_mask=torch.stack([tensors[f"in/image_mask/{c}"] for c in cameras], 1),
-        prompt=tensors["in/tokenized_prompt"].long(),
-        prompt_mask=tensors["in/tokenized_prompt_mask"],
+        prompt=tensors[f"in/{prompt}"].long(),
+        prompt_mask=tensors[f"in/{prompt}_mask"],
         actions=tensors["in/actions"],
     )
 

@@ -165,7 +165,7 @@ def test_a_memory_without_caches_is_refused(data, processor) -> None:
 
 
 def test_splits_hold_out_whole_episodes(data, processor) -> None:
-    split = split_episodes(data[0], val_episodes={"Alpha": [1]})
+    split = split_episodes(data[0], val_episodes=["Alpha/1"])
     assert [part.tolist() for part in split.train] == [[0], [0]]
     assert [part.tolist() for part in split.val] == [[1], []]
     train = TrainingDataset(data[0], processor, episodes=split.train)
@@ -189,10 +189,11 @@ def test_hashed_splits_are_stable_and_of_the_asked_size() -> None:
 
 def test_impossible_splits_are_refused(data) -> None:
     for options, message in (
-        ({"val_episodes": {"Gamma": [0]}}, "names Gamma, but the sources are Alpha, Beta"),
-        ({"val_episodes": {"Beta": [1]}}, r"val_episodes.Beta: \[1\] of 1 episodes"),
+        ({"val_episodes": ["Gamma/0"]}, "names Gamma, but the sources are Alpha, Beta"),
+        ({"val_episodes": ["Beta/1"]}, r"\[1\] of Beta, which has episodes 0…0"),
+        ({"val_episodes": [1]}, "several sources"),
         ({"val_fraction": 1.0}, "must lie in"),
-        ({"val_episodes": {"Alpha": [0, 1], "Beta": [0]}}, "no episode to train on"),
+        ({"val_episodes": ["Alpha/0", "Alpha/1", "Beta/0"]}, "no episode to train on"),
     ):
         with pytest.raises(UserError, match=message):
             split_episodes(data[0], **options)

@@ -9,7 +9,12 @@ from mme_vla import build_policy
 from mme_vla.naming import write
 from mme_vla.weights.released import released_derived, released_table, released_unread
 
-VARIANTS = {"pi05": "pi05_baseline"} | {
+VARIANTS = {
+    "pi05": "pi05_baseline",
+    "pi05_past_actions": "pi05_baseline",
+    "simplesg": "symbolic-simple-subgoal",
+    "groundsg": "symbolic-grounded-subgoal",
+} | {
     f"{memory}_{integration}": f"{kind}-{memory}-{integration}"
     for kind, memory in (
         ("perceptual", "framesamp"),

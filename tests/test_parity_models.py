@@ -8,7 +8,7 @@ import torch
 
 from mme_vla.memory.rmt import RMT
 
-MODELS = ["pi05_baseline"] + [
+MODELS = ["pi05_baseline", "symbolic-grounded-subgoal"] + [
     f"{memory}-{integration}"
     for memory in ("perceptual-framesamp", "perceptual-tokendrop", "recurrent-ttt", "recurrent-rmt")
     for integration in ("context", "modul", "expert")

@@ -255,3 +255,41 @@ def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
     (tmp_path / "other" / "config.json").write_text((tmp_path / "damaged" / "config.json").read_text())
     with pytest.raises(UserError, match=r"(?s)missing.*unexpected"):
         MMEPolicy.from_pretrained(tmp_path / "other")
+
+
+def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
+    policy = small_policy("pi05")
+    batch = random_batch(policy, batch=4)
+    batch.action_mask = torch.arange(batch.actions.shape[1]).expand(4, -1) < torch.tensor([[1], [20], [7], [20]])
+    noise, time_ = torch.randn(batch.actions.shape), torch.full((4,), 0.5)
+    with torch.no_grad():
+        whole, _ = policy(batch, noise, time_)
+        halves = [
+            policy(batch._map(lambda x, rows=rows: x[rows]), noise[rows], time_[rows])[0]
+            for rows in (slice(0, 2), slice(2, 4))
+        ]
+        moved = batch.actions.clone()
+        moved[0, 1:] += 9.0
+        batch.actions = moved
+        unchanged, _ = policy(batch, noise, time_)
+    assert whole.item() == pytest.approx(sum(h.item() for h in halves) / 2, abs=1e-5)
+    assert torch.isfinite(unchanged)
+
+
+@pytest.mark.parametrize(
+    ("memory", "options", "message"),
+    [
+        ("framesamp", {"grid": 5, "budget": 500}, "memory.grid=5"),
+        ("tokendrop", {"grid": 0}, "memory.grid=0"),
+        ("tokendrop", {"stride": 0}, "memory.stride=0"),
+        ("framesamp", {"pooling": "median"}, "memory.pooling='median'"),
+    ],
+)
+def test_sizes_that_cannot_be_are_refused_while_building(memory, options, message):
+    with pytest.raises(UserError, match=message):
+        build_policy(f"{memory}_context", memory=options)
+
+
+def test_a_backbone_of_no_size_is_refused():
+    with pytest.raises(UserError, match="num_heads=0"):
+        build_policy("pi05", backbone={"num_heads": 0})

@@ -149,3 +149,33 @@ def test_tokendrop_encodes_only_the_frames_it_can_choose(frames, monkeypatch):
     monkeypatch.setattr(policy, "encode_frames", lambda f: counted.append(len(f)) or original(f))
     feed(policy, frames, demo=0)
     assert sum(counted) == 1 + FRAMES // 8
+
+
+def test_an_error_leaves_the_episode_as_it_was(policy, frames):
+    episode = feed(policy, frames, upto=20, demo=0)
+    before = episode.recall()
+    both = {"image": frames[:3], "wrist_image": frames[:3]}
+    states = np.zeros((3, 8), np.float32)
+    for wrong in (
+        {"actions": np.zeros((1, 8))},
+        {"is_demo": np.array([True, False])},
+        {"is_demo": True},
+    ):
+        with pytest.raises(UserError):
+            episode.observe(both, states, **wrong)
+    with pytest.raises(UserError, match="finite"):
+        episode.observe(both, np.full((3, 8), np.nan))
+    assert (len(episode.history), episode.frames_seen) == (20, 20)
+    assert torch.equal(episode.recall().features, before.features)
+
+
+def test_acting_without_statistics_is_refused_before_anything_moves(policy, frames):
+    episode = feed(policy, frames, upto=5, demo=0)
+    stats, policy.processor.stats = policy.processor.stats, None
+    try:
+        with pytest.raises(UserError, match="statistics"):
+            policy.act([episode])
+    finally:
+        policy.processor.stats = stats
+    untouched = policy.start_episode(episode.goal, seed=0).draw_noise()
+    assert torch.equal(episode.draw_noise(), untouched)

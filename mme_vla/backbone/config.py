@@ -24,6 +24,12 @@ class _Config:
         return cls(**built)
 
 
+def _check_positive(config: Any, prefix: str) -> None:
+    for name, value in vars(config).items():
+        if isinstance(value, int) and value < 1:
+            raise UserError(f"{prefix}{name}={value} must be at least 1.")
+
+
 @dataclass(frozen=True)
 class VisionConfig(_Config):
     """SigLIP; its output width is the VLM's. `image_size` must be a multiple of `patch_size`."""
@@ -36,6 +42,7 @@ class VisionConfig(_Config):
     num_heads: int = 16
 
     def __post_init__(self) -> None:
+        _check_positive(self, "vision.")
         if self.image_size % self.patch_size:
             raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
 
@@ -46,6 +53,9 @@ class ExpertConfig(_Config):
 
     width: int
     mlp_dim: int
+
+    def __post_init__(self) -> None:
+        _check_positive(self, "an expert's ")
 
 
 @dataclass(frozen=True)
@@ -65,6 +75,7 @@ class BackboneConfig(_Config):
     time_distribution: str = "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
 
     def __post_init__(self) -> None:
+        _check_positive(self, "backbone.")
         if self.num_heads % self.num_kv_heads:
             raise UserError(f"num_heads={self.num_heads} must be a multiple of num_kv_heads={self.num_kv_heads}.")
         if self.head_dim % 2:

@@ -12,8 +12,10 @@ from collections import OrderedDict
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
 
 import numpy as np
+import torch
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
@@ -31,6 +33,9 @@ MEMORY_VIEW = "image"
 FINGERPRINT = "fingerprint.json"
 COMMAND = "python -m mme_vla.data.cache model=<model> data=<data>"
 DTYPES = {"bfloat16": np.uint16, "float32": np.float32}  # bfloat16 is stored as its bits
+
+
+DAMAGED = (OSError, ValueError, EOFError, BadZipFile)  # what reading a damaged file can raise
 
 
 class CacheMissingError(UserError):
@@ -105,7 +110,8 @@ class VisionCache:
         self.folder, self.spec = folder, StorageSpec(**expected["storage"])
         self._lengths, self._exec_starts = source.lengths, source.exec_starts
         self._dtype, self._command = DTYPES[expected["dtype"]], command
-        missing = [e for e in range(len(source)) if not token_file(folder, e).is_file()]
+        files = (token_file, score_file) if self.spec.scorer else (token_file,)
+        missing = [e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)]
         if missing:
             raise CacheMissingError(
                 f"The vision cache {folder} is half-written: {len(missing)} of {len(source)} episodes are missing. "
@@ -139,7 +145,7 @@ class VisionCache:
         rows = len(self.spec.kept_frames(int(self._lengths[episode])))
         try:
             tokens = np.load(path, mmap_mode="r")
-        except (OSError, ValueError) as error:
+        except DAMAGED as error:
             raise UserError(f"{path} is damaged ({error}). Rebuild the cache: {self._command} rebuild=true") from None
         if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:
             raise UserError(
@@ -155,7 +161,7 @@ class VisionCache:
         try:
             with np.load(path) as stored:
                 return FrameScores(stored["frames"], stored["values"])
-        except (OSError, ValueError, KeyError) as error:
+        except (*DAMAGED, KeyError) as error:
             raise UserError(f"{path} is damaged ({error}). Rebuild the cache: {self._command} rebuild=true") from None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -232,10 +238,13 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.data.sources import open_sources
     from mme_vla.training.start import start_from
 
+    if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise UserError("rebuild=true removes files that other processes write: run it once without torchrun first.")
     policy = build_from_config(cfg, fresh_backbone=cfg.init_from is None)
     if cfg.init_from is not None:
         print(start_from(policy, cfg.init_from))
-    memory = policy.to(cfg.device).memory
+    device = _device(cfg.device)
+    memory = policy.to(device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
     encoder, dtype = policy.vision_fingerprint(), str(policy.history_dtype).removeprefix("torch.")
@@ -247,7 +256,7 @@ def run(cfg: "DictConfig") -> None:
             plan = estimate(source, memory, policy.encode_frames, dtype, cfg.data.cache.batch_size)
             print(
                 f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode, "
-                f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {cfg.device}"
+                f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
             )
             continue
         if cfg.rebuild:
@@ -255,6 +264,16 @@ def run(cfg: "DictConfig") -> None:
         batch_size = cfg.data.cache.batch_size
         written = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
         print(f"{source.name}: {written} episodes encoded, {len(source)} in all, at {folder}")
+
+
+def _device(name: str) -> torch.device:
+    """`auto` and `cuda` mean this process's own GPU under torchrun."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    device = torch.device(name)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise UserError(f"device={name}: PyTorch sees no GPU here; use device=cpu.")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if name == "cuda" else device
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """Which episodes train and which validate: whole episodes, decided by name or by a fixed hash."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 
@@ -21,23 +21,24 @@ class Split:
 def split_episodes(
     sources: Sequence[EpisodeSource],
     val_fraction: float = 0.0,
-    val_episodes: Mapping[str, Sequence[int]] | None = None,
+    val_episodes: Sequence[int | str] | None = None,
 ) -> Split:
     """Split every source by episode.
 
-    A source named in `val_episodes` holds out exactly those. Of any other, episode e validates if the first eight
+    `val_episodes` holds out episodes by `<source name>/<number>`, or by number where there is one source; a source it
+    names holds out exactly those. Of any other, episode e validates if the first eight
     bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
     change when data are added, and needs no random numbers.
 
     Raises:
         UserError: an unknown source or episode, a fraction outside [0, 1), or nothing left to train on.
     """
-    named = {name: sorted(set(numbers)) for name, numbers in (val_episodes or {}).items()}
+    named = _by_source(val_episodes or [], sources)
     unknown = set(named) - {source.name for source in sources}
     if unknown:
         raise UserError(
             f"val_episodes names {', '.join(sorted(unknown))}, but the sources are "
-            f"{', '.join(source.name for source in sources)}."
+            f"{', '.join(source.name for source in sources)}. Name episodes of these, or set data.val_episodes=[]."
         )
     if not 0 <= val_fraction < 1:
         raise UserError(f"val_fraction={val_fraction} must lie in [0, 1).")
@@ -47,7 +48,10 @@ def split_episodes(
         if source.name in named:
             wrong = [number for number in named[source.name] if not 0 <= number < len(source)]
             if wrong:
-                raise UserError(f"val_episodes.{source.name}: {wrong} of {len(source)} episodes (0…{len(source) - 1}).")
+                raise UserError(
+                    f"val_episodes names {wrong} of {source.name}, which has episodes 0…{len(source) - 1}. "
+                    "Name others, or hold out a share: data.val_episodes=[] data.val_fraction=0.1"
+                )
             held_out = np.isin(episodes, named[source.name])
         else:
             held_out = np.array([_fraction(f"{source.name}/{e}") < val_fraction for e in episodes], bool)
@@ -56,6 +60,20 @@ def split_episodes(
     if not sum(map(len, split.train)):
         raise UserError("The split leaves no episode to train on; lower val_fraction or shorten val_episodes.")
     return split
+
+
+def _by_source(names: Sequence[int | str], sources: Sequence[EpisodeSource]) -> dict[str, list[int]]:
+    """Group `<source>/<number>` words, or bare numbers of the only source."""
+    grouped: dict[str, list[int]] = {}
+    for name in names:
+        source, _, number = str(name).rpartition("/")
+        if not number.isdigit() or (not source and len(sources) > 1):
+            raise UserError(
+                f"val_episodes: {name!r} should read <source>/<episode>, such as {sources[0].name}/0"
+                + (", since there are several sources." if number.isdigit() else ".")
+            )
+        grouped.setdefault(source or sources[0].name, []).append(int(number))
+    return grouped
 
 
 def _fraction(text: str) -> float:

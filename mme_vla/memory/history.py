@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
+from mme_vla.types import GRID
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,14 @@ class StorageSpec:
     pooling: str = "mean"
     keep_every: int = 1
     scorer: str = ""
+
+    def __post_init__(self) -> None:
+        if self.grid < 1 or GRID % self.grid:
+            raise UserError(f"memory.grid={self.grid}: a view's {GRID}×{GRID} tokens pool to 1, 2, 4, 8 or 16 a side.")
+        if self.pooling not in ("mean", "max"):
+            raise UserError(f"memory.pooling={self.pooling!r}: choose mean (as released) or max (as the paper writes).")
+        if self.keep_every < 1:
+            raise UserError(f"memory: keeping every {self.keep_every}th frame is not possible; it must be at least 1.")
 
     def keeps(self, frame: int) -> bool:
         """Whether tokens of this frame are stored."""
@@ -169,11 +178,9 @@ class OnlineHistory(History):
         if len(tokens) != len(wanted):
             raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
         if self._scorer is not None:
-            for offset, frame in enumerate(frames):
-                values = self._scorer(self._length + offset, frame)
-                if values is not None:
-                    self._score_frames.append(self._length + offset)
-                    self._score_values.append(np.asarray(values, np.float32))
+            rows = [(self._length + i, self._scorer(self._length + i, frame)) for i, frame in enumerate(frames)]
+            self._score_frames += [frame for frame, values in rows if values is not None]
+            self._score_values += [np.asarray(values, np.float32) for _, values in rows if values is not None]
         if len(tokens):
             self._grow(len(self._kept) + len(tokens), tokens)
             assert self._tokens is not None

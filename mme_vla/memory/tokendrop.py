@@ -71,6 +71,8 @@ class TokenDrop(PerceptualMemory):
         Raises:
             UserError: the budget does not hold the first frame, or exceeds the candidates.
         """
+        if stride < 1:
+            raise UserError(f"memory.stride={stride} must be at least 1: the frames between two that are scored.")
         if not grid**2 <= budget <= candidates:
             raise UserError(
                 f"memory.budget={budget} must lie between {grid**2} (the first frame, always kept) and "

@@ -138,11 +138,11 @@ class Processor:
         """
         normalised, past = None, None
         if state is not None and self.prompt_format.reads_state:
-            normalised = normalize(_float(state), self._need_stats().state).numpy()
+            normalised = normalize(_float(state), self.require_stats().state).numpy()
         wanted = self.prompt_format.past_actions
         if wanted and state is not None and past_actions is not None:
             recent = to_deltas(_float(past_actions)[-wanted:], _float(state))
-            past = normalize(recent, self._need_stats().actions).numpy()
+            past = normalize(recent, self.require_stats().actions).numpy()
         given = PromptInput(goal, subgoal, normalised, past)
         return encode_prompt(self.prompt_format, self.tokenizer, given, self.prompt_length)
 
@@ -159,7 +159,7 @@ class Processor:
         Raises:
             UserError: there are no statistics, or the shapes do not fit.
         """
-        stats = self._need_stats()
+        stats = self.require_stats()
         chunk, state = _float(chunk), _float(state)
         if chunk.shape != (self.horizon, len(stats.actions)) or state.shape != (len(stats.state),):
             raise UserError(
@@ -181,7 +181,7 @@ class Processor:
         Raises:
             UserError: there are no statistics.
         """
-        stats = self._need_stats()
+        stats = self.require_stats()
         deltas = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
         return to_absolute(deltas, state.to(deltas))
 
@@ -263,7 +263,8 @@ class Processor:
             raise UserError(f"{path} holds a {type(config).__name__}, not a processor's settings.")
         return cls.from_config(config, Path(folder))
 
-    def _need_stats(self) -> NormStats:
+    def require_stats(self) -> NormStats:
+        """Return the statistics, or say where they come from."""
         if self._stats is None:
             raise UserError(
                 "States and actions need normalisation statistics, and this processor has none. Training computes them "

@@ -80,6 +80,8 @@ class Trainer:
         )
         self.policy = policy.to(accelerator.device).train()
         policy.backbone.transformer.gradient_checkpointing = settings.gradient_checkpointing
+        if settings.compile:
+            policy.backbone.compile()
         parameters = trainable(policy)
         self.optimizer = make_optimizer(parameters.values(), settings)
         self.ema = EMA(parameters, settings.ema)

@@ -15,6 +15,7 @@ CHECKPOINTS = "checkpoints"
 MAY_DIFFER = (
     "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
     "train.save_every", "train.keep", "train.workers", "train.open_loop_chunks", "train.device",
+    "data.cache",
 )  # fmt: skip
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss."""
 
@@ -94,8 +95,9 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _newest_unfinished(folder: Path) -> Path | None:
-    """The last checkpoint in `folder`, else of the newest run beside it, unless that run is finished."""
-    runs = [folder, *sorted(folder.parent.glob("*"), key=lambda path: path.name, reverse=True)]
+    """The last checkpoint in `folder`, else of the run beside it that wrote last, unless that run is finished."""
+    beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
+    runs = [folder, *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)]
     for run in runs:
         found = checkpoints_in(run / CHECKPOINTS)
         if found:

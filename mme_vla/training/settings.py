@@ -34,6 +34,7 @@ class TrainSettings:
     ema: float = 0.999
     accumulate: int = 1
     gradient_checkpointing: bool = False
+    compile: bool = False
     device: str = "auto"
     workers: int = 1
     log_every: int = 100

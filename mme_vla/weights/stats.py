@@ -36,7 +36,7 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
         if asset not in files:
             raise UserError(
                 f"{folder} holds statistics of {', '.join(files) or 'no dataset'}: "
-                + (f"there are none of {asset!r}." if asset else "say which with asset=….")
+                + (f"there are none of {asset!r}." if asset else "say which: --asset, or read_stats(folder, asset).")
             )
         return NormStats.load(files[asset])
     if files:
