@@ -18,6 +18,8 @@ CONTROL_STEP = 0.05
 """Seconds between two rows of a plan: the control period."""
 JOINT_STEP = 0.1
 """Length of one step along a screw motion, in joint space (radians, Euclidean norm)."""
+MOST_STEPS = 200
+"""Steps after which a screw motion is given up: at the edge of its reach the arm would swing for ever."""
 _STALLED = 1e-4
 _NO_ROTATION = 3e-5
 _HALF_TURN = 1e-5
@@ -76,6 +78,8 @@ def plan_screw(
         if np.linalg.norm(moved) < _STALLED or not arm.within_limits(joints):
             return None
         path.append(joints)
+        if len(path) > MOST_STEPS:
+            return None
     return time_optimal(np.array(path), velocity_limit, acceleration_limit, dt)
 
 

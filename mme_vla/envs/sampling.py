@@ -66,7 +66,20 @@ def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.
     for _ in range(ROUNDS):
         sample = goal if random.random() < GOAL_BIAS else random.uniform(arm.lower, arm.upper)
         tree.grow(sample)
-    return tree.path_to(goal)
+    path = tree.path_to(goal)
+    return None if path is None else np.array(_shortened(path, obstacles))
+
+
+def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]:
+    """Leave out what can be passed by in a straight line, then space the rest evenly, so that a spline stays near it."""
+    kept, i = [path[0]], 0
+    while i < len(path) - 1:
+        free = (j for j in range(len(path) - 1, i + 1, -1) if obstacles.clear_between(path[i], path[j]))
+        j = next(free, i + 1)
+        steps = int(np.ceil(np.linalg.norm(path[j] - path[i]) / REACH))
+        kept += [path[i] + (path[j] - path[i]) * k / steps for k in range(1, steps)] + [path[j]]
+        i = j
+    return kept
 
 
 class _Tree:
@@ -94,7 +107,7 @@ class _Tree:
         self.costs.append(cost)
         self._rewire(near)
 
-    def path_to(self, goal: np.ndarray) -> np.ndarray | None:
+    def path_to(self, goal: np.ndarray) -> list[np.ndarray] | None:
         """The way from the root to a node that is the goal."""
         distances = self._distances(goal)
         node = int(np.argmin(distances))
@@ -104,7 +117,7 @@ class _Tree:
         while node >= 0:
             path.append(self.nodes[node])
             node = self.parents[node]
-        return np.array(path[::-1])
+        return path[::-1]
 
     def _rewire(self, near: list[int]) -> None:
         new = len(self.nodes) - 1

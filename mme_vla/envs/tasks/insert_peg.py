@@ -62,7 +62,7 @@ class InsertPeg(MemoryTask):
             places.append(self._draw_place(draws, (x, y), places))
             peg.set_home(at(places[-1], 0, math.radians(-45 + 90 * draws.uniform())))
         self.end = ("head", "tail")[draws.integer(0, 2)]
-        self.side = (1, -1)[draws.integer(0, 2)]
+        self.side = (-1, 1)[draws.integer(0, 2)]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         self.mark = Mark(self._red_disc, below, SHOWN_STEPS)
