@@ -161,10 +161,13 @@ def _method(model: str, subgoal: str | None, budget: int | None, runs: list[Run]
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
     difficulties = {key: record.difficulty for run in runs for key, record in run.records.items()}
+    whole = {task for task in protocol.tasks for run in runs if run.successes(task) is not None}
     for level in DIFFICULTIES:
-        having = tuple(t for t in protocol.tasks if level in {d for key, d in difficulties.items() if key.task == t})
-        if having:
-            figure = _figure(runs, having, protocol, _of_difficulty(level, difficulties), None)
+        seen = {key.task for key, of in difficulties.items() if of == level}
+        # A task without the level is left out; one that is not whole yet may have it, and keeps the figure incomplete.
+        tasks = tuple(task for task in protocol.tasks if task in seen or task not in whole)
+        if seen:
+            figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
 

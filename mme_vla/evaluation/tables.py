@@ -25,17 +25,17 @@ class Table:
     strong: set[int] = field(default_factory=set)
 
 
-def show(figure: Figure, interval: bool = False) -> str:
+def show(figure: Figure, short: bool = False) -> str:
     """A figure as text: mean ± deviation, or how far it is.
 
     A mean that leaves incomplete runs out says of how many it is.
     """
     if figure.mean is None:
+        if short:
+            return f"incomplete ({figure.done:,} of {figure.expected:,})"
         partial = "" if figure.partial is None else f" ({figure.partial:.1f} so far)"
         return f"{figure.done:,} of {figure.expected:,} episodes{partial}"
     text = f"{figure.mean:.2f}" + ("" if figure.std is None else f" ± {figure.std:.2f}")
-    if interval and figure.interval is not None:
-        text += f" {span(figure)}"
     return text if figure.complete == figure.runs else f"{text} ({figure.complete} of {figure.runs} runs)"
 
 
@@ -62,9 +62,17 @@ def overview(results: Results) -> Table:
         episodes = (
             f"{average.done:,}" if average.done == average.expected else f"{average.done:,} of {average.expected:,}"
         )
-        cells = [show(method.figures["suite"][suite]) for suite in suites]
+        cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
         rows.append(
-            [method.label, str(average.runs), episodes, *cells, show(average), span(average), show_paper(average)]
+            [
+                method.label,
+                str(average.runs),
+                episodes,
+                *cells,
+                show(average, short=True),
+                span(average),
+                show_paper(average),
+            ]
         )
     return Table("Success rate (%), mean ± sample standard deviation over runs", columns, rows)
 
