@@ -1,8 +1,9 @@
 """The report's figures, as SVG text that stands in a page by itself."""
 
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -39,7 +40,7 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
     ]
     having = having[:MOST_BARS]
     names = list(dict.fromkeys(name for _, method in having for name in method.figures[kind]))
-    with _canvas((10.4, 3.8) if wide else (5.6, 3.6)) as (canvas, axes, finish):
+    with picture((10.4, 3.8) if wide else (5.6, 3.6)) as (canvas, (axes,)):
         width, lines = 0.8 / max(len(having), 1), []
         for place, (i, method) in enumerate(having):
             shift = (place - (len(having) - 1) / 2) * width
@@ -58,7 +59,7 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
         axes.set_ylim(0, 100)
         axes.tick_params(axis="x", length=0)
         _legend(canvas, axes, 6 if wide else 3)
-        return finish()
+        return svg(canvas)
 
 
 def heat_map(results: Results) -> str:
@@ -70,7 +71,7 @@ def heat_map(results: Results) -> str:
         if method.paper is not None:
             rows.append(("paper", [paper.per_task(method.paper.name)[task].mean for task in tasks]))
     values = np.array([[np.nan if v is None else v for v in row] for _, row in rows], float)
-    with _canvas((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (_, axes, finish):
+    with picture((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
         axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto")
         for i, j in np.ndindex(values.shape):
             known = not np.isnan(values[i, j])
@@ -93,7 +94,7 @@ def heat_map(results: Results) -> str:
             boundary += len(results.protocol.choose("suite", suite))
             if 0 < boundary < len(tasks) and list(tasks) == sorted(tasks, key=_suite_of):
                 axes.axvline(boundary - 0.5, color="white", lw=3)
-        return finish()
+        return svg(canvas)
 
 
 def efficiency(results: Results, flops: dict[str, float]) -> str:
@@ -102,7 +103,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
     Args:
         flops: of a sampled chunk at full size, by model.
     """
-    with _canvas((5.6, 3.9)) as (canvas, axes, finish):
+    with picture((5.6, 3.9)) as (canvas, (axes,)):
         named = set()
         for known in paper.paper_methods().values():
             if known.model in flops and known.subgoal != "memer":
@@ -130,7 +131,7 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
             label = results.methods[i].label
             axes.annotate(label, (x, y), place, fontsize=9, color=_colour(i), va="center", arrowprops=arrow)
         _legend(canvas, axes, 2)
-        return finish()
+        return svg(canvas)
 
 
 _FAMILY_NAMES = {"none": "no memory", "symbolic": "symbolic", "perceptual": "perceptual", "recurrent": "recurrent"}
@@ -143,7 +144,7 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
         points: as `budget_points` gives them.
     """
     order = list(dict.fromkeys(method.model for method in results.methods))
-    with _canvas((5.6, 3.9)) as (canvas, axes, finish):
+    with picture((5.6, 3.9)) as (canvas, (axes,)):
         table = paper.paper_table("memory_budget")
         budgets = [int(row["memory_tokens"]) for row in table]
         for marker, model in zip("ov", SWEPT, strict=True):
@@ -163,7 +164,7 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)
         _legend(canvas, axes, 2)
-        return finish()
+        return svg(canvas)
 
 
 def budget_points(methods: Sequence[Method], usual: int) -> dict[str, list[tuple[int, Figure]]]:
@@ -179,26 +180,19 @@ def budget_points(methods: Sequence[Method], usual: int) -> dict[str, list[tuple
     }
 
 
-class _canvas:  # noqa: N801  (reads as a function)
-    """A figure in the report's style; `finish()` gives its SVG."""
+@contextmanager
+def picture(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canvas, list[Axes]]]":
+    """A figure of panels under each other, in the report's style for as long as it is entered."""
+    import matplotlib
+    from matplotlib.figure import Figure as Canvas
 
-    def __init__(self, size: tuple[float, float]) -> None:
-        self.size = size
-
-    def __enter__(self) -> "tuple[Canvas, Axes, Any]":
-        import matplotlib
-        from matplotlib.figure import Figure as Canvas
-
-        self._style = matplotlib.rc_context(_STYLE)  # type: ignore[arg-type]
-        self._style.__enter__()
-        canvas = Canvas(self.size, layout="constrained")
-        return canvas, canvas.add_subplot(), lambda: _svg(canvas)
-
-    def __exit__(self, *error: Any) -> None:
-        self._style.__exit__(*error)
+    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
+        canvas = Canvas(size, layout="constrained")
+        yield canvas, list(canvas.subplots(panels, squeeze=False, sharex=True)[:, 0])
 
 
-def _svg(canvas: "Canvas") -> str:
+def svg(canvas: "Canvas") -> str:
+    """The figure as an element that stands in a page."""
     out = io.StringIO()
     canvas.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()
