@@ -91,8 +91,7 @@ def _decode(found: dict[Any, Any]) -> Any:
 
 def _array(found: dict[Any, Any]) -> np.ndarray:
     dtype, shape, data = _dtype(found), found.get(b"shape"), found.get(b"data")
-    whole = isinstance(shape, list) and all(type(n) is int and n >= 0 for n in shape)
-    if not whole or len(shape) > 32:
+    if not isinstance(shape, list) or len(shape) > 32 or not all(type(n) is int and n >= 0 for n in shape):
         raise UserError(f"An array's shape must be a list of at most 32 whole numbers, got {str(shape)[:80]}.")
     if not isinstance(data, bytes):
         raise UserError(f"An array's data must be bytes, got {type(data).__name__}.")

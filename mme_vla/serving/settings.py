@@ -55,8 +55,11 @@ class ServeSettings:
                 f"action_space={self.action_space}: these policies answer with joint angles, 8 numbers a step. Ask the "
                 "client for joint_angle; no conversion to end-effector poses is offered."
             )
-        if self.api_key is not None and (not self.api_key or not self.api_key.isprintable()):
-            raise UserError("api_key must be a text without control characters; null asks for none.")
+        key = self.api_key
+        if key is not None and not (
+            isinstance(key, str) and key.isascii() and key.isprintable() and key.strip() == key != ""
+        ):
+            raise UserError("api_key must be a text of plain ASCII without blanks around it; null asks for none.")
         if not isinstance(self.port, int) or not 0 <= self.port < 65536:
             raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
         for name in ("execute", "flow_steps", "max_batch", "encode_chunk"):

@@ -1,0 +1,134 @@
+"""The one thread that runs the policy: waiting requests travel in one batch, long videos in pieces between batches."""
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from mme_vla.episode import Episode
+from mme_vla.policy import MMEPolicy
+from mme_vla.serving.stats import ServerStats
+
+
+@dataclass
+class _Waiting[T]:
+    """A piece of work and who waits for it; a future that is done already belongs to a client that has gone."""
+
+    work: T
+    future: asyncio.Future
+
+
+class Engine:
+    """Runs the policy for all clients.
+
+    The event loop never computes. All computing happens in one thread, which takes turns: a batch of the episodes that
+    wait for actions, then one piece of the video that has waited longest. So a client with a thousand frames delays
+    another by one piece, and a batch never waits for a client that is still sending.
+
+    Args:
+        policy: with statistics, on its device.
+        max_batch: most episodes that act together.
+        flow_steps: Euler steps a chunk.
+    """
+
+    def __init__(self, policy: MMEPolicy, max_batch: int = 16, flow_steps: int = 10, stats: ServerStats | None = None):
+        self.policy = policy
+        self.max_batch, self.flow_steps = max_batch, flow_steps
+        self.stats = stats or ServerStats()
+        self._acts: deque[_Waiting[Episode]] = deque()
+        self._videos: deque[_Waiting[Iterator[None]]] = deque()
+        self._wake = asyncio.Event()
+        self._thread = ThreadPoolExecutor(1, "policy")
+        self._task: asyncio.Task[None] | None = None
+
+    def start(self) -> None:
+        """Begin to work, in the running event loop."""
+        self._task = asyncio.get_running_loop().create_task(self._work())
+
+    async def stop(self) -> None:
+        """Stop after the piece that is running; what still waits is cancelled."""
+        if self._task is not None:
+            self._task.cancel()
+            with suppress(asyncio.CancelledError):
+                await self._task
+        for future in [*(w.future for w in self._acts), *(w.future for w in self._videos)]:
+            future.cancel()
+        await asyncio.to_thread(self._thread.shutdown)
+
+    async def act(self, episode: Episode) -> np.ndarray:
+        """The next chunk [h, 8] of an episode, chosen in one batch with whoever waits at the same time."""
+        chunk: np.ndarray = await self._join(self._acts, episode)
+        return chunk
+
+    async def run(self, steps: Iterator[None]) -> None:
+        """Run an iterator to its end in the policy's thread, one step at a time, others' work in between."""
+        await self._join(self._videos, steps)
+
+    async def call(self, function: Callable[[], object]) -> object:
+        """Run something short in the policy's thread, at once."""
+        return await asyncio.get_running_loop().run_in_executor(self._thread, function)
+
+    async def _join[T](self, queue: deque[_Waiting[T]], work: T) -> np.ndarray:
+        future: asyncio.Future[np.ndarray] = asyncio.get_running_loop().create_future()
+        queue.append(_Waiting(work, future))
+        self._wake.set()
+        return await future
+
+    async def _work(self) -> None:
+        while True:
+            await self._wake.wait()
+            self._wake.clear()
+            while self._acts or self._videos:
+                if self._acts:
+                    await self._batch()
+                if self._videos:
+                    await self._piece()
+
+    async def _batch(self) -> None:
+        batch: list[_Waiting[Episode]] = []
+        while self._acts and len(batch) < self.max_batch:
+            waiting = self._acts.popleft()
+            if not waiting.future.done():
+                batch.append(waiting)
+        if not batch:
+            return
+        begun = time.perf_counter()
+        try:
+            chunks = await self.call(lambda: self.policy.act([waiting.work for waiting in batch], self.flow_steps))
+        except Exception as error:
+            for waiting in batch:
+                _fail(waiting.future, error)
+            return
+        self.stats.took("batch", time.perf_counter() - begun)
+        self.stats.count("batched", len(batch))
+        assert isinstance(chunks, np.ndarray)
+        for waiting, chunk in zip(batch, chunks, strict=True):
+            if not waiting.future.done():
+                waiting.future.set_result(chunk)
+
+    async def _piece(self) -> None:
+        waiting = self._videos.popleft()
+        if waiting.future.done():
+            return
+        try:
+            finished = await self.call(lambda: next(waiting.work, _END)) is _END
+        except Exception as error:
+            return _fail(waiting.future, error)
+        if not finished:
+            return self._videos.append(waiting)
+        if not waiting.future.done():
+            waiting.future.set_result(None)
+        return None
+
+
+_END = object()
+
+
+def _fail(future: asyncio.Future, error: Exception) -> None:
+    if not future.done():
+        future.set_exception(error)
