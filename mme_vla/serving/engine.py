@@ -15,20 +15,22 @@ from mme_vla.policy import MMEPolicy
 from mme_vla.serving.stats import ServerStats
 
 
-@dataclass
+@dataclass(eq=False)
 class _Waiting[T]:
     """A piece of work and who waits for it; a future that is done already belongs to a client that has gone."""
 
     work: T
     future: asyncio.Future
+    pieces: int = 1
 
 
 class Engine:
     """Runs the policy for all clients.
 
-    The event loop never computes. All computing happens in one thread, which takes turns: a batch of the episodes that
-    wait for actions, then one piece of the video that has waited longest. So a client with a thousand frames delays
-    another by one piece, and a batch never waits for a client that is still sending.
+    The event loop never computes. All computing happens in one thread, which takes turns: the new frames of everyone
+    who has only a few, then one batch of the episodes that wait for actions, then one piece of the long video that has
+    waited longest. So clients that replan at the same time travel together, and a client with a thousand frames delays
+    the others by one piece.
 
     Args:
         policy: with statistics, on its device.
@@ -65,17 +67,17 @@ class Engine:
         chunk: np.ndarray = await self._join(self._acts, episode)
         return chunk
 
-    async def run(self, steps: Iterator[None]) -> None:
-        """Run an iterator to its end in the policy's thread, one step at a time, others' work in between."""
-        await self._join(self._videos, steps)
+    async def run(self, steps: Iterator[None], pieces: int = 1) -> None:
+        """Run an iterator that pauses between its `pieces` in the policy's thread, with others' work in the pauses."""
+        await self._join(self._videos, steps, pieces)
 
     async def call(self, function: Callable[[], object]) -> object:
         """Run something short in the policy's thread, at once."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
-    async def _join[T](self, queue: deque[_Waiting[T]], work: T) -> np.ndarray:
+    async def _join[T](self, queue: deque[_Waiting[T]], work: T, pieces: int = 1) -> np.ndarray:
         future: asyncio.Future[np.ndarray] = asyncio.get_running_loop().create_future()
-        queue.append(_Waiting(work, future))
+        queue.append(_Waiting(work, future, pieces))
         self._wake.set()
         return await future
 
@@ -84,10 +86,13 @@ class Engine:
             await self._wake.wait()
             self._wake.clear()
             while self._acts or self._videos:
+                for waiting in [waiting for waiting in self._videos if waiting.pieces <= 1][: self.max_batch]:
+                    await self._piece(waiting)
+                await asyncio.sleep(0)  # those whose frames are in now ask for actions
                 if self._acts:
                     await self._batch()
                 if self._videos:
-                    await self._piece()
+                    await self._piece(self._videos[0])
 
     async def _batch(self) -> None:
         batch: list[_Waiting[Episode]] = []
@@ -111,8 +116,8 @@ class Engine:
             if not waiting.future.done():
                 waiting.future.set_result(chunk)
 
-    async def _piece(self) -> None:
-        waiting = self._videos.popleft()
+    async def _piece(self, waiting: _Waiting[Iterator[None]]) -> None:
+        self._videos.remove(waiting)
         if waiting.future.done():
             return
         try:
@@ -120,6 +125,7 @@ class Engine:
         except Exception as error:
             return _fail(waiting.future, error)
         if not finished:
+            waiting.pieces -= 1
             return self._videos.append(waiting)
         if not waiting.future.done():
             waiting.future.set_result(None)

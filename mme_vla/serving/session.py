@@ -60,7 +60,7 @@ class Session:
         if request.exec_start > 0:
             self._exec_start = request.exec_start
         self._check_room(len(request.front))
-        await self._engine.run(self._remember(request.front))
+        await self._engine.run(self._remember(request.front), self._pieces(request.front))
 
     async def _infer(self, request: Infer) -> np.ndarray:
         policy = self._engine.policy
@@ -84,7 +84,7 @@ class Session:
             )
         episode = self.episode
         episode.goal, episode.subgoal = request.goal, self._subgoal(request)
-        await self._engine.run(self._observe(request))
+        await self._engine.run(self._observe(request), self._pieces(request.front or ()))
         chunk = await self._engine.act(episode)
         if not np.isfinite(chunk).all():
             raise RuntimeError("the policy's answer is not finite")
@@ -100,14 +100,22 @@ class Session:
 
     def _remember(self, front: Sequence[np.ndarray]) -> Iterator[None]:
         """Take frames into memory, pausing after every `encode_chunk` frames that have to be encoded."""
-        memory, episode = self._engine.policy.memory, self.episode
-        every = 1 if memory is None else memory.storage.keep_every
-        piece = self._settings.encode_chunk * every
+        episode, piece = self.episode, self._piece
         for start in range(0, len(front), piece):
+            if start:
+                yield
             frames = np.stack(front[start : start + piece])
             demo = episode.frames_seen + np.arange(len(frames)) < self._exec_start
             episode.remember(frames, demo)
-            yield
+
+    @property
+    def _piece(self) -> int:
+        """Frames to a piece; of some memories most frames are never encoded."""
+        memory = self._engine.policy.memory
+        return self._settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
+
+    def _pieces(self, front: Sequence[np.ndarray]) -> int:
+        return max(1, -(-len(front) // self._piece))
 
     def _check_room(self, count: int) -> None:
         total, most = self.episode.frames_seen + count, self._settings.limits.frames
