@@ -14,6 +14,9 @@ import pytest
 from conftest import REPOSITORY
 from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
 
+from mme_vla.config import compose
+from mme_vla.errors import UserError
+from mme_vla.serve import load
 from mme_vla.serving import Client, Limits, pack, unpack
 
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}
@@ -151,7 +154,8 @@ def test_silent_sessions_are_freed(policy):
 def test_garbage_on_the_wire_is_answered_and_harms_nobody(served, sent):
     with socket.create_connection(served.address, timeout=20) as raw:
         raw.sendall(sent)
-        raw.shutdown(socket.SHUT_WR)
+        if not sent.endswith(b"\r\n\r\n"):
+            raw.shutdown(socket.SHUT_WR)
         answer = b""
         try:
             while piece := raw.recv(4096):
@@ -191,12 +195,17 @@ def test_the_command_serves_and_stops_when_told(tmp_path):
 
 
 def test_the_command_says_what_it_needs():
-    for words, said in (
-        ([], "checkpoint="),
-        (["checkpoint=nowhere"], "nowhere"),
-        (["checkpoint=x", "model=pi05"], "leave"),
-    ):
-        done = subprocess.run(
-            [sys.executable, "-m", "mme_vla.serve", *words], cwd=REPOSITORY, capture_output=True, text=True
-        )
-        assert done.returncode == 2 and said in done.stderr and "Traceback" not in done.stderr
+    for words, said in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
+        with pytest.raises(UserError, match=said):
+            load(compose("serve", words))
+    command = [sys.executable, "-m", "mme_vla.serve", "checkpoint=x", "model=pi05"]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_command_loads_a_run_folder(policy, tmp_path):
+    policy.save_pretrained(tmp_path / "checkpoints" / "step_000005")
+    loaded, name = load(compose("serve", [f"checkpoint={tmp_path}"]))
+    assert name == "tokendrop_expert"
+    parts = course(rounds=0)
+    np.testing.assert_array_equal(acted_directly(loaded, parts)[0], acted_directly(policy, parts)[0])
