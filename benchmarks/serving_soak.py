@@ -249,6 +249,7 @@ def soak_server(checkpoint: str, seconds: float) -> int:
     print(f"{CLIENTS} clients, {seconds:g} s:", dict(sorted(soak.counts.items())))
     print(f"difference from the same episode alone {soak.worst:.1e}, between episodes at least {soak.apart:.1e}")
     print("server:", json.dumps(stats))
+    print("memory MiB, every 10 s:", " ".join(f"{mib:.0f}" for mib in memory[::10]))
     print(f"memory MiB: start {memory[0]:.0f}, median of middle third {early:.0f}, of last third {late:.0f}")
     print(f"/healthz while serving, ms: p50 {health[0]:.1f}, p95 {health[1]:.1f}, max {health[2]:.1f}")
     print(f"exit code {code}; last words: {log[-1].strip()}")

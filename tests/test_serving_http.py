@@ -203,8 +203,8 @@ def test_the_command_says_what_it_needs():
     assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
 
 
-def test_the_command_loads_a_run_folder(policy, tmp_path):
-    policy.save_pretrained(tmp_path / "checkpoints" / "step_000005")
+def test_the_command_loads_a_checkpoint(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
     loaded, name = load(compose("serve", [f"checkpoint={tmp_path}"]))
     assert name == "tokendrop_expert"
     parts = course(rounds=0)

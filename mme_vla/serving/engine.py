@@ -28,9 +28,9 @@ class Engine:
     """Runs the policy for all clients.
 
     The event loop never computes. All computing happens in one thread, which takes turns: the new frames of everyone
-    who has only a few, then one batch of the episodes that wait for actions, then one piece of the long video that has
-    waited longest. So clients that replan at the same time travel together, and a client with a thousand frames delays
-    the others by one piece.
+    who has only a few, then one batch of the episodes that wait for actions, then pieces of long videos for as long as
+    the rest of the turn took, at least one piece. So clients that replan at the same time travel together, and clients
+    with a thousand frames and clients with few each get half of the machine while there are both.
 
     Args:
         policy: with statistics, on its device.
@@ -46,6 +46,7 @@ class Engine:
         self._videos: deque[_Waiting[Iterator[None]]] = deque()
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
+        self._readers = ThreadPoolExecutor(2, "decode")
         self._task: asyncio.Task[None] | None = None
 
     def start(self) -> None:
@@ -60,6 +61,7 @@ class Engine:
                 await self._task
         for future in [*(w.future for w in self._acts), *(w.future for w in self._videos)]:
             future.cancel()
+        self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
@@ -75,6 +77,10 @@ class Engine:
         """Run something short in the policy's thread, at once."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
+    async def decode[T](self, function: Callable[[], T]) -> T:
+        """Run something that decodes a large message, beside the policy's thread."""
+        return await asyncio.get_running_loop().run_in_executor(self._readers, function)
+
     async def _join[T](self, queue: deque[_Waiting[T]], work: T, pieces: int = 1) -> np.ndarray:
         future: asyncio.Future[np.ndarray] = asyncio.get_running_loop().create_future()
         queue.append(_Waiting(work, future, pieces))
@@ -86,13 +92,17 @@ class Engine:
             await self._wake.wait()
             self._wake.clear()
             while self._acts or self._videos:
+                begun = time.perf_counter()
                 for waiting in [waiting for waiting in self._videos if waiting.pieces <= 1][: self.max_batch]:
                     await self._piece(waiting)
                 await asyncio.sleep(0)  # those whose frames are in now ask for actions
                 if self._acts:
                     await self._batch()
-                if self._videos:
-                    await self._piece(self._videos[0])
+                until = 2 * time.perf_counter() - begun
+                while long := next((waiting for waiting in self._videos if waiting.pieces > 1), None):
+                    await self._piece(long)
+                    if time.perf_counter() > until:
+                        break
 
     async def _batch(self) -> None:
         batch: list[_Waiting[Episode]] = []

@@ -1,6 +1,5 @@
 """One client: its episode, and what its requests do to it. Dropping the session frees all the client's memory."""
 
-import asyncio
 import time
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -38,7 +37,7 @@ class Session:
             UserError: the request is malformed, or does not fit the episode.
         """
         begun = time.perf_counter()
-        request = self._read(data) if len(data) <= SMALL else await asyncio.to_thread(self._read, data)
+        request = self._read(data) if len(data) <= SMALL else await self._engine.decode(lambda: self._read(data))
         if isinstance(request, Reset):
             self._begin()
             return {"reset_finished": True, "reset_time_ms": self._took("reset", begun)}
