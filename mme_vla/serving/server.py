@@ -5,6 +5,7 @@ import logging
 import time
 from collections.abc import Awaitable
 from contextlib import suppress
+from importlib.metadata import version
 from typing import Any, cast
 
 from mme_vla.errors import UserError
@@ -227,12 +228,10 @@ def _peer(ws: ServerConnection) -> str:
 
 def _metadata(policy: MMEPolicy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
     """What a client is told when it connects."""
-    from mme_vla import __version__
-
     limits = settings.limits
     return {
         "server": "mme_vla",
-        "version": __version__,
+        "version": version("mme-vla"),
         "model": name,
         "trained": trained,
         "action_space": settings.action_space,
