@@ -2,58 +2,29 @@
 
     python benchmarks/cost.py [--count] [--budgets] [--time] [--memory] [--models …]     (all four without a choice)
 
-FLOPs are those of PyTorch's `FlopCounterMode` over the real code on the meta device: two for each multiply-add of
-linear layers, convolutions, matrix products and attention (on meta its kernel is taken apart into counted products;
-`check_attention_is_counted` holds that). Elementwise work, norms, softmax and embedding look-ups are not counted.
-Batch 1, two cameras, every prompt as long as its model's config allows, a full memory of 512 tokens; recurrent
-memories read a full window of 64 frames. Past frames arrive as stored tokens, as they do in training; what the vision
-tower spends on them in an episode is a column of its own.
+FLOPs are counted by `mme_vla.evaluation.analyses.cost`, which says what counts; `python -m mme_vla.analyse cost` prints
+them as well.
 """
 
 import argparse
 import resource
 import subprocess
 import sys
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from timing import alternate, machine
-from torch import nn
-from torch.utils.flop_counter import FlopCounterMode
 from variants import chunk, training_step
 
 from mme_vla import build_policy
 from mme_vla.config import compose
-from mme_vla.memory.recurrent import RecurrentMemory
+from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.policy import MMEPolicy
 from mme_vla.testing import ALL_MODELS, NEURAL, random_batch
 from mme_vla.types import Batch
 
 TERA, MIB = 1e12, 2**20
-REPLAN = 16  # frames that pass between two chunks of an episode
 BUDGETS = (64, 128, 256, 512, 1024)
 OF_BUDGETS = ("framesamp_modul", "tokendrop_expert")
-
-
-def flops(work: Callable[[], object]) -> int:
-    """FLOPs of a call, forward only."""
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        work()
-    return counter.get_total_flops()
-
-
-def check_attention_is_counted() -> None:
-    """Stop if this version of PyTorch does not count masked attention on the meta device."""
-    q, k = torch.empty(1, 8, 20, 32, device="meta"), torch.empty(1, 8, 50, 32, device="meta")
-    mask = torch.zeros(1, 1, 20, 50, device="meta")
-    counted = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
-    assert counted == 2 * (2 * 8 * 20 * 50 * 32), f"attention counts {counted} FLOPs on meta"
-
-
-def prompt_length(model: str) -> int:
-    """Tokens of the prompt, as the model's own file says."""
-    return compose("policy", [f"model={model}", "backbone=pi05"]).processor.prompt_length
 
 
 def full_batch(policy: MMEPolicy, batch: int, prompt: int) -> Batch:
@@ -64,64 +35,19 @@ def full_batch(policy: MMEPolicy, batch: int, prompt: int) -> Batch:
     return made
 
 
-def full_size(model: str, budget: int = 512) -> tuple[MMEPolicy, Batch]:
-    """A model at full size and a batch of one, both on meta."""
-    overrides: dict[str, Any] = {} if model not in NEURAL else {"memory": {"budget": budget}}
-    policy = build_policy(model, backbone="pi05", device="meta", **overrides)
-    policy.augment = False  # elementwise, and it draws numbers
-    return policy, full_batch(policy, 1, prompt_length(model)).to("meta")
-
-
-def forward_pass(policy: MMEPolicy, batch: Batch) -> Callable[[], object]:
-    """The loss of one training sample."""
-    return lambda: policy(batch)
-
-
-def sampling(policy: MMEPolicy, batch: Batch) -> Callable[[], object]:
-    """One chunk: memory, prefix and ten Euler steps."""
-    return lambda: policy.sample_actions(batch)
-
-
-def memory_flops(policy: MMEPolicy, batch: Batch) -> int:
-    """Encoding the memory tokens from scratch."""
-    return flops(lambda: policy.encode_memory(batch.history))
-
-
-def streamed_flops(policy: MMEPolicy, batch: Batch) -> int | None:
-    """A recurrent memory's one update when its frame list grows by one; None for other memories."""
-    memory, history = policy.memory, batch.history
-    if not isinstance(memory, RecurrentMemory) or history is None:
-        return None
-    last = slice(-(memory.storage.grid**2), None)
-    frame = history.features[:, last], history.positions[:, last], history.mask[:, last]
-    return flops(lambda: memory.read(memory.update(memory.init_state(1), *frame)))
-
-
-def frames_flops(policy: MMEPolicy) -> int:
-    """The vision tower on those of `REPLAN` passing frames that the memory wants stored."""
-    if policy.memory is None:
-        return 0
-    size = policy.backbone.config.vision.image_size
-    image = torch.empty(1, 3, size, size, device="meta")
-    wanted = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
-    return wanted * flops(lambda: policy.backbone.encode_images(image))
-
-
 def count(models: list[str]) -> None:
     """Parameters and FLOPs of the models at full size."""
     print("| model | prompt | parameters | forward pass | sampled chunk | over `pi05` | memory, of these | streamed "
           "| past frames |\n|---|---:|---:|---:|---:|---:|---:|---:|---:|")  # fmt: skip
-    reference = flops(sampling(*full_size("pi05")))
+    reference = count_model("pi05").chunk
     for model in models:
-        policy, batch = full_size(model)
-        parameters = sum(p.numel() for p in policy.parameters()) / 1e6
-        forward, sampled = flops(forward_pass(policy, batch)), flops(sampling(policy, batch))
-        memory, streamed = memory_flops(policy, batch), streamed_flops(policy, batch)
+        found = count_model(model)
         cells = [
-            str(batch.prompt.shape[1]), f"{parameters:,.1f} M", f"{forward / TERA:.3f} T", f"{sampled / TERA:.3f} T",
-            f"{sampled / reference:.2f}x", f"{memory / TERA:.4f} T" if memory else "",
-            "" if streamed is None else f"{streamed / TERA:.4f} T",
-            f"{frames_flops(policy) / TERA:.3f} T" if policy.memory else "",
+            str(found.prompt), f"{found.parameters / 1e6:,.1f} M", f"{found.forward / TERA:.3f} T",
+            f"{found.chunk / TERA:.3f} T", f"{found.chunk / reference:.2f}x",
+            f"{found.memory / TERA:.4f} T" if found.memory else "",
+            "" if found.streamed is None else f"{found.streamed / TERA:.4f} T",
+            f"{found.frames / TERA:.3f} T" if model in NEURAL else "",
         ]  # fmt: skip
         print(f"| `{model}` | {' | '.join(cells)} |")
 
@@ -131,13 +57,15 @@ def budgets() -> None:
     head = " | ".join(f"{budget:,}" for budget in BUDGETS)
     print(f"| model | | {head} |\n|---|---|{'---:|' * len(BUDGETS)}")
     for model in OF_BUDGETS:
-        made = [full_size(model, budget) for budget in BUDGETS]
-        rows = {
-            "forward pass": [flops(forward_pass(*parts)) for parts in made],
-            "sampled chunk": [flops(sampling(*parts)) for parts in made],
-        }
+        found = [count_model(model, budget) for budget in BUDGETS]
+        rows = {"forward pass": [cost.forward for cost in found], "sampled chunk": [cost.chunk for cost in found]}
         for what, values in rows.items():
             print(f"| `{model}` | {what} | {' | '.join(f'{value / TERA:.3f} T' for value in values)} |")
+
+
+def prompt_length(model: str) -> int:
+    """Tokens of the prompt, as the model's own file says."""
+    return compose("policy", [f"model={model}", "backbone=pi05"]).processor.prompt_length
 
 
 def tiny(model: str, batch: int) -> tuple[MMEPolicy, Batch]:
@@ -207,7 +135,6 @@ def main() -> None:
         peaks_of(args.child, args.batch)
         return
     every = not (args.count or args.budgets or args.time or args.memory)
-    check_attention_is_counted()
     if args.count or every:
         count(args.models)
     if args.budgets or every:

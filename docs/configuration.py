@@ -12,6 +12,7 @@ COMMANDS = {
     "convert": "python -m mme_vla.data.convert",
     "cache": "python -m mme_vla.data.cache",
     "inspect": "python -m mme_vla.inspect",
+    "serve": "python -m mme_vla.serve",
 }
 INTRODUCTION = """# Configuration
 

@@ -42,11 +42,14 @@ def build_policy(
 
     >>> policy = build_policy("framesamp_modul", memory={"budget": 256})  # doctest: +SKIP
     """
-    words = [f"model={name}"]
-    for key, value in overrides.items():
-        words += _words(key, value)
     extra = [] if config_dir is None else [Path(config_dir)]
-    return build_from_config(compose("policy", words, extra_dirs=extra), device=device, seed=seed)
+    config = compose("policy", policy_words(name, overrides), extra_dirs=extra)
+    return build_from_config(config, device=device, seed=seed)
+
+
+def policy_words(name: str, overrides: Mapping[str, Any]) -> list[str]:
+    """Write what `build_policy` takes as Hydra overrides."""
+    return [f"model={name}", *(word for key, value in overrides.items() for word in _words(key, value))]
 
 
 def build_from_config(

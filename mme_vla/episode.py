@@ -67,24 +67,70 @@ class Episode:
             raise UserError("observe() got states that are not finite numbers.")
         if len(front) == 0:
             return
-        demo = np.broadcast_to(demo, (len(front),))
+        demo, executed = self._checked_course(len(front), demo, actions)
+        images = self._policy.require_processor().images([front[-1], wrist[-1]])
+        self._take(front, demo, executed)
+        self._images, self._state = images, torch.from_numpy(states[-1].copy())
+
+    def remember(
+        self, front: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
+    ) -> None:
+        """Take frames into memory alone, for a client that sends past frames and the current view apart.
+
+        Followed by `look` at the last of them it is what `observe` does.
+
+        Args:
+            front: [t, H, W, 3] uint8, in order, each once.
+            is_demo, actions: as for `observe`.
+
+        Raises:
+            UserError: a wrong dtype or shape, or a video frame after execution has begun.
+        """
+        front = self._checked_view({VIEWS[0]: front}, VIEWS[0])
+        demo = np.asarray(is_demo, bool)
+        if demo.shape not in ((), (len(front),)):
+            raise UserError(f"is_demo must be one flag or {len(front)}, one a frame; got {demo.shape}.")
+        if len(front):
+            self._take(front, *self._checked_course(len(front), demo, actions))
+
+    def look(self, image: np.ndarray, wrist_image: np.ndarray, state: np.ndarray) -> None:
+        """Set the current view and state, adding nothing to memory.
+
+        Args:
+            image, wrist_image: [H, W, 3] uint8.
+            state: [8]; seven joint angles and the first finger's position.
+
+        Raises:
+            UserError: pictures or a state of another form.
+        """
+        state = np.asarray(state, np.float32)
+        if state.shape != (8,) or not np.isfinite(state).all():
+            raise UserError(f"look() needs a state of 8 finite numbers, got shape {state.shape}.")
+        images = self._policy.require_processor().images([image, wrist_image])
+        self._images, self._state = images, torch.from_numpy(state.copy())
+
+    def _checked_course(
+        self, count: int, demo: np.ndarray, actions: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Flags [count] of the next frames and the actions that led to the execution frames among them."""
+        demo = np.broadcast_to(demo, (count,))
         if demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any()):
             raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
-        executed = self._executed_now(int((~demo).sum()), actions)
-        processor = self._policy.require_processor()
-        images = processor.images([front[-1], wrist[-1]])
+        return demo, self._executed_now(int((~demo).sum()), actions)
+
+    def _take(self, front: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
+        """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
             wanted = self.history.wanted(len(front))
             self.history.append(front, self._policy.encode_frames(front[wanted]))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
-        longest = processor.prompt_format.past_actions
+        longest = self._policy.require_processor().prompt_format.past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
         self.frames_seen += len(front)
-        self._images, self._state = images, torch.from_numpy(states[-1].copy())
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""

@@ -122,7 +122,8 @@ class MMEPolicy(Saved):
             memory: memory tokens encoded beforehand; by default they are made from `batch.history`.
 
         Returns:
-            The mean loss, and metrics to log (detached); the memory's own begin with `memory/`.
+            The mean loss, and metrics to log (detached); the memory's own begin with `memory/`, and are there while
+            `memory.reporting` is True.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")

@@ -1,11 +1,14 @@
 """Small policies, batches and episodes for testing a memory or an integration: the library's own tests use them."""
 
+from functools import cache
 from typing import Any
 
 import numpy as np
 import torch
+from omegaconf import DictConfig
 
-from mme_vla.build import build_policy
+from mme_vla.build import build_from_config, policy_words
+from mme_vla.config import compose
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy import MMEPolicy
 from mme_vla.processing.normalize import NormStats, QuantileStats
@@ -28,12 +31,18 @@ def unit_stats() -> NormStats:
     return NormStats(state=quantiles(), actions=quantiles())
 
 
-def small_policy(name: str, **overrides: Any) -> MMEPolicy:
+def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
     """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive norms are shut)."""
-    policy = build_policy(name, **{"backbone": "tiny", **overrides})
+    policy = build_from_config(_composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed)
     policy.require_processor().stats = unit_stats()
     open_gates(policy)
     return policy
+
+
+@cache
+def _composed(*words: str) -> DictConfig:
+    """Composing takes several times as long as building a tiny policy, and tests build the same ones over and over."""
+    return compose("policy", words)
 
 
 def open_gates(policy: MMEPolicy, scale: float = 0.5) -> None:

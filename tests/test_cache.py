@@ -17,6 +17,7 @@ from mme_vla.data.cache import (
     cache_folder,
     ensure_cache,
     fingerprint,
+    score_file,
     token_file,
 )
 from mme_vla.data.cache_build import build_cache, clear_cache, estimate
@@ -131,15 +132,32 @@ def test_a_stale_cache_is_refused_with_the_command_that_mends_it(source, tmp_pat
     assert token_file(cache.folder, 0).exists()
 
 
-@pytest.mark.parametrize("damage", ["truncated", "reshaped"])
-def test_a_damaged_file_is_refused(source, tmp_path, damage: str) -> None:
-    path = token_file(ensure(source, LastFrames(), tmp_path).folder, 1)
-    if damage == "truncated":
-        path.write_bytes(path.read_bytes()[:-100])
-    else:
-        np.save(path, np.load(path)[:-1])
+def reshape(path: Path) -> None:
+    np.save(path, np.load(path)[:-1])
+
+
+def keep(count: int):
+    """Cut a file to its first bytes."""
+    return lambda path: path.write_bytes(path.read_bytes()[:count])
+
+
+def flip(path: Path) -> None:
+    path.write_bytes(b"".join(bytes([byte ^ 0xFF]) for byte in path.read_bytes()[:64]) + path.read_bytes()[64:])
+
+
+@pytest.mark.parametrize("damage", [keep(-100), keep(40), keep(0), flip, reshape])
+def test_a_damaged_token_file_is_refused(source, tmp_path, damage) -> None:
+    damage(token_file(ensure(source, LastFrames(), tmp_path).folder, 1))
     with pytest.raises(UserError, match=rf"episode_000001.npy .*{COMMAND} rebuild=true"):
         ensure(source, LastFrames(), tmp_path)
+
+
+@pytest.mark.parametrize("damage", [keep(-30), keep(10), keep(0), flip])
+def test_a_damaged_score_file_is_refused(source, tmp_path, damage) -> None:
+    memory = LastFrames(scored=True)
+    damage(score_file(ensure(source, memory, tmp_path).folder, 1))
+    with pytest.raises(UserError, match=rf"{score_file(tmp_path, 1).name} is damaged .*{COMMAND} rebuild=true"):
+        ensure(source, memory, tmp_path).history(1)
 
 
 def test_foreign_folders_are_neither_read_nor_cleared(source, tmp_path) -> None:

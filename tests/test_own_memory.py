@@ -44,7 +44,14 @@ def test_own_memory_gets_a_loss_and_acts(policy):
 
 def test_own_memory_trains_through_the_same_command(tmp_path):
     command = [sys.executable, "-m", "mme_vla.train", "--config-dir", str(EXAMPLE / "configs")]
-    options = ["model=last_frames_context", "train.steps=2", f"hydra.run.dir={tmp_path / 'run'}"]
+    small = [
+        "backbone.depth=1",
+        "backbone.vision.depth=1",
+        "backbone.vision.image_size=16",
+        "backbone.vision.patch_size=1",
+    ]
+    brief = ["train.steps=2", "train.val_samples=2", "train.open_loop_chunks=1", "train.workers=0", "logger=none"]
+    options = ["model=last_frames_context", *small, *brief, f"hydra.run.dir={tmp_path / 'run'}"]
     done = subprocess.run([*command, *options], cwd=EXAMPLE, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stdout + done.stderr
     assert list((tmp_path / "run").rglob("model.safetensors"))

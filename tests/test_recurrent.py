@@ -57,6 +57,17 @@ class RandomHistory(History):
         return torch.from_numpy(np.stack(rows)).float()
 
 
+class Counting:
+    """A function that counts its calls."""
+
+    def __init__(self, function) -> None:
+        self.function, self.calls = function, 0
+
+    def __call__(self, *args):
+        self.calls += 1
+        return self.function(*args)
+
+
 def window(memory: RecurrentMemory, length: int, exec_start: int = 0) -> HistoryTokens:
     return stack_history([memory.recall(RandomHistory(length, exec_start), length - 1)])
 
@@ -211,12 +222,39 @@ TTT_METRICS = [
 @pytest.mark.parametrize(("model", "names"), [("ttt_modul", TTT_METRICS), ("rmt_modul", ["slot_change"])])
 def test_inner_statistics_are_metrics(model, names):
     policy = small_policy(model)
+    policy.memory.reporting = True
     _, metrics = policy(random_batch(policy))
     assert sorted(metrics) == sorted(["loss", *(f"memory/{name}" for name in names)])
     assert all(value.ndim == 0 and torch.isfinite(value) and not value.requires_grad for value in metrics.values())
     if "memory/step_size" in metrics:
         assert float(metrics["memory/step_size"]) == pytest.approx(0.01, rel=0.5)
         assert metrics["memory/inner_loss_after"] < metrics["memory/inner_loss_before"]
+
+
+def test_statistics_are_computed_only_when_asked_for(make, monkeypatch):
+    memory, asked = make(), []
+    advance = memory.layer.advance
+
+    def noting(state, x, valid, following=0, statistics=False):
+        asked.append(statistics)
+        return advance(state, x, valid, following, statistics)
+
+    monkeypatch.setattr(memory.layer, "advance", noting)
+    if isinstance(memory, TTT):
+        monkeypatch.setattr(memory.layer, "inner", counted := Counting(memory.layer.inner))
+    tokens = window(memory, 100)
+    quiet = memory(tokens)
+    quiet.tokens.sum().backward()  # recomputation included
+    assert quiet.metrics == {}
+    assert not any(asked)
+    without = counted.calls if isinstance(memory, TTT) else 0
+    memory.reporting = True
+    telling = memory(tokens)
+    assert telling.metrics
+    assert torch.equal(telling.tokens, quiet.tokens)
+    if isinstance(memory, TTT):
+        frames = tokens.mask.shape[1] // GRID**2
+        assert counted.calls - without == without / 2 + 2 * frames, "two more forward passes a frame"
 
 
 def test_inner_updates_round_to_the_dtype_of_the_stored_state(make):

@@ -4,7 +4,6 @@ import io
 import json
 import math
 import os
-import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -170,19 +169,6 @@ def test_a_half_written_checkpoint_is_not_one(tmp_path: Path) -> None:
     train(tmp_path, steps=2)
     (tmp_path / "checkpoints" / ".step_000004.partial").mkdir()
     assert resolve_checkpoint(tmp_path).name == "step_000002"
-
-
-def test_a_stop_signal_saves_and_leaves(tmp_path: Path) -> None:
-    class Interrupted(ProgressLine):
-        def advance(self) -> None:
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    handler = signal.getsignal(signal.SIGTERM)
-    built = trainer(tmp_path)
-    with Interrupted(6, 0, shown=False) as line:
-        assert not built.run(line, loggers(tmp_path))
-    assert resolve_checkpoint(tmp_path).name == "step_000001"
-    assert signal.getsignal(signal.SIGTERM) == handler
 
 
 def test_a_loss_that_is_no_number_stops_the_run_and_saves_nothing(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -199,6 +200,17 @@ def test_a_memory_of_ones_own_starts_from_a_released_base(bases: dict[str, Path]
 
 
 # Statistics
+
+
+def test_of_several_datasets_statistics_none_is_taken_and_it_is_said(bases: dict[str, Path], tmp_path: Path) -> None:
+    folder = tmp_path / "base"
+    shutil.copytree(bases["openpi"], folder)
+    (folder / "assets" / "droid").mkdir(parents=True)
+    unit_stats().save(folder / "assets" / "droid" / "norm_stats.json")
+    policy = build_policy("pi05")
+    with pytest.warns(UserWarning, match=r"statistics of droid, robomme; none were taken.*read_stats\("):
+        load_into(policy, folder)
+    assert policy.require_processor().stats is None
 
 
 def test_statistics_of_openpi_and_of_several_datasets(tmp_path: Path) -> None:

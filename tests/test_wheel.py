@@ -12,7 +12,10 @@ from pathlib import Path
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-TRAIN = ["-m", "mme_vla.train", "model=tokendrop_expert", "train.steps=3", "hydra.run.dir=run"]
+TRAIN = [
+    "-m", "mme_vla.train", "model=tokendrop_expert", "train.steps=3", "train.val_samples=2", "train.open_loop_chunks=1",
+    "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "hydra.run.dir=run",
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")

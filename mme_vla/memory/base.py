@@ -20,6 +20,9 @@ class MemoryModule(nn.Module):
         storage: what has to be stored of each frame.
         pad_left: True puts the padding before the tokens (recurrent memories), False after them.
 
+    `reporting` is set from outside: True asks `forward` for numbers about its inside, as `MemoryTokens.metrics`. The
+    training loop sets it for the updates it logs; where it is False, what only these numbers need is not computed.
+
     and implements `select` and `forward`.
     """
 
@@ -27,6 +30,7 @@ class MemoryModule(nn.Module):
     capacity: int
     storage: StorageSpec
     pad_left: bool = False
+    reporting: bool = False
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """Say which stored tokens step `step` remembers.

@@ -144,7 +144,7 @@ class RecurrentMemory(MemoryModule):
     # The window
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        """Encode a window [b, n, d_vision] of whole frames; the result carries the layer's statistics as metrics."""
+        """Encode a window [b, n, d_vision] of whole frames; while `reporting`, with statistics of the layer as metrics."""
         x = self.encoder(history.features, history.positions, history.mask)
         return self.run(self._by_frame(x), self._by_frame(history.mask).all(-1))
 
@@ -159,13 +159,14 @@ class RecurrentMemory(MemoryModule):
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             if torch.is_grad_enabled():
-                inputs = (state, part, real, following, True)
+                inputs = (state, part, real, following, self.reporting)
                 state, numbers = checkpoint(advance, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
-                state, numbers = advance(state, part, real, following, True)
+                state, numbers = advance(state, part, real, following, self.reporting)
             statistics.append(numbers)
         tokens = self.read(state)
-        tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
+        if self.reporting:
+            tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
         return tokens
 
     # Frame by frame

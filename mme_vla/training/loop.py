@@ -1,7 +1,5 @@
 """The training loop: update, average, log, validate, save."""
 
-import signal
-import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -12,6 +10,7 @@ from accelerate import Accelerator
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
+from mme_vla.memory.base import MemoryModule
 from mme_vla.policy import MMEPolicy
 from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, trainable
 from mme_vla.training.console import ProgressLine, memory_gib
@@ -21,6 +20,7 @@ from mme_vla.training.optim import clip_gradients, learning_rate, make_optimizer
 from mme_vla.training.order import BatchOrder, draw_flow, generator_for, seed_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
+from mme_vla.training.stopping import leave_signals_alone, stop_asked
 from mme_vla.training.validation import Collate, Samples, Validation
 from mme_vla.training.window import Window
 
@@ -75,7 +75,7 @@ class Trainer:
             num_workers=settings.workers,
             prefetch_factor=4 if settings.workers else None,
             pin_memory=accelerator.device.type == "cuda",
-            worker_init_fn=_leave_signals_alone,
+            worker_init_fn=leave_signals_alone,
             generator=generator_for(settings.seed, "workers"),
         )
         self.policy = policy.to(accelerator.device).train()
@@ -108,22 +108,23 @@ class Trainer:
         """
         window, settings = Window(self.settings.batch_size), self.settings
         batches = iter(self.loader)
-        with _stop_asked(enabled=self.accelerator.num_processes == 1) as stop:
+        with stop_asked() as asked:
             for step in range(self.run_info.step, settings.steps):
-                window.add(self.update(step, batches, window))
-                line.advance()
                 done = step + 1
-                leaving = stop.is_set() or done == settings.steps
-                saving = leaving or done % settings.save_every == 0
+                with _reporting(self.policy.memory, self._due(done)):
+                    window.add(self.update(step, batches, window))
+                line.advance()
+                stopping = asked() and done < settings.steps
+                saving = stopping or done == settings.steps or done % settings.save_every == 0
                 # A window ends with every checkpoint, so that a resumed run has the same windows.
-                if saving or done % settings.log_every == 0:
+                if saving or self._due(done):
                     self._log(done, window, line, loggers)
                 with window.pause():
                     if done % settings.val_every == 0 or done == settings.steps:
                         self.validate(done, line, loggers)
                     if saving:
                         self.save(done)
-                if stop.is_set() and done < settings.steps:
+                if stopping:
                     line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
                     return False
         return True
@@ -179,6 +180,11 @@ class Trainer:
         self.last_checkpoint = folder / checkpoint_name(step)
         return self.last_checkpoint
 
+    def _due(self, done: int) -> bool:
+        """Whether a window ends after `done` updates, as far as the plan goes; being asked to stop ends one too."""
+        settings = self.settings
+        return done == settings.steps or done % settings.save_every == 0 or done % settings.log_every == 0
+
     def _log(self, step: int, window: Window, line: ProgressLine, loggers: Loggers) -> None:
         values = window.close(step, self.accelerator.reduce)
         values["memory/gib"] = memory_gib(self.accelerator.device)
@@ -186,29 +192,14 @@ class Trainer:
         line.numbers(step, values)
 
 
-def _leave_signals_alone(worker: int) -> None:
-    """Ctrl-C and a cluster's SIGTERM go to every process of a group: the training process alone answers them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-
-
 @contextmanager
-def _stop_asked(enabled: bool) -> Iterator[threading.Event]:
-    """An event that Ctrl-C or a cluster's SIGTERM sets; a second one ends the process as usual."""
-    event = threading.Event()
-    if not enabled or threading.current_thread() is not threading.main_thread():
-        yield event
+def _reporting(memory: MemoryModule | None, wanted: bool) -> Iterator[None]:
+    """Let the memory report numbers about its inside while this is open."""
+    if memory is None or not wanted:
+        yield
         return
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-
-    def ask(number: int, frame: Any) -> None:
-        event.set()
-        signal.signal(number, before[signal.Signals(number)])
-
-    for number in before:
-        signal.signal(number, ask)
+    memory.reporting = True
     try:
-        yield event
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        memory.reporting = False

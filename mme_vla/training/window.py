@@ -13,7 +13,10 @@ from mme_vla.errors import UserError
 
 
 class Window:
-    """Sums what updates report, on their device, and the time they take; reading it waits for the device once."""
+    """Sums what updates report, on their device, and the time they take; reading it waits for the device once.
+
+    A number that only some updates report is averaged over those.
+    """
 
     def __init__(self, batch_size: int) -> None:
         self._batch_size = batch_size
@@ -22,6 +25,7 @@ class Window:
     def restart(self) -> None:
         """Begin anew."""
         self._sums: dict[str, Tensor] = {}
+        self._counts: dict[str, int] = {}
         self._updates = 0
         self._waited = self._paused = 0.0
         self._begun = time.perf_counter()
@@ -30,6 +34,7 @@ class Window:
         """Take one update's numbers."""
         for name, value in metrics.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value
+            self._counts[name] = self._counts.get(name, 0) + 1
         self._updates += 1
 
     @contextmanager
@@ -55,7 +60,8 @@ class Window:
         Raises:
             UserError: the loss is no longer a number.
         """
-        means = reduce(torch.stack(list(self._sums.values())) / self._updates, reduction="mean").tolist()
+        averages = [total / self._counts[name] for name, total in self._sums.items()]
+        means = reduce(torch.stack(averages), reduction="mean").tolist()
         values = {f"train/{name}": mean for name, mean in zip(self._sums, means, strict=True)}
         seconds = time.perf_counter() - self._begun - self._paused
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds

@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,7 +42,8 @@ def load_into(
     """Fill a policy with a checkpoint of the same variant, in any format this library knows.
 
     The policy may lie on the meta device, so that no weight is drawn only to be replaced. A checkpoint that
-    carries the statistics of one dataset hands them to the policy's processor; LeRobot's are left (see `read_stats`).
+    carries the statistics of one dataset hands them to the policy's processor; LeRobot's are left (see `read_stats`),
+    and of several none is taken, with a warning that names them.
 
     Args:
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
@@ -58,12 +60,18 @@ def load_into(
             f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
             "To begin training from it use start_from() (on the command line: init_from=…)."
         )
-    stats = None
-    if policy.processor is not None and found.format != "lerobot" and len(stats_files(found.folder)) < 2:
+    stats, datasets = None, list(stats_files(found.folder))
+    if policy.processor is not None and found.format != "lerobot" and len(datasets) < 2:
         stats = read_stats(found.folder)
     assign_tensors(policy, read_as(policy, found), str(source), kind)
     if stats is not None and policy.processor is not None:
         policy.processor.stats = stats
+    elif len(datasets) > 1:
+        warnings.warn(
+            f"{source} holds normalisation statistics of {', '.join(datasets)}; none were taken. Choose one: "
+            f"policy.processor.stats = read_stats({str(found.folder)!r}, {datasets[0]!r})",
+            stacklevel=2,
+        )
     return policy
 
 

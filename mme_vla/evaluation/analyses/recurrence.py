@@ -1,0 +1,57 @@
+"""What a recurrent memory reports frame by frame: TTT's inner loss, step sizes and clipping, RMT's change of slots."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.evaluation.analyses.replay import STRIDE, replay
+from mme_vla.memory.recurrent import RecurrentMemory
+from mme_vla.policy import MMEPolicy
+
+
+@dataclass(frozen=True)
+class RecurrenceCurves:
+    """One episode's recurrence: frames [t] it took, in order, and a number of each by name.
+
+    TTT: `inner_loss_before` and `inner_loss_after` the update by this frame, `step_size`, `clipped_gradients`,
+    `clipped_rates` (shares). RMT: `slot_change`, relative.
+    """
+
+    episode: int
+    exec_start: int
+    frames: np.ndarray
+    curves: dict[str, np.ndarray]
+
+
+@torch.no_grad()
+def recurrence_curves(policy: MMEPolicy, source: EpisodeSource, episode: int, stride: int = STRIDE) -> RecurrenceCurves:
+    """Run the memory over the window it has at an episode's last chunk.
+
+    Raises:
+        UserError: the memory is not recurrent, or there is no such episode.
+    """
+    memory = policy.memory
+    if not isinstance(memory, RecurrentMemory):
+        raise UserError("This policy has no recurrent memory: choose one such as ttt_modul or rmt_expert.")
+    last = None
+    for last in replay(policy, source, episode, stride):  # noqa: B007  (only the last is wanted)
+        pass
+    assert last is not None
+    step, running = last
+    history = running.required_history()
+    window = running.recall()
+    with policy.autocast():
+        features, positions, mask = (
+            x[None].to(policy.device) for x in (window.features, window.positions, window.mask)
+        )
+        x = memory.encoder(features, positions, mask)
+        patches = memory.storage.grid**2
+        frames = x.unflatten(1, (-1, patches))
+        valid = mask.unflatten(1, (-1, patches)).all(-1)
+        _, numbers = memory.layer.advance(memory.init_state(1), frames, valid, statistics=True)
+    real = valid[0].cpu().numpy()
+    curves = {name: values[0].float().cpu().numpy()[real] for name, values in numbers.items()}
+    return RecurrenceCurves(episode, history.exec_start, memory.frames(history, step), curves)

@@ -1,0 +1,77 @@
+"""A policy shown recorded episodes as an environment would show them, so that what happens inside can be watched."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.stats import compute_norm_stats
+from mme_vla.episode import Episode
+from mme_vla.errors import UserError
+from mme_vla.policy import MMEPolicy
+from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.types import VIEWS
+
+STRIDE = 16
+"""Steps between two chunks, as an evaluation executes them."""
+
+
+def replay(
+    policy: MMEPolicy, source: EpisodeSource, episode: int, stride: int = STRIDE, most: int | None = None
+) -> Iterator[tuple[int, Episode]]:
+    """Show a recorded episode frame by frame and let the policy act at every `stride`-th execution step.
+
+    The recorded actions go on being executed, whatever the policy answers. Subgoals, where the policy reads them, are
+    the recorded ones.
+
+    Args:
+        most: chunks at most, spread over the episode.
+
+    Yields:
+        The step a chunk was just chosen at, and the running episode.
+
+    Raises:
+        UserError: there is no such episode, or it lacks the subgoals this policy reads.
+    """
+    if not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    give_statistics(policy, source)
+    start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
+    steps = np.arange(start, length, stride)
+    if most is not None and most < len(steps):
+        steps = steps[np.linspace(0, len(steps) - 1, most).round().astype(int)]
+    text = SubgoalText.from_config(policy.config.get("subgoal_text"))
+    running, seen = policy.start_episode(source.goal(episode)), 0
+    for step in steps.tolist():
+        indices = np.arange(seen, step + 1)
+        views = {view: source.frames(episode, indices, view) for view in VIEWS}
+        executed = indices[indices >= start]
+        actions = source.actions(episode)[np.maximum(executed - 1, 0)]
+        running.observe(views, source.states(episode, seen, step + 1), indices < start, actions)
+        seen = step + 1
+        if text is not None:
+            texts = source.subgoals(episode, step)
+            if text.kind not in texts:
+                raise UserError(f"{source.name} has no {text.kind}, which this policy reads.")
+            running.subgoal = texts[text.kind]
+        policy.act([running])
+        yield step, running
+
+
+def replay_all(
+    policy: MMEPolicy,
+    source: EpisodeSource,
+    episodes: Sequence[int] | None,
+    stride: int = STRIDE,
+    most: int | None = None,
+) -> int:
+    """Replay several episodes (None: all); return how many chunks were chosen."""
+    chosen = range(len(source)) if episodes is None else episodes
+    return sum(1 for episode in chosen for _ in replay(policy, source, episode, stride, most))
+
+
+def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:
+    """Normalisation statistics for a fresh policy, which has none: those of the data it is shown."""
+    processor = policy.require_processor()
+    if processor.stats is None:
+        processor.stats = compute_norm_stats([source], horizon=processor.horizon)

@@ -1,0 +1,63 @@
+"""What a memory remembers along an episode, as a video: the contact sheet of every few steps."""
+
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.pictures import contact_sheet
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.history import OnlineHistory
+
+
+def selection_sheets(
+    source: EpisodeSource, episode: int, memory: MemoryModule, name: str, every: int = 8
+) -> Iterator[tuple[int, Image.Image]]:
+    """Draw what `memory` remembers at the first execution step and at every `every`-th after it.
+
+    Selections need no weights: the tokens stored are empty.
+
+    Yields:
+        (step, picture); pictures grow with what is remembered.
+
+    Raises:
+        UserError: there is no such episode, or `every` is not positive.
+    """
+    import torch
+
+    if not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    if every < 1:
+        raise UserError(f"every={every} must be at least 1: the steps between two pictures.")
+    start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
+    frames = source.frames(episode, np.arange(length))
+    history, patches = OnlineHistory(memory.storage, memory.make_scorer(), start), memory.storage.grid**2
+    seen = 0
+    for step in range(start, length, every):
+        part = frames[seen : step + 1]
+        history.append(part, torch.zeros(len(history.wanted(len(part))), patches, 1))
+        seen = step + 1
+        selected = memory.select(history, step)
+        title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
+        yield step, contact_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)
+
+
+def write_video(pictures: Sequence[Image.Image], path: Path, fps: int = 4) -> None:
+    """Write pictures of any sizes as an H.264 mp4, each at the top left of a white frame that holds the largest."""
+    import av
+
+    width, height = (-(-max(picture.size[axis] for picture in pictures) // 2) * 2 for axis in (0, 1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": "23"}
+        for picture in pictures:
+            canvas = Image.new("RGB", (width, height), "white")
+            canvas.paste(picture)
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(canvas), format="rgb24")))
+        container.mux(stream.encode())

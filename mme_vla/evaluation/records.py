@@ -1,0 +1,199 @@
+"""What is kept of an evaluated episode, and how records come together into runs."""
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from datetime import UTC, datetime
+from typing import Any, NamedTuple, Self
+
+from mme_vla.errors import UserError, did_you_mean
+
+OUTCOMES = ("success", "fail", "timeout", "error")
+
+
+class RunKey(NamedTuple):
+    """What one pass over the benchmark is a pass of: one policy, one checkpoint, one model seed."""
+
+    model: str
+    subgoal: str | None
+    memory_budget: int | None
+    checkpoint: int | str
+    model_seed: int
+    split: str
+
+    def __str__(self) -> str:
+        name = self.model if self.subgoal is None else f"{self.model}+{self.subgoal}"
+        name = name if self.memory_budget is None else f"{name}, {self.memory_budget} memory tokens"
+        return f"{name}, checkpoint {self.checkpoint}, seed {self.model_seed}, {self.split}"
+
+
+class EpisodeKey(NamedTuple):
+    """An episode of the benchmark's split."""
+
+    task: str
+    episode: int
+
+
+@dataclass(frozen=True)
+class Seconds:
+    """Where an episode's wall time went."""
+
+    sim: float = 0.0
+    policy: float = 0.0
+    total: float = 0.0
+
+
+@dataclass(frozen=True)
+class EpisodeRecord:
+    """One evaluated episode.
+
+    model: name of the model (`framesamp_modul`). checkpoint: its step, or a name.
+    model_seed: of the policy's noise; it does not reach the environment.
+    task, episode: which episode of the split; seed, difficulty: the environment's, from the benchmark's metadata.
+    outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error` (see `error`).
+    steps: actions executed. seconds: where the time went.
+    subgoal: name of the subgoal predictor, None for a policy without.
+    memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
+    extra: whatever else a runner keeps.
+    when: UTC time of the end, ISO 8601.
+    """
+
+    model: str
+    checkpoint: int | str
+    model_seed: int
+    task: str
+    episode: int
+    seed: int
+    difficulty: str
+    outcome: str
+    steps: int
+    seconds: Seconds = field(default_factory=Seconds)
+    error: str | None = None
+    split: str = "test"
+    max_steps: int = 1300
+    action_space: str = "joint_angle"
+    subgoal: str | None = None
+    memory_budget: int | None = None
+    when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
+    extra: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.outcome not in OUTCOMES:
+            raise UserError(f"outcome {self.outcome!r} is none. {did_you_mean(str(self.outcome), OUTCOMES)}")
+        for name, kind in _KINDS.items():
+            value = getattr(self, name)
+            if not isinstance(value, kind) or isinstance(value, bool):
+                wanted = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
+                raise UserError(f"{name}={value!r} of a record must be {wanted}, not {type(value).__name__}.")
+        if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
+            object.__setattr__(self, "checkpoint", int(self.checkpoint))
+
+    @property
+    def success(self) -> bool:
+        return self.outcome == "success"
+
+    @property
+    def run(self) -> RunKey:
+        return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split)
+
+    @property
+    def key(self) -> EpisodeKey:
+        return EpisodeKey(self.task, self.episode)
+
+    def to_json(self) -> str:
+        """One line, without its end."""
+        return json.dumps(asdict(self), ensure_ascii=False, separators=(",", ":"))
+
+    @classmethod
+    def from_json(cls, line: str) -> Self:
+        """Read a line.
+
+        Raises:
+            ValueError: it is not JSON. UserError: it is, but not a record: fields are missing, unknown or wrong.
+        """
+        values = json.loads(line)
+        if not isinstance(values, dict):
+            raise UserError(f"a record is a JSON object, not {type(values).__name__}")
+        known = {member.name for member in fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise UserError(f"unknown field {unknown[0]!r}. {did_you_mean(unknown[0], known)} Others go into `extra`.")
+        try:
+            return cls(**{**values, "seconds": Seconds(**(values.get("seconds") or {}))})
+        except TypeError as error:
+            raise UserError(f"not an episode record: {error}") from None
+
+
+_KINDS: dict[str, Any] = {
+    "model": str, "checkpoint": (int, str), "model_seed": int, "task": str, "episode": int, "seed": int,
+    "difficulty": str, "steps": int, "split": str, "max_steps": int, "action_space": str, "when": str, "extra": dict,
+    "seconds": Seconds,
+}  # fmt: skip
+
+
+def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[EpisodeRecord]:
+    """One record for each episode of each run, in the order they first came.
+
+    Any other outcome supersedes an `error`, which was retried. Of equal outcomes the first stays. Different outcomes
+    of one episode are refused: the same checkpoint and seed were evaluated twice.
+
+    Args:
+        records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
+
+    Raises:
+        UserError: conflicting outcomes, or two runs of an episode that are not of the same environment.
+    """
+    if conflicts not in ("refuse", "first", "last"):
+        raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
+    kept: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
+    for new in records:
+        at = (new.run, new.key)
+        old = kept.get(at)
+        if old is None or (old.outcome == "error" and new.outcome != "error"):
+            kept[at] = new
+            continue
+        if new.seed != old.seed:
+            raise UserError(
+                f"{new.task} {new.episode} ({new.run}) was run with environment seeds {old.seed} and {new.seed}: "
+                "these are not the same benchmark; evaluate both from the same episode metadata."
+            )
+        if new.outcome in (old.outcome, "error"):
+            continue
+        if conflicts == "refuse":
+            raise UserError(
+                f"{new.task} {new.episode} ({new.run}) was evaluated twice with different outcomes: {old.outcome} at "
+                f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last."
+            )
+        if (conflicts == "last") == (new.when > old.when):
+            kept[at] = new
+    return list(kept.values())
+
+
+def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:
+    """Group merged records.
+
+    Raises:
+        UserError: one run mixes step limits or action spaces, so its episodes cannot be averaged.
+    """
+    runs: dict[RunKey, list[EpisodeRecord]] = {}
+    for record in records:
+        runs.setdefault(record.run, []).append(record)
+    for run, members in runs.items():
+        for name in ("max_steps", "action_space"):
+            values = sorted({getattr(member, name) for member in members})
+            if len(values) > 1:
+                raise UserError(f"{run} mixes {name} {' and '.join(map(str, values))}: evaluate it with one of them.")
+    return runs
+
+
+def finished(records: Iterable[EpisodeRecord], retry_errors: bool = True) -> set[EpisodeKey]:
+    """The episodes of one run that need not be run again; those that ended in an error do, unless told otherwise."""
+    return {record.key for record in records if not (retry_errors and record.outcome == "error")}
+
+
+def count_outcomes(records: Iterable[EpisodeRecord]) -> Mapping[str, int]:
+    """How many episodes ended how, every outcome named."""
+    counts = dict.fromkeys(OUTCOMES, 0)
+    for record in records:
+        counts[record.outcome] += 1
+    return counts

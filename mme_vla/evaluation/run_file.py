@@ -1,0 +1,91 @@
+"""`run.json` beside a run's records: the settings that decide its results, so that a run resumes as what it was."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from mme_vla.errors import UserError
+
+RUN_FILE = "run.json"
+
+
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """SHA-256 of the settings, whatever the order of their keys."""
+    return hashlib.sha256(json.dumps(settings, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Begin a run in `folder`, or go on with the one that is there.
+
+    Args:
+        settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, …
+        notes: what does not (device, workers, versions); written down when the run begins, never compared.
+
+    Returns:
+        What `run.json` holds. Several shards may claim the same folder at once: the first writes it.
+
+    Raises:
+        UserError: the folder holds a run with other settings; each difference is named.
+    """
+    settings = json.loads(json.dumps(settings))  # as they will be read back: tuples are lists, keys are strings
+    content = {
+        "settings": settings,
+        "fingerprint": fingerprint(settings),
+        "notes": dict(notes or {}),
+        "begun": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    target, mine = folder / RUN_FILE, folder / f".{RUN_FILE}.{os.getpid()}"
+    mine.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")
+    try:
+        os.link(mine, target)  # whole or not at all, and never over another's
+        return content
+    except FileExistsError:
+        pass
+    finally:
+        mine.unlink()
+    there = read_run(folder)
+    if there["fingerprint"] != content["fingerprint"]:
+        raise UserError(
+            f"{folder} holds a run with other settings: {_differences(there['settings'], settings)}. "
+            "Resume it with its own settings, or choose another folder."
+        )
+    return there
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """Read a folder's `run.json`.
+
+    Raises:
+        UserError: it is missing or damaged.
+    """
+    path = folder / RUN_FILE
+    try:
+        content = json.loads(path.read_text())
+        if content["fingerprint"] != fingerprint(content["settings"]):
+            raise UserError(f"{path} was changed by hand: its settings do not have its fingerprint.")
+    except OSError as error:
+        raise UserError(f"Cannot read {path}: {error.strerror}.") from None
+    except (json.JSONDecodeError, KeyError, TypeError) as error:
+        raise UserError(f"{path} is damaged ({error}); remove it if the records beside it are of this run.") from None
+    return content
+
+
+def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
+    before, after = _flat(there), _flat(now)
+    changed = [key for key in sorted({*before, *after}) if before.get(key, _NOTHING) != after.get(key, _NOTHING)]
+    return "; ".join(f"{key} was {before.get(key, 'not set')!r}, is {after.get(key, 'not set')!r}" for key in changed)
+
+
+_NOTHING = object()
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat

@@ -1,0 +1,149 @@
+"""`Client`: talk to a policy server from Python, in either schema."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.serving.codec import pack, unpack
+
+try:
+    from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+    from websockets.sync.client import connect
+except ImportError as error:
+    raise UserError("The client needs msgpack and websockets: pip install 'mme-vla[serve]'.") from error
+
+
+class Client:
+    """A connection to a policy server; blocking, for one thread.
+
+    The episode lives on the server with the connection and is lost with it, so nothing reconnects by itself: after a
+    `ConnectionError` call `reconnect()` and begin the episode again.
+
+    Args:
+        url: `ws://host:port`.
+        api_key: what the server asks for, if it does.
+        timeout: seconds to wait for an answer; a first request of 1,000 frames may take minutes on a CPU.
+        open_timeout: seconds to wait for the connection and the server's metadata.
+
+    Raises:
+        UserError: not an address of a server, or the key is refused.
+        ConnectionError: nobody answers there.
+
+    >>> with Client("ws://127.0.0.1:8001") as client:  # doctest: +SKIP
+    ...     client.reset()
+    ...     chunk = client.infer({"task_goal": [goal], "is_first_step": True, ...})["actions"]
+    """
+
+    def __init__(
+        self,
+        url: str = "ws://127.0.0.1:8001",
+        *,
+        api_key: str | None = None,
+        timeout: float = 600,
+        open_timeout: float = 60,
+    ) -> None:
+        self.url, self.timeout, self.open_timeout = url, timeout, open_timeout
+        self._headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
+        self._socket: Any = None
+        self.metadata: dict[str, Any] = {}
+        """What the server said of itself when this client connected."""
+        self.reconnect()
+
+    def reconnect(self) -> None:
+        """Close the connection if there is one and open another, with an episode that has not begun."""
+        self.close()
+        try:
+            self._socket = connect(
+                self.url,
+                additional_headers=self._headers,
+                compression=None,
+                max_size=None,
+                open_timeout=self.open_timeout,
+                ping_timeout=self.timeout,
+                proxy=None,
+            )
+        except InvalidURI as error:
+            raise UserError(f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
+        except InvalidHandshake as error:
+            reply = getattr(getattr(error, "response", None), "body", b"") or b""
+            said = bytes(reply).decode(errors="replace").strip()
+            raise UserError(f"The server at {self.url} refuses the connection: {said or error}") from None
+        except (OSError, TimeoutError, EOFError) as error:
+            raise ConnectionError(f"No policy server answers at {self.url}: {error}") from error
+        self.metadata = self._receive(self.open_timeout)
+
+    def reset(self) -> dict[str, Any]:
+        """Begin a new episode on the server."""
+        return self.request({"reset": True})
+
+    def add_buffer(self, images: np.ndarray, states: np.ndarray, exec_start: int = 0) -> dict[str, Any]:
+        """Send frames to remember, the current one included, before `infer` (MME-VLA schema).
+
+        Args:
+            images: front view [t, H, W, 3] or [t, 1, H, W, 3] uint8.
+            states: [t, 8]; seven joint angles and the first finger's position.
+            exec_start: index of the episode's first execution frame, when these frames begin with a video.
+        """
+        images = np.asarray(images)
+        images = images[:, None] if images.ndim == 4 else images
+        states = np.asarray(states, np.float32)
+        return self.request({"add_buffer": True, "images": images, "state": states, "exec_start_idx": exec_start})
+
+    def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
+        """Ask for the next chunk.
+
+        Args:
+            observation: of either schema: `observation/image`, `observation/wrist_image`, `observation/state` and
+                `prompt`; or the challenge's lists.
+
+        Returns:
+            `actions` [n, 8] float32 absolute joint angles and gripper command, and `infer_time_ms`.
+        """
+        return self.request(observation)
+
+    def request(self, message: Mapping[str, Any] | Sequence[Any]) -> dict[str, Any]:
+        """Send one message and return the answer.
+
+        Raises:
+            UserError: the server refuses the message, and says why. The connection is closed then.
+            ConnectionError: the connection is lost. TimeoutError: no answer within `timeout`; the connection is closed.
+        """
+        data = pack(message)
+        if self._socket is None:
+            raise ConnectionError("This client is closed: call reconnect().")
+        with suppress(ConnectionClosed):  # the server may have said why before it closed
+            self._socket.send(data)
+        return self._receive(self.timeout)
+
+    def close(self) -> None:
+        """Close the connection; the server frees the episode."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _receive(self, timeout: float) -> dict[str, Any]:
+        try:
+            answer = self._socket.recv(timeout)
+        except ConnectionClosed as error:
+            self.close()
+            raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from None
+        except TimeoutError:
+            self.close()  # an answer that came later would be taken for that of the next request
+            raise TimeoutError(f"No answer from {self.url} within {timeout:g} s; call reconnect().") from None
+        if isinstance(answer, str):
+            self.close()
+            raise UserError(f"The server refuses this request: {answer}")
+        found: dict[str, Any] = unpack(answer)
+        return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in found.items()}

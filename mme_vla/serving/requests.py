@@ -1,0 +1,212 @@
+"""What clients say: two message schemas, told apart by their keys, checked whole before anything is done.
+
+The MME-VLA schema (openpi's, with memory) sends past frames and the current observation apart: `add_buffer`, then an
+`observation/…` message. The RoboMME challenge sends lists of all frames since its last request. Both reset alike.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError, did_you_mean
+
+SUBGOALS = ("simple_subgoal", "grounded_subgoal")
+STATE = 8  # seven joint angles and the first finger's position
+MOST_GOAL = 4000  # characters
+SIDES = (8, 4096)  # pixels of a picture's side
+KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
+
+
+@dataclass(frozen=True)
+class Reset:
+    """Forget the episode and begin another."""
+
+
+@dataclass(frozen=True)
+class AddBuffer:
+    """Frames to remember, the current one included; nothing is chosen yet.
+
+    front: t pictures [H, W, 3] uint8.
+    exec_start: index of the episode's first execution frame; 0 where it is not said.
+    """
+
+    front: Sequence[np.ndarray]
+    exec_start: int
+
+
+@dataclass(frozen=True)
+class Infer:
+    """Choose a chunk.
+
+    image, wrist_image: the current pictures. state [8]. goal: the task in words. subgoals: by kind, those given.
+    front: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
+    first: whether the message begins an episode; None where the schema does not say.
+    """
+
+    image: np.ndarray
+    wrist_image: np.ndarray
+    state: np.ndarray
+    goal: str
+    subgoals: Mapping[str, str] = field(default_factory=dict)
+    front: Sequence[np.ndarray] | None = None
+    first: bool | None = None
+
+
+Request = Reset | AddBuffer | Infer
+
+
+def parse(message: Any, most_frames: int) -> Request:
+    """Recognise a decoded message.
+
+    Args:
+        most_frames: longest list of frames taken.
+
+    Raises:
+        UserError: neither schema, a missing key, or a value of the wrong form; it names the key.
+    """
+    if not isinstance(message, dict):
+        raise UserError(f"A request is a map, got {type(message).__name__}.")
+    space = message.get("action_space", "joint_angle")
+    if space != "joint_angle":
+        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with joint angles (joint_angle) only.")
+    if "reset" in message:
+        if message["reset"] is not True:
+            raise UserError("reset must be true; leave the key out of other requests.")
+        return Reset()
+    if "add_buffer" in message:
+        return _add_buffer(message, most_frames)
+    if "front_rgb_list" in message or "task_goal" in message:
+        return _challenge(message, most_frames)
+    if any(isinstance(key, str) and key.startswith("observation/") for key in message):
+        return _observation(message)
+    keys = [key for key in message if isinstance(key, str)][:10]
+    near = did_you_mean(keys[0], KNOWN) if keys else f"Known: {', '.join(KNOWN)}."
+    raise UserError(f"No known request has the keys {keys}. {near}")
+
+
+def _add_buffer(message: dict[Any, Any], most_frames: int) -> AddBuffer:
+    images = _array(message, "images")
+    if images.ndim != 5 or images.shape[1] != 1:
+        raise UserError(f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype} {list(images.shape)}.")
+    count = len(images)
+    front = _frames("images", list(images[:, 0]), most_frames)
+    states = _numbers("state", _array(message, "state"))
+    if states.shape != (count, STATE):
+        raise UserError(f"state must be [{count}, {STATE}], one row a frame, got {list(states.shape)}.")
+    start = message.get("exec_start_idx", 0)
+    if isinstance(start, np.integer):
+        start = int(start)
+    if type(start) is not int or start < 0:
+        raise UserError(f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.")
+    return AddBuffer(front, start)
+
+
+def _observation(message: dict[Any, Any]) -> Infer:
+    views = [_picture(key, _get(message, key)) for key in ("observation/image", "observation/wrist_image")]
+    state = _numbers("observation/state", _array(message, "observation/state"))
+    if state.shape != (STATE,):
+        raise UserError(f"observation/state must be [{STATE}], got {list(state.shape)}.")
+    return Infer(views[0], views[1], state, _text("prompt", _get(message, "prompt")), _subgoals(message))
+
+
+def _challenge(message: dict[Any, Any], most_frames: int) -> Infer:
+    front = _frames("front_rgb_list", _get(message, "front_rgb_list"), most_frames)
+    wrist = _frames("wrist_rgb_list", _get(message, "wrist_rgb_list"), most_frames)
+    joints, grippers = (_rows(message, key, size) for key, size in (("joint_state_list", 7), ("gripper_state_list", 2)))
+    lengths = {len(front), len(wrist), len(joints), len(grippers)}
+    if len(lengths) != 1:
+        raise UserError(
+            f"All lists need one entry a frame: front_rgb_list has {len(front)}, wrist_rgb_list {len(wrist)}, "
+            f"joint_state_list {len(joints)}, gripper_state_list {len(grippers)}."
+        )
+    first = _get(message, "is_first_step")
+    if not isinstance(first, bool | np.bool_):
+        raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
+    goal = _text("task_goal", _get(message, "task_goal"))
+    state = np.concatenate([joints[-1], grippers[-1][:1]]).astype(np.float32)
+    return Infer(front[-1], wrist[-1], state, goal, _subgoals(message), front, bool(first))
+
+
+def _subgoals(message: dict[Any, Any]) -> dict[str, str]:
+    return {key: _text(key, message[key]) for key in SUBGOALS if message.get(key) is not None}
+
+
+def _get(message: dict[Any, Any], key: str) -> Any:
+    if key not in message:
+        raise UserError(f"The request lacks {key}; it has {sorted(str(k)[:40] for k in list(message)[:20])}.")
+    return message[key]
+
+
+def _array(message: dict[Any, Any], key: str) -> np.ndarray:
+    value = _get(message, key)
+    if isinstance(value, list):  # plain numbers are as good
+        try:
+            value = np.asarray(value)
+        except (ValueError, TypeError, OverflowError):
+            value = None
+    if not isinstance(value, np.ndarray):
+        raise UserError(f"{key} must be an array.")
+    return value
+
+
+def _numbers(key: str, value: np.ndarray) -> np.ndarray:
+    if value.dtype.kind not in "fiu":
+        raise UserError(f"{key} must hold numbers, got dtype {value.dtype}.")
+    with np.errstate(over="ignore"):
+        numbers = value.astype(np.float32)
+    if not np.isfinite(numbers).all():
+        raise UserError(f"{key} holds numbers that are not finite.")
+    return numbers
+
+
+def _rows(message: dict[Any, Any], key: str, size: int) -> list[np.ndarray]:
+    rows = _get(message, key)
+    if isinstance(rows, np.ndarray):
+        rows = list(rows) if rows.ndim else None
+    if not isinstance(rows, list):
+        raise UserError(f"{key} must be a list of arrays [{size}].")
+    found = [_numbers(key, _array({key: row}, key)) for row in rows]
+    for row in found:
+        if row.shape != (size,):
+            raise UserError(f"{key} must hold arrays [{size}], got {list(row.shape)}.")
+    return found
+
+
+def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
+    if isinstance(frames, np.ndarray):
+        frames = list(frames) if frames.ndim == 4 else None
+    if not isinstance(frames, list):
+        raise UserError(f"{key} must be a list of uint8 pictures [height, width, 3].")
+    if not 1 <= len(frames) <= most:
+        raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
+    for frame in frames:
+        _picture(key, frame)
+    shapes = {frame.shape for frame in frames}
+    if len(shapes) > 1:
+        raise UserError(f"All pictures of {key} need one size, got {sorted(shapes)[:3]}.")
+    return frames
+
+
+def _picture(key: str, picture: Any) -> np.ndarray:
+    if not isinstance(picture, np.ndarray):
+        raise UserError(f"{key} must be a uint8 picture [height, width, 3], got {type(picture).__name__}.")
+    if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[-1] != 3:
+        got = f"{picture.dtype} {list(picture.shape)}"
+        raise UserError(f"{key} must be a uint8 picture [height, width, 3], got {got}.")
+    if not all(SIDES[0] <= side <= SIDES[1] for side in picture.shape[:2]):
+        raise UserError(f"{key}: a picture's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(picture.shape[:2])}.")
+    if max(picture.shape[:2]) > 8 * min(picture.shape[:2]):
+        raise UserError(f"{key}: a picture of {list(picture.shape[:2])} is too narrow to be scaled into a square.")
+    return picture
+
+
+def _text(key: str, value: Any) -> str:
+    if isinstance(value, list | tuple) and value:
+        value = value[0]  # the benchmark gives a goal as a list of wordings
+    if not isinstance(value, str):
+        raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
+    if len(value) > MOST_GOAL:
+        raise UserError(f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
+    return str(value)

@@ -1,0 +1,145 @@
+"""One client: its episode, and what its requests do to it. Dropping the session frees all the client's memory."""
+
+import time
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.serving.codec import unpack
+from mme_vla.serving.engine import Engine
+from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset, parse
+from mme_vla.serving.settings import ServeSettings
+
+SMALL = 2**18  # bytes decoded on the event loop; larger messages are decoded in a thread
+
+
+class Session:
+    """The episode of one client.
+
+    Requests of a session must come one after the other; `answer` is not to be called twice at the same time.
+    """
+
+    def __init__(self, engine: Engine, settings: ServeSettings) -> None:
+        self._engine, self._settings = engine, settings
+        self._begin()
+
+    def _begin(self) -> None:
+        self.episode = self._engine.policy.start_episode("", seed=self._settings.seed)
+        self._exec_start = 0
+        self._seen_when_acting: int | None = None
+
+    async def answer(self, data: bytes) -> dict[str, Any]:
+        """Do what a packed request asks and return the answer, not yet packed.
+
+        Raises:
+            UserError: the request is malformed, or does not fit the episode.
+        """
+        begun = time.perf_counter()
+        request = self._read(data) if len(data) <= SMALL else await self._engine.decode(lambda: self._read(data))
+        if isinstance(request, Reset):
+            self._begin()
+            return {"reset_finished": True, "reset_time_ms": self._took("reset", begun)}
+        if isinstance(request, AddBuffer):
+            await self._add(request)
+            return {"add_buffer_finished": True, "add_buffer_time_ms": self._took("add_buffer", begun)}
+        actions = await self._infer(request)
+        return {"actions": actions, "infer_time_ms": self._took("infer", begun)}
+
+    def _read(self, data: bytes) -> Request:
+        return parse(unpack(data), self._settings.limits.frames)
+
+    def _took(self, kind: str, begun: float) -> float:
+        seconds = time.perf_counter() - begun
+        self._engine.stats.took(kind, seconds)
+        return seconds * 1e3
+
+    async def _add(self, request: AddBuffer) -> None:
+        if request.exec_start > 0:
+            self._exec_start = request.exec_start
+        self._check_room(len(request.front))
+        await self._engine.run(self._remember(request.front), self._pieces(request.front))
+
+    async def _infer(self, request: Infer) -> np.ndarray:
+        policy = self._engine.policy
+        if request.first:
+            self._begin()  # a client that repeats its first request means the same episode, not a longer one
+        elif request.first is not None and self.episode.frames_seen == 0:
+            raise UserError(
+                "is_first_step is false but this episode has no frame here: its first request must come first. Was the "
+                "server restarted, or the connection lost? Reset and begin the episode again."
+            )
+        if request.front is None and self.episode.frames_seen == 0 and policy.memory is not None:
+            raise UserError("This policy remembers past frames: send them with add_buffer, the current one included.")
+        if request.front is not None:
+            self._check_room(len(request.front))
+            if request.first:
+                self._exec_start = len(request.front) - 1
+        elif self._reads_past_actions and self._seen_when_acting == self.episode.frames_seen:
+            raise UserError(
+                "This policy reads which actions were executed, one a frame: send the frames since the last chunk with "
+                "add_buffer before the observation."
+            )
+        episode = self.episode
+        episode.goal, episode.subgoal = request.goal, self._subgoal(request)
+        await self._engine.run(self._observe(request), self._pieces(request.front or ()))
+        chunk = await self._engine.act(episode)
+        if not np.isfinite(chunk).all():
+            raise RuntimeError("the policy's answer is not finite")
+        self._seen_when_acting = episode.frames_seen
+        # A challenge client executes all it is given; an MME-VLA client cuts the chunk itself.
+        return chunk if request.front is None else chunk[: self._settings.execute]
+
+    def _observe(self, request: Infer) -> Iterator[None]:
+        if request.front is not None:
+            yield from self._remember(request.front)
+        self.episode.look(request.image, request.wrist_image, request.state)
+        _ = self.episode.prompt  # a goal that cannot be read fails here, and not in a batch with others
+
+    def _remember(self, front: Sequence[np.ndarray]) -> Iterator[None]:
+        """Take frames into memory, pausing after every `encode_chunk` frames that have to be encoded."""
+        episode, piece = self.episode, self._piece
+        for start in range(0, len(front), piece):
+            if start:
+                yield
+            frames = np.stack(front[start : start + piece])
+            demo = episode.frames_seen + np.arange(len(frames)) < self._exec_start
+            episode.remember(frames, demo)
+
+    @property
+    def _piece(self) -> int:
+        """Frames to a piece; of some memories most frames are never encoded."""
+        memory = self._engine.policy.memory
+        return self._settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
+
+    def _pieces(self, front: Sequence[np.ndarray]) -> int:
+        return max(1, -(-len(front) // self._piece))
+
+    def _check_room(self, count: int) -> None:
+        total, most = self.episode.frames_seen + count, self._settings.limits.frames
+        if total > most:
+            raise UserError(
+                f"An episode of {total} frames: this server remembers at most {most} (limits.frames). Reset between "
+                "episodes."
+            )
+
+    @property
+    def _reads_past_actions(self) -> bool:
+        return self._engine.policy.require_processor().prompt_format.past_actions > 0
+
+    def _subgoal(self, request: Infer) -> str | None:
+        """The subgoal this policy was trained to read, of those the request brings."""
+        kind = subgoal_kind(self._engine.policy)
+        if kind is not None:
+            return request.subgoals.get(kind)
+        given = list(request.subgoals.values())
+        return given[0] if len(given) == 1 else None
+
+
+def subgoal_kind(policy: Any) -> str | None:
+    """`simple_subgoal` or `grounded_subgoal`, as the policy was trained; None where it reads none."""
+    if not policy.require_processor().prompt_format.reads_subgoal:
+        return None
+    kind = (policy.config.get("subgoal_text") or {}).get("kind")
+    return None if kind is None else str(kind)

@@ -1,0 +1,90 @@
+"""What a server may be told, checked before it starts."""
+
+import ipaddress
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+from mme_vla.errors import UserError, did_you_mean
+
+ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one client may ask for, and for how long. Seconds, unless the name says otherwise."""
+
+    message_mib: float = 2048
+    frames: int = 4096
+    connections: int = 64
+    send_s: float = 60
+    receive_s: float = 120
+    idle_s: float = 3600
+    stop_s: float = 30
+
+    @property
+    def message_bytes(self) -> int:
+        return int(self.message_mib * 2**20)
+
+
+@dataclass(frozen=True)
+class ServeSettings:
+    """How to serve; the keys and their meaning are those of configs/serve.yaml.
+
+    Raises:
+        UserError: a value that cannot work, named with its key.
+    """
+
+    host: str = "127.0.0.1"
+    port: int = 8001
+    api_key: str | None = field(default=None, repr=False)
+    action_space: str = "joint_angle"
+    execute: int = 16
+    flow_steps: int = 10
+    seed: int = 42
+    max_batch: int = 16
+    encode_chunk: int = 32
+    log_every_s: float = 60
+    limits: Limits = Limits()
+
+    def __post_init__(self) -> None:
+        if self.action_space not in ACTION_SPACES:
+            raise UserError(f"action_space={self.action_space!r}. {did_you_mean(self.action_space, ACTION_SPACES)}")
+        if self.action_space != "joint_angle":
+            raise UserError(
+                f"action_space={self.action_space}: these policies answer with joint angles, 8 numbers a step. Ask the "
+                "client for joint_angle; no conversion to end-effector poses is offered."
+            )
+        key = self.api_key
+        if key is not None and not (
+            isinstance(key, str) and key.isascii() and key.isprintable() and key.strip() == key != ""
+        ):
+            raise UserError("api_key must be a text of plain ASCII without blanks around it; null asks for none.")
+        if not isinstance(self.port, int) or not 0 <= self.port < 65536:
+            raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
+        for name in ("execute", "flow_steps", "max_batch", "encode_chunk"):
+            _positive(name, getattr(self, name), whole=True)
+        _positive("log_every_s", self.log_every_s)
+        for spec in fields(self.limits):
+            whole = spec.name in ("frames", "connections")
+            _positive(f"limits.{spec.name}", getattr(self.limits, spec.name), whole)
+
+    @classmethod
+    def from_dict(cls, config: Mapping[str, Any]) -> Self:
+        """Build from a composed configuration; keys of other purposes are left aside."""
+        known = {spec.name for spec in fields(cls)} - {"limits"}
+        return cls(**{key: config[key] for key in known & set(config)}, limits=Limits(**config.get("limits", {})))
+
+    @property
+    def local_only(self) -> bool:
+        """Whether only programs on this machine can connect."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def _positive(name: str, value: Any, whole: bool = False) -> None:
+    kinds = int if whole else (int, float)
+    if isinstance(value, bool) or not isinstance(value, kinds) or not value > 0:
+        raise UserError(f"{name}={value!r} must be a positive {'whole ' if whole else ''}number.")

@@ -1,0 +1,20 @@
+"""One pretended episode before the first client, so that no client pays for what happens only once."""
+
+import numpy as np
+
+from mme_vla.policy import MMEPolicy
+from mme_vla.serving.settings import ServeSettings
+
+SIDE = 256  # pixels; what RoboMME's cameras give
+
+
+def warm_up(policy: MMEPolicy, settings: ServeSettings) -> None:
+    """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
+    frames = np.zeros((settings.encode_chunk, SIDE, SIDE, 3), np.uint8)
+    episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
+    for episode in episodes:
+        episode.subgoal = "warm up"
+        episode.remember(frames)
+        episode.look(frames[0], frames[0], np.zeros(8, np.float32))
+    policy.act(episodes[:1], settings.flow_steps)
+    policy.act(episodes, settings.flow_steps)

@@ -1,0 +1,70 @@
+"""Leaving a run early: Ctrl-C or a cluster's SIGTERM, answered by every process after the same update."""
+
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import distributed
+
+ANSWERED = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextmanager
+def stop_asked() -> Iterator[Callable[[], bool]]:
+    """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual.
+
+    Yields:
+        A function that says whether any process was asked. It is a collective: all processes call it after the same
+        update, so all get the same answer, though the signals reach them at different moments or only one of them.
+    """
+    event = threading.Event()
+    with _signals_set(event):
+        if not _several_processes():
+            yield event.is_set
+            return
+        # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
+        group = distributed.new_group(backend="gloo")
+
+        def anyone() -> bool:
+            flag = torch.tensor(int(event.is_set()))
+            distributed.all_reduce(flag, distributed.ReduceOp.MAX, group)
+            return bool(flag)
+
+        try:
+            yield anyone
+        finally:
+            distributed.destroy_process_group(group)
+
+
+def leave_signals_alone(worker: int) -> None:
+    """Signals go to every process of a group, data workers included: the training process alone answers them."""
+    for number in ANSWERED:
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _several_processes() -> bool:
+    return distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
+
+
+@contextmanager
+def _signals_set(event: threading.Event) -> Iterator[None]:
+    """Each signal sets the event, once; only a main thread may answer signals, in any other nothing changes."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in ANSWERED}
+
+    def ask(number: int, frame: Any) -> None:
+        event.set()
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, ask)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
