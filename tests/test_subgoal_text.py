@@ -128,10 +128,9 @@ def test_a_damaged_answer_is_named_so(answer):
 
 
 def test_memer_answers():
-    parsed, positions = parse_memer(
-        '```json\n{"current_subtask": "pick at <|box_start|>(500,250)<|box_end|>", "keyframe_positions": [9, 3, 3, 0]}```',
-        8,
-    )
+    box = "<|box_start|>(500,250)<|box_end|>"
+    answer = f'```json\n{{"current_subtask": "pick at {box}", "keyframe_positions": [9, 3, 3, 0]}}```'
+    parsed, positions = parse_memer(answer, 8)
     assert (parsed.text, parsed.points, positions) == ("pick at <128, 64>", ((128, 64),), [3])
     for answer in (
         "no",

@@ -108,9 +108,7 @@ class SubgoalEpisode:
             UserError: nothing was observed yet.
         """
         if self._frame is None:
-            raise UserError(
-                "The episode has seen no frame yet: call observe() with the current frame before predict()."
-            )
+            raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
         return self._frame
 
 
@@ -135,7 +133,7 @@ class SubgoalPredictor:
         """Begin an episode.
 
         Args:
-            goal: the task in words. video: [t, H, W, 3] uint8, the conditioning video without the first execution frame.
+            goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first execution frame.
             task: its name (`ButtonUnmask`), for rules that hold for some tasks.
         """
         return SubgoalEpisode(goal, video, task)
@@ -169,7 +167,7 @@ class SubgoalPredictor:
         log.warning("Subgoal answer unusable (%s) at step %d, the last one is kept: %s", problem, episode.step, reason)
         return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=answer, problem=problem)
 
-    def close(self) -> None:  # noqa: B027  (most have nothing to give back)
+    def close(self) -> None:
         """Give back what the predictor holds."""
 
 

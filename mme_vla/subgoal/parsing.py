@@ -1,8 +1,8 @@
 """From a language model's answer to a subgoal: points, JSON, coordinates.
 
-Models write points in thousandths of the picture's sides, `(row, column)` from 0 to 1000; the policy reads pixels of the
-256×256 front picture, `<row, column>`. What cannot be read raises `MalformedAnswer`, which the predictors count and
-survive.
+Models write points in thousandths of the picture's sides, `(row, column)` from 0 to 1000; the policy reads pixels of
+the 256×256 front picture, `<row, column>`. What cannot be read raises `MalformedAnswer`, which the predictors count
+and survive.
 """
 
 import json

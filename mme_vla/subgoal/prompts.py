@@ -82,7 +82,7 @@ def memer_answer(subtask: str, positions: Sequence[int]) -> str:
 
 
 def split_media(text: str) -> list[str]:
-    """Cut a text at its `<image>` and `<video>` marks, which stay as entries of their own; empty pieces are left out."""
+    """Cut a text at its `<image>` and `<video>` marks, which stay as entries; empty pieces are left out."""
     return [piece for piece in re.split(f"({IMAGE}|{VIDEO})", text) if piece]
 
 
