@@ -2,9 +2,9 @@
 
 `python -m mme_vla.subgoal.build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
 
-Writes one JSON-lines file for each set (`simple.jsonl`, `grounded.jsonl`, `memer.jsonl`) in the layout of ms-swift, with
-the pictures and videos beside it; paths in the rows are relative to the output folder. An interrupted run goes on with
-the episodes that are missing, and the same input always gives the same files.
+Writes one JSON-lines file for each set (`simple.jsonl`, `grounded.jsonl`, `memer.jsonl`) in the layout of ms-swift,
+with the pictures and videos beside it; paths in the rows are relative to the output folder. An interrupted run goes on
+with the episodes that are missing, and the same input always gives the same files.
 """
 
 import json

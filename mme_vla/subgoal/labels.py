@@ -147,7 +147,8 @@ def windows(labels: Labels, wanted: Sequence[int], one_a_window: bool = False) -
     """
     looked_at = range(labels.exec_start, labels.length, FRAME_STEP)
     rows: list[Window] = []
-    waiting, past, frames, found = list(wanted), [], [], []
+    waiting, past = list(wanted), list[int]()
+    frames, found = list[int](), list[int]()
     for i, t in enumerate(looked_at):
         frames.append(t)
         if waiting and abs(t - waiting[0]) <= 1 and not (one_a_window and found):

@@ -12,7 +12,8 @@ from mme_vla.subgoal.parsing import points_of
 class Oracle(SubgoalPredictor):
     """Reads `<kind>_subgoal_online` from the environment's report.
 
-    An episode that is over reports no further subgoal (`complete`); the last one then stays, as in training.
+    An episode that is over, or between two sub-tasks, reports none (`complete`, `no record`): the last one then
+    stays, as in training.
     """
 
     def answer(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
@@ -32,6 +33,6 @@ class Oracle(SubgoalPredictor):
                 f"{sorted(map(str, episode.info)) or 'nothing'}."
             )
         text = text.strip().lower()
-        if text in ("", "complete"):
+        if text in ("", "complete", "no record"):
             return Subgoal(episode.subgoal.text, episode.subgoal.points)
         return Subgoal(text, points_of(text))

@@ -68,7 +68,8 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
     video = f"{stem}_video.mp4" if labels.exec_start else None
     # Bytes of the names, so that the noise of an episode does not depend on which others are built.
     rng = np.random.default_rng([options.seed, *f"{name}/{labels.task}".encode(), labels.number])
-    rows, images = [], {}
+    rows: list[Row] = []
+    images: dict[str, int] = {}
     for messages, points, frames in build(kind, labels, options):
         names = [f"{stem}_step{t}.png" for t in frames]
         images.update(zip(names, frames, strict=True))
