@@ -14,7 +14,7 @@ from mme_vla.errors import UserError
 from mme_vla.subgoal import build as module
 from mme_vla.subgoal.build import build, open_input
 from mme_vla.subgoal.labels import Labels, keyframes, resting_frames, selected_steps, transitions, windows
-from mme_vla.subgoal.media import read_image, read_video, sample_video
+from mme_vla.subgoal.media import Clip, read_image, sample_video
 from mme_vla.subgoal.rows import RowOptions, episode_rows
 from mme_vla.subgoal.swift import command, write_arguments
 
@@ -100,7 +100,7 @@ def test_every_picture_and_video_a_row_names_is_there(built, h5):
     episode, about = labels["VideoRepick_ep0"]
     stored = read_image(built / "qwenvl/images/VideoRepick_ep0_step56.png")
     assert np.array_equal(stored, next(episode.pictures([56])))
-    assert len(read_video(built / "memer/images/VideoRepick_ep0_video.mp4")) == about.exec_start == 37
+    assert Clip.read(built / "memer/images/VideoRepick_ep0_video.mp4").length == about.exec_start == 37
 
 
 def test_a_lerobot_dataset_gives_the_same_rows(h5, golden, tmp_path):

@@ -8,6 +8,7 @@ import pytest
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal import Memer, Oracle, QwenVL, build_predictor
+from mme_vla.subgoal.media import Clip
 from mme_vla.subgoal.tiny import save_tiny
 from mme_vla.subgoal.vlm import VLM, Answer, Question
 
@@ -79,7 +80,7 @@ def test_questions_carry_goal_history_points_picture_and_video():
     assert predictor.predict([episode])[0].text == "put it down"
     first, second = (batch[0] for batch in vlm.batches)
     assert "The task goal is: sort the cubes\nThis is the initial turn" in first.user
-    assert len(first.videos[0]) == 40 and (first.images[0] == 0).all() and (second.images[0] == 16).all()
+    assert first.videos[0].length == 40 and (first.images[0] == 0).all() and (second.images[0] == 16).all()
     assert "are: 1. pick at <|box_start|>(387,703)<|box_end|>\n<image>" in second.user
     assert "grounded language subgoals" in second.system
 
@@ -171,14 +172,16 @@ def test_an_episode_without_a_frame_is_refused():
 
 
 def test_a_tiny_model_reads_conversations_as_qwen_writes_them(tiny):
-    question = Question("be brief", "<video>go\n<image>at <|box_start|>(1,2)<|box_end|>", [frames(1)[0]], [frames(66)])
+    question = Question(
+        "be brief", "<video>go\n<image>at <|box_start|>(1,2)<|box_end|>", [frames(1)[0]], [Clip.of(frames(66))]
+    )
     batch = tiny.encode([question])
     text = tiny.processor.tokenizer.decode(batch["input_ids"][0])
     assert text.startswith("<|im_start|>system\nbe brief<|im_end|>\n<|im_start|>user\n<")
     assert text.endswith("at <|box_start|>(1,2)<|box_end|><|im_end|>\n<|im_start|>assistant\n")
     assert text.count("<|image_pad|>") == 64, "256×256 pixels, 32 a token"
     assert text.count("<|video_pad|>") == 2 * 64 and text.count(" seconds>") == 2, "four frames, two by two"
-    long = tiny.encode([Question("s", "<video>", videos=[frames(600)])])
+    long = tiny.encode([Question("s", "<video>", videos=[Clip.of(frames(600))])])
     assert tiny.processor.tokenizer.decode(long["input_ids"][0]).count("<|video_pad|>") == 5 * 64
     large = tiny.encode([Question("s", "<image>", [frames(1, size=1024)[0]])])
     assert tiny.processor.tokenizer.decode(large["input_ids"][0]).count("<|image_pad|>") <= 256

@@ -2,12 +2,15 @@
 
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
 from mme_vla.errors import UserError
 
+VIDEO_FRAMES = 10  # that a model looks at, at most
 FPS = 30  # of the videos predictors are shown; the simulator's steps simply play faster
 
 
@@ -53,28 +56,54 @@ def read_image(path: Path) -> np.ndarray:
 
     try:
         with Image.open(path) as image:
-            return np.asarray(image.convert("RGB"))
+            return np.array(image.convert("RGB"))
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error}). Build the training data again.") from None
 
 
-def read_video(path: Path) -> np.ndarray:
-    """Read all frames of a video, [t, H, W, 3] uint8.
+@dataclass(frozen=True)
+class Clip:
+    """What a Qwen model looks at of a video.
 
-    Raises:
-        UserError: it is missing or damaged.
+    frames: [n, H, W, 3] uint8. indices: [n] their places in the video. length: of the whole video, in frames.
     """
-    import av
 
-    try:
-        with av.open(str(path)) as container:
-            frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    except (OSError, ValueError) as error:  # PyAV's errors derive from these
-        raise UserError(f"{path} cannot be read ({error}). Build the training data again.") from None
-    return np.stack(frames)
+    frames: np.ndarray
+    indices: np.ndarray
+    length: int
+
+    @classmethod
+    def of(cls, video: np.ndarray) -> Self:
+        """Sample a video [t, H, W, 3] uint8."""
+        indices = sample_video(len(video))
+        return cls(np.ascontiguousarray(video[indices]), indices, len(video))
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Sample a file; frames that are not looked at are decoded but not turned into pictures.
+
+        Raises:
+            UserError: it is missing or damaged.
+        """
+        import av
+
+        try:
+            with av.open(str(path)) as container:
+                length = container.streams.video[0].frames
+                indices = sample_video(length)
+                wanted = set(indices.tolist())
+                decoded = enumerate(container.decode(video=0))
+                frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in wanted]
+        except (OSError, ValueError) as error:  # PyAV's errors derive from these
+            raise UserError(f"{path} cannot be read ({error}). Build the training data again.") from None
+        if len(frames) != len(indices):
+            raise UserError(f"{path} is damaged: it announces {length} frames. Build the training data again.")
+        return cls(np.stack(frames), indices, length)
 
 
-def sample_video(length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = 10) -> np.ndarray:
+def sample_video(
+    length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = VIDEO_FRAMES
+) -> np.ndarray:
     """Which frames of a video a Qwen model looks at: `rate` a second, within bounds, an even number of them.
 
     Args:

@@ -8,6 +8,7 @@ import numpy as np
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
 from mme_vla.subgoal.history import merge_keyframes, recent_frames
+from mme_vla.subgoal.media import Clip
 from mme_vla.subgoal.parsing import MalformedAnswer, parse_memer
 from mme_vla.subgoal.prompts import memer_system, memer_user
 from mme_vla.subgoal.qwenvl import VLMPredictor
@@ -78,7 +79,7 @@ class Memer(VLMPredictor):
         video = len(episode.video) > 0
         user = memer_user(episode.goal, len(episode.keyframes), len(recent), video)
         pictures = [*episode.keyframes.values(), *recent.values()]
-        return Question(memer_system(), user, pictures, [episode.video] if video else [])
+        return Question(memer_system(), user, pictures, [Clip.of(episode.video)] if video else [])
 
     def answer(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
         """Ask for all of them in one batch."""

@@ -9,6 +9,7 @@ import numpy as np
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
 from mme_vla.subgoal.history import SubgoalHistory, hold_until
+from mme_vla.subgoal.media import Clip
 from mme_vla.subgoal.parsing import MalformedAnswer, parse_subgoal, write_boxes
 from mme_vla.subgoal.prompts import subgoal_system, subgoal_user
 from mme_vla.subgoal.vlm import VLM, Answer, Question
@@ -88,7 +89,7 @@ class QwenVL(VLMPredictor):
             subgoal_system(self.kind),
             write_boxes(user, episode.history.points),
             [episode.frame],
-            [episode.video] if video else [],
+            [Clip.of(episode.video)] if video else [],
         )
 
     def answer(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from mme_vla.errors import UserError
-from mme_vla.subgoal.media import FPS, sample_video
+from mme_vla.subgoal.media import FPS, VIDEO_FRAMES, Clip
 from mme_vla.subgoal.prompts import IMAGE, VIDEO, split_media
 from mme_vla.subgoal.tiny import make_tiny
 
-IMAGE_TOKENS, VIDEO_TOKENS, VIDEO_FRAMES = 256, 64, 10  # at most: a picture; a video frame; frames of a video
+IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: a picture; a video frame
 TOKEN_SIDE = 32  # pixels of a token: patches of 16, merged 2×2
 TINY = "tiny"
 
@@ -23,14 +23,14 @@ class Question:
     """One question.
 
     system, user: texts; `<image>` and `<video>` in the user's mark where pictures go.
-    images: [H, W, 3] uint8 each. videos: [t, H, W, 3] uint8 each, all frames, at 30 a second.
+    images: [H, W, 3] uint8 each. videos: what is looked at of each.
     answer: what the model is to learn to say; None where it is asked.
     """
 
     system: str
     user: str
     images: list[np.ndarray] = field(default_factory=list)
-    videos: list[np.ndarray] = field(default_factory=list)
+    videos: list[Clip] = field(default_factory=list)
     answer: str | None = None
 
     def messages(self) -> list[dict[str, Any]]:
@@ -104,13 +104,17 @@ class VLM:
         ]
         images = [image for q in questions for image in q.images]
         videos = [video for q in questions for video in q.videos]
-        looked_at = [sample_video(len(video), most=VIDEO_FRAMES) for video in videos]
         given: dict[str, Any] = {"images": images} if images else {}
         if videos:
-            given["videos"] = [np.ascontiguousarray(v[i]) for v, i in zip(videos, looked_at, strict=True)]
+            given["videos"] = [video.frames for video in videos]
             given["video_metadata"] = [
-                {"total_num_frames": len(v), "fps": FPS, "frames_indices": i.tolist(), "duration": len(v) / FPS}
-                for v, i in zip(videos, looked_at, strict=True)
+                {
+                    "total_num_frames": video.length,
+                    "fps": FPS,
+                    "frames_indices": video.indices.tolist(),
+                    "duration": video.length / FPS,
+                }
+                for video in videos
             ]
             given["do_sample_frames"] = False
         return self.processor(text=texts, padding=True, padding_side=side, return_tensors="pt", **given)
