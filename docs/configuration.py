@@ -12,6 +12,8 @@ COMMANDS = {
     "convert": "python -m mme_vla.data.convert",
     "cache": "python -m mme_vla.data.cache",
     "inspect": "python -m mme_vla.inspect",
+    "subgoal_build": "python -m mme_vla.subgoal.build",
+    "subgoal_train": "python -m mme_vla.subgoal.train",
 }
 INTRODUCTION = """# Configuration
 
