@@ -7,6 +7,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from conftest import REPOSITORY
 
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
@@ -214,4 +215,5 @@ def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
     recipe = [found[key] for key in ("lora_rank", "lora_alpha", "learning_rate", "warmup_ratio")]
     assert recipe == [16, 32, 1e-4, 0.05]
     assert found["per_device_train_batch_size"] * found["gradient_accumulation_steps"] * 4 == 64
-    assert "FPS_MAX_FRAMES=10" in command("simple") and command("simple").endswith("swift sft swift_simple.json")
+    page = (REPOSITORY / "docs" / "subgoals.md").read_text().replace(" \\\n ", "")
+    assert command("grounded") in page and command("grounded").endswith("swift sft swift_grounded.json")

@@ -4,10 +4,16 @@ import json
 from pathlib import Path
 
 MODEL = "Qwen/Qwen3-VL-4B-Instruct"
-ENVIRONMENT = {"IMAGE_MAX_TOKEN_NUM": "256", "VIDEO_MAX_TOKEN_NUM": "64", "FPS_MAX_FRAMES": "10", "NPROC_PER_NODE": "4"}
+ENVIRONMENT = {
+    "IMAGE_MAX_TOKEN_NUM": "256",
+    "VIDEO_MAX_TOKEN_NUM": "64",
+    "FPS_MAX_FRAMES": "10",
+    "QWENVL_BBOX_FORMAT": "legacy",  # points between <|box_start|> and <|box_end|>
+    "NPROC_PER_NODE": "4",
+}
 _ARGUMENTS = {
     "model": MODEL,
-    "train_type": "lora",
+    "train_type": "lora",  # of ms-swift 3.9 and later 3.x; version 4 calls it tuner_type
     "lora_rank": 16,
     "lora_alpha": 32,
     "target_modules": ["all-linear"],
