@@ -111,7 +111,7 @@ class GripperPrimitives(RobotControl):
 
     def _grasp_pose(self, thing: Thing, depth: float) -> sapien.Pose:
         closing = self.env.tcp_pose.to_transformation_matrix()[:3, 1]
-        return sapien.Pose(thing.position + [0, 0, depth], grasp_orientation(thing, closing))
+        return sapien.Pose(thing.position + np.array([0, 0, depth]), grasp_orientation(thing, closing))
 
     @staticmethod
     def _over(target: Thing, z: float, q: np.ndarray | Sequence[float]) -> sapien.Pose:

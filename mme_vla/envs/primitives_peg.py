@@ -17,7 +17,7 @@ HOOK_BACK, HOOK_ASIDE, HOOK_STOP = 0.1, 0.1, 0.03
 """Where a hook begins behind and beside the cube, and how far before the goal it ends, metres."""
 ABOVE_PEG = 0.2
 INSERT_FAR, INSERT_NEAR, INSERT_PAST, INSERT_RAISED = 0.2, 0.15, 0.05, 0.15
-"""Stations of an insertion along the hole, seen from where the end is in the middle of the box, and the first's height."""
+"""Stations of an insertion, along the hole from where the end is in the box's middle, and the first one's height."""
 
 
 class PegPrimitives(RobotControl):

@@ -7,7 +7,7 @@ from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.containers import add_hidden_cubes
 from mme_vla.envs.draws import Draws
 from mme_vla.envs.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide
-from mme_vla.envs.objects import H, Container, build_container
+from mme_vla.envs.objects import Container, H, build_container
 from mme_vla.envs.placement import Avoid, Region, SceneError, draw_container
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
