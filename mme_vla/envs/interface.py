@@ -111,15 +111,19 @@ class RoboMMEEnv(gymnasium.Env):
 
         Args:
             seed: without effect on the scene, which the environment's own seed fixes.
-            options: none are known.
+            options: `{"video": False}` leaves the conditioning video out, for measuring and debugging: its sub-tasks
+                then remain to be done.
 
         Returns:
             Observation lists (conditioning video, then the present frame) and the info of the present frame.
 
         Raises:
-            UserError: the environment is closed.
+            UserError: the environment is closed, or an option is not known.
         """
         task = self._open_task()
+        options = {"video": True} | (options or {})
+        if len(options) > 1:
+            raise UserError(f"Unknown reset options {sorted(options.keys() - {'video'})}; there is only 'video'.")
         super().reset(seed=seed)
         # Leftovers of an episode, in the solver and in what the script added, go only with the scene.
         self._muted = True
@@ -131,7 +135,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._grounding.clear()
         self._observer.start()
         for subtask in task.progress.subtasks:
-            if subtask.video:
+            if subtask.video and options["video"]:
                 self._demonstrate(subtask)
         run.in_video = False
         self._step_control(task.start_action)

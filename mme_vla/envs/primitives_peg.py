@@ -87,18 +87,21 @@ class PegPrimitives(RobotControl):
         """
         head_first = (held if isinstance(held, str) else held.name) in ("tail", peg.tail.name)
         free = peg.head if head_first else peg.tail
-        grip = free.pose.inv() * self.env.tcp_pose
-        # Unturned, a peg that goes in head first comes from the hole's negative end, which is on the right.
-        hole = box.pose if head_first == (side > 0) else sapien.Pose(box.pose.p, turned(box.pose.q, "z", np.pi))
-        inserted = hole * grip
         outward = -1 if head_first else 1
+        other_way = head_first != (side > 0)
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
-            return inserted * sapien.Pose([outward * along, 0, -raised])
+            grip = free.pose.inv() * self.env.tcp_pose
+            inserted = box.pose * grip
+            if other_way:
+                inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
+                if head_first and along < 0:
+                    along += grip.p[0]
+            return inserted * sapien.Pose([along, 0, -raised])
 
-        self.move_to(station(INSERT_FAR, INSERT_RAISED), CLOSE)
-        self.move_to(station(INSERT_FAR), CLOSE)
-        self.move_to(station(INSERT_NEAR))
+        self.move_to(station(outward * INSERT_FAR, INSERT_RAISED), CLOSE)
+        self.move_to(station(outward * INSERT_FAR), CLOSE)
+        self.move_to(station(outward * INSERT_NEAR))
         self.move_to(station(-INSERT_PAST), CLOSE, until)
 
 
