@@ -13,13 +13,12 @@ from mme_vla.envs.draws import Draws
 from mme_vla.envs.placement import Region
 from mme_vla.envs.tasks.swing_xtimes import SwingXtimes
 
-SCENE = 3601
 LOW = 0.11
 
 
 @pytest.fixture(scope="module")
 def swing() -> Iterator[SwingXtimes]:
-    env = make(SwingXtimes, SCENE, "medium")
+    env = make(SwingXtimes, 3601, "medium")
     yield env
     env.close()
 
@@ -136,16 +135,15 @@ def test_texts(swing):
     assert [option.needs_point for option in swing.choices()] == [True, True, False, False]
 
 
-@pytest.mark.parametrize("repetitions", [1, 2])
-def test_goals(swing, monkeypatch, repetitions):
+@pytest.mark.parametrize(
+    ("repetitions", "middle"),
+    [(1, "put it down on the left-side target"),
+     (2, "move it to the top of the left-side target, repeating this back-and-forth motion two times")],
+)  # fmt: skip
+def test_goals(swing, monkeypatch, repetitions, middle):
     monkeypatch.setattr(swing, "repetitions", repetitions)
-    start = f"pick up the {swing.cube.colour} cube, move it to the top of the right-side target, then "
-    assert swing.goals() == [
-        start + "put it down on the left-side target, finally press the button to stop"
-        if repetitions == 1
-        else start + "move it to the top of the left-side target, repeating this back-and-forth motion two times, "
-        "finally press the button to stop"
-    ]
+    start = f"pick up the {swing.cube.colour} cube, move it to the top of the right-side target, then"
+    assert swing.goals() == [f"{start} {middle}, finally press the button to stop"]
 
 
 def test_a_demonstration_takes_as_long_as_the_official_one():

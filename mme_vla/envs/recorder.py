@@ -119,7 +119,7 @@ class Recorder:
         progress = self._task.progress
         # The text was set before the evaluation moved the pointer: it follows one step later.
         shown, self._shown = self._shown, progress.shown
-        planned = progress.subtasks[min(progress.planned, len(progress.subtasks) - 1)]
+        planned = progress.demonstrated
         if planned.video != self._in_video:
             if self._in_video is not None:
                 self._waypoint = None

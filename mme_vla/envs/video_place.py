@@ -75,13 +75,19 @@ class VideoPlace(MemoryTask):
 
     def start_episode(self, draws: Draws) -> None:
         self._swap: Swap | None = None
+        self._swap_due = False
 
     def before_physics(self, k: int) -> None:
-        if self._swapped and self._swap is None and self.progress.current is self._swap_stage:
+        if self._swap_due and self._swap is None:
             first, second = self._swapped
             self._swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
         if self._swap is not None:
             self._swap.apply(k)
+
+    def failure(self) -> bool:
+        """Notes whether the swap may begin, one step after its stage is entered; the rules belong to the stages."""
+        self._swap_due = bool(self._swapped) and self.progress.current is self._swap_stage
+        return False
 
     def subtasks(self) -> list[SubTask]:
         self._swap_stage = SubTask(

@@ -90,11 +90,12 @@ class BinFill(MemoryTask):
 
     def _put(self) -> bool:
         """Whether a cube has just been put into the bin; it leaves the scene and is counted."""
-        for cube in self.all_cubes():
-            if self._falls_into_bin(cube):
-                self.filled[cube.colour] += 1
-                cube.move_to(IN_BIN)
-                return True
+        for colour, cubes in self.cubes.items():
+            for cube in cubes:
+                if self._falls_into_bin(cube):
+                    self.filled[colour] += 1
+                    cube.move_to(IN_BIN)
+                    return True
         return False
 
     def failure(self) -> bool:
