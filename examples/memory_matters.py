@@ -7,10 +7,10 @@ In the video a square of one of four colours passes over the scene; when executi
 action depends on its colour alone. The current view, the goal and the state say nothing, so a policy without memory can
 only guess. Prints the open-loop error of each policy on episodes it has not seen, and draws it.
 
-The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; recurrent memories read every 4th
-frame and pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and every slot
-alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot takes in, and
-what all slots have in common is learned late.
+The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp look at every 4th
+frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and
+every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
+takes in, and what all slots have in common is learned late.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from mme_vla import build_policy
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy import MMEPolicy
-from mme_vla.testing import NEURAL, RECURRENT, cached_history
+from mme_vla.testing import NEURAL, cached_history
 from mme_vla.types import Batch
 
 COLOURS = np.array([[220, 40, 40], [40, 200, 60], [50, 70, 230], [230, 210, 40]], np.uint8)
@@ -38,8 +38,12 @@ ANSWERS = np.array([[1, 1, 1, 1, -1, -1, -1, -1], [1, -1, 1, -1, 1, -1, 1, -1],
 SIZE, SQUARE = 64, 40  # pixels
 VIDEO, LENGTH = 8, 12  # frames of conditioning video, and of the whole episode
 MEMORY = {"budget": 64, "grid": 4}
-RECURRENCE = {"stride": 4, "chunk": 1}
-RMT = {"budget": 16, "attention_dtype": "float32"}
+OF_KIND: dict[str, dict[str, Any]] = {
+    "framesamp": {},
+    "tokendrop": {"stride": 4},
+    "ttt": {"stride": 4, "chunk": 1},
+    "rmt": {"stride": 4, "chunk": 1, "budget": 16, "attention_dtype": "float32"},
+}
 
 
 @dataclass
@@ -53,9 +57,7 @@ class Stream:
 
 def memory_options(model: str) -> dict[str, Any]:
     """What this demonstration changes in the shipped memory of a model."""
-    if model not in NEURAL:
-        return {}
-    return MEMORY | (RECURRENCE if model in RECURRENT else {}) | (RMT if model.startswith("rmt") else {})
+    return MEMORY | OF_KIND[model.split("_")[0]] if model in NEURAL else {}
 
 
 def make_stream(rng: np.random.Generator) -> Stream:
