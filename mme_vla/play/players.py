@@ -116,6 +116,8 @@ class OraclePlayer(Player):
         subtask = task.progress.current
         if subtask is None:
             _stuck("every sub-task is done, but the episode has not ended")
+        if subtask.video:
+            _stuck(f"the conditioning video did not succeed ({subtask.text!r}), so the task cannot be done")
         choices = {choice.label: choice for choice in task.choices()}
         choice = choices.get(subtask.choice)
         if choice is None:
