@@ -140,9 +140,8 @@ def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_pa
 
 
 def test_an_address_that_cannot_be_had_is_refused():
-    with listen("127.0.0.1", 0) as taken:
-        with pytest.raises(UserError, match="Cannot listen"):
-            listen("127.0.0.1", taken.getsockname()[1])
+    with listen("127.0.0.1", 0) as taken, pytest.raises(UserError, match="Cannot listen"):
+        listen("127.0.0.1", taken.getsockname()[1])
     with pytest.raises(UserError, match="port=99999"):
         listen("127.0.0.1", 99999)
 
