@@ -2,10 +2,16 @@
 
 import http.client
 import json
+import os
+import signal
 import struct
+import subprocess
+import sys
 import threading
 import time
+import urllib.request
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 from browser import Browser
@@ -144,6 +150,33 @@ def test_an_address_that_cannot_be_had_is_refused():
         listen("127.0.0.1", taken.getsockname()[1])
     with pytest.raises(UserError, match="port=99999"):
         listen("127.0.0.1", 99999)
+
+
+def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
+    script = (
+        "import logging; from test_play_page import *; from mme_vla.play.web import serve\n"
+        "logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+        "session = a_session()\n"
+        "who = Identity('human', 'anna', 0, 1300, {})\n"
+        f"run = PlayRun(Path({str(tmp_path)!r}), [an_episode()], who, lambda _: session)\n"
+        "serve(Desk(run, 'anna'), '127.0.0.1', 0)\n"
+        "print('freed', session.env.closed)"
+    )
+    here = Path(__file__).parent
+    paths = os.pathsep.join([str(here), str(here.parent), *sys.path])
+    process = subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": paths},
+    )  # fmt: skip
+    lines = iter(process.stderr.readline, "")
+    address = next(line for line in lines if "open http" in line).split()[1]
+    end = time.monotonic() + 30
+    while json.load(urllib.request.urlopen(f"{address}/state"))["phase"] != "choosing":
+        assert time.monotonic() < end
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=30)
+    assert (process.returncode, output) == (0, "freed True\n"), errors
+    assert "Traceback" not in errors
 
 
 def test_an_episode_that_cannot_be_set_up_is_said_and_can_be_tried_again(tmp_path):

@@ -6,7 +6,7 @@ import json
 import logging
 import socket
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
 from typing import Any
 
@@ -189,7 +189,7 @@ def make_server(desk: Desk, local: bool = True) -> Any:
 
 
 def serve(desk: Desk, host: str, port: int) -> None:
-    """Serve the page until told to stop.
+    """Serve the page until Ctrl-C.
 
     Raises:
         UserError: as `listen` and `make_server`.
@@ -200,4 +200,5 @@ def serve(desk: Desk, host: str, port: int) -> None:
         if not is_local(host):
             log.warning("host=%s: whoever reaches this port can play", host)
         log.info("open http://%s:%d in a browser; Ctrl-C ends", shown, bound.getsockname()[1])
-        server.run(sockets=[bound])
+        with suppress(KeyboardInterrupt):  # uvicorn raises it again when all is closed
+            server.run(sockets=[bound])

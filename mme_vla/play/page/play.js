@@ -202,10 +202,8 @@ function showOutcome() {
   }
   $("next").hidden = phase === "finished";
   const key = `${state.session} ${phase}`;
-  if (focused !== key) {
-    focused = key;
-    $("outcome-title").focus();
-  }
+  if (focused !== key) $("outcome-title").focus();
+  focused = key;
 }
 
 function complain(text, lost = false) {
@@ -232,10 +230,7 @@ function select(option) {
   render();
 }
 
-function deselect() {
-  chosen = point = null;
-  render();
-}
+const deselect = () => { chosen = point = null; render(); };
 
 function showPresent() {
   film.pause();
@@ -261,10 +256,7 @@ function replay() {
 
 $("picture").addEventListener("click", (event) => {
   if (!ready() || !chosen?.needs_point) return;
-  if (film.at !== film.last) {
-    showPresent(); // what was clicked is not what is there now
-    return;
-  }
+  if (film.at !== film.last) return showPresent(); // what was clicked is not what is there now
   const box = $("picture").getBoundingClientRect();
   setPoint(((event.clientY - box.top) / box.height) * SIDE, ((event.clientX - box.left) / box.width) * SIDE);
 });
