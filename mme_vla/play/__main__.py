@@ -29,6 +29,7 @@ def main(cfg: DictConfig) -> None:
     """
     from mme_vla.envs.make import ENVS
     from mme_vla.play import build_player
+    from mme_vla.play.web import require_page
 
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     _log_to_terminal()
@@ -44,6 +45,8 @@ def main(cfg: DictConfig) -> None:
     settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
     human = player["name"] == HUMAN
     built = None if human else build_player(player)
+    if human:
+        require_page()
     looks = built is None or built.looks
     if config["env"] == "mme_vla":
         _check_simulator(looks)

@@ -8,6 +8,7 @@ import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
+from importlib.util import find_spec
 from typing import Any
 
 from mme_vla.errors import UserError
@@ -26,6 +27,16 @@ HEADERS = (
 )  # fmt: skip
 
 
+def require_page() -> None:
+    """Refuse to go on without the packages the page needs.
+
+    Raises:
+        UserError: the extra `play` is not installed.
+    """
+    if find_spec("starlette") is None or find_spec("uvicorn") is None:
+        raise UserError("The page needs the extra `play`: pip install 'mme-vla[play]'.")
+
+
 def make_app(desk: Desk, local: bool = True) -> Any:
     """The ASGI application; the desk begins when it starts.
 
@@ -36,13 +47,11 @@ def make_app(desk: Desk, local: bool = True) -> Any:
     Raises:
         UserError: the extra `play` is not installed.
     """
-    try:
-        from starlette.applications import Starlette
-        from starlette.requests import Request
-        from starlette.responses import JSONResponse, Response
-        from starlette.routing import Route
-    except ImportError:
-        raise UserError("The page needs the extra `play`: pip install 'mme-vla[play]'.") from None
+    require_page()
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
 
     def refuse(status: int, reason: str) -> Response:
         return JSONResponse({"error": reason}, status)
@@ -180,10 +189,8 @@ def make_server(desk: Desk, local: bool = True) -> Any:
         UserError: the extra `play` is not installed.
     """
     app = make_app(desk, local)
-    try:
-        import uvicorn
-    except ImportError:
-        raise UserError("The page needs the extra `play`: pip install 'mme-vla[play]'.") from None
+    import uvicorn
+
     return uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False, ws="none", lifespan="on",
                                          timeout_graceful_shutdown=5))  # fmt: skip
 
