@@ -15,6 +15,7 @@ COMMANDS = {
     "serve": "python -m mme_vla.serve",
     "record": "python -m mme_vla.envs.record",
     "show": "python -m mme_vla.envs.show",
+    "play": "python -m mme_vla.play",
     "subgoal_build": "python -m mme_vla.subgoal.build",
     "subgoal_train": "python -m mme_vla.subgoal.train",
 }
