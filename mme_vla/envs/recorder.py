@@ -1,4 +1,4 @@
-"""One demonstration as data: every stored step of an episode with observation, action and texts, as the official files."""
+"""One demonstration as data: every stored step of an episode, with the fields of the official files."""
 
 import json
 from collections.abc import Callable
