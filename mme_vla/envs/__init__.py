@@ -1,0 +1,48 @@
+"""The 16 RoboMME tasks as environments, with their demonstrations. Importing this does not import the simulator."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mme_vla.envs.interface import RoboMMEEnv
+    from mme_vla.envs.make import make_env
+    from mme_vla.envs.metadata import EpisodeSpec, episode, episodes
+    from mme_vla.envs.names import TASK_NAMES
+    from mme_vla.envs.vector import VecEnv, make_vec_env
+    from mme_vla.envs.vector_jobs import Job, Reply
+
+__all__ = [
+    "TASK_NAMES",
+    "EpisodeSpec",
+    "Job",
+    "Reply",
+    "RoboMMEEnv",
+    "VecEnv",
+    "episode",
+    "episodes",
+    "make_env",
+    "make_vec_env",
+]
+
+_HOMES = {
+    "EpisodeSpec": "metadata",
+    "Job": "vector_jobs",
+    "Reply": "vector_jobs",
+    "RoboMMEEnv": "interface",
+    "TASK_NAMES": "names",
+    "VecEnv": "vector",
+    "episode": "metadata",
+    "episodes": "metadata",
+    "make_env": "make",
+    "make_vec_env": "vector",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

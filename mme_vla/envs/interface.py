@@ -1,0 +1,282 @@
+"""The environment a policy meets: official observation lists, info keys and statuses around one simulated task.
+
+`reset` runs the conditioning video and returns all of its frames followed by the present one; `step` returns one frame,
+or all frames of the motion in the action spaces that plan. Images appear only when the environment renders.
+"""
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+import torch
+
+from mme_vla.envs.demonstrator import Demonstrator
+from mme_vla.envs.grounding import Grounding
+from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
+from mme_vla.envs.robot_control import PlanningError
+from mme_vla.envs.spaces import Control, UnreachableError, action_space
+from mme_vla.envs.subtasks import NO_RECORD
+from mme_vla.errors import UserError
+
+if TYPE_CHECKING:
+    from mme_vla.envs.base import MemoryTask
+    from mme_vla.envs.subtasks import SubTask
+
+log = logging.getLogger(__name__)
+
+FrameHook = Callable[[dict[str, Any], dict[str, Any], bool], None]
+"""Called with each returned frame, its info, and whether it belongs to the conditioning video."""
+_MARGIN = 2  # The benchmark counts two steps more than the limit it is given.
+
+
+@dataclass
+class _Run:
+    """One episode under way."""
+
+    control: Control
+    shown: "SubTask"
+    """Whose text describes the present frame."""
+    last_action: np.ndarray
+    in_video: bool = True
+    frames: list[dict[str, Any]] = field(default_factory=list)
+    """Those that the present call hands out."""
+    newest: dict[str, Any] = field(default_factory=dict)
+    info: dict[str, Any] = field(default_factory=dict)
+    count: int = 0
+    """Control steps that count towards the limit."""
+    terminated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
+    truncated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
+
+
+class RoboMMEEnv(gymnasium.Env):
+    """One episode's environment with the official interface.
+
+    `step` never raises for what an action brings about: a malformed action, an unreachable pose or a simulator error
+    ends the episode with `info["status"] == "error"`. After the end of an episode further steps are simulated as the
+    benchmark does, so that recorded action sequences can be replayed to their last action.
+
+    Args:
+        task: the simulated task, created with the observation mode `none` (or, for `maniskill_obs`, the wanted one).
+        action: name of the action space.
+        max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
+        include: what observations and infos hold beyond the standard keys.
+        render: whether there are images.
+
+    Attributes:
+        on_frame: called with every frame that is returned, for recording.
+
+    Raises:
+        UserError: an unknown action space, or a limit that is no positive integer.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(
+        self,
+        task: "MemoryTask",
+        action: str = "joint_angle",
+        max_steps: int = 1300,
+        include: Include | None = None,
+        render: bool = True,
+    ) -> None:
+        if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
+            raise UserError(f"max_steps is {max_steps!r}; expected a positive integer.")
+        self._space = action_space(action)
+        self.include = include or Include()
+        self.max_steps = max_steps
+        self.on_frame: FrameHook | None = None
+        self.render_mode = "rgb_array" if render else None
+        self.action_space = self._space.space(task.stick)
+        self._keys = frame_keys(self.include, render)
+        self.observation_space = observation_space(self._keys)
+        self._render = render
+        self._grounding = Grounding()
+        self._task: MemoryTask | None = task
+        self._observer = Observer(task, self.include, render)
+        self._muted = True
+        # Frames are made where the simulator makes observations: after physics and evaluation, before the script.
+        task.get_obs = self._on_observation  # type: ignore[method-assign]
+        self._episodes = 0
+        self._run: _Run | None = None
+
+    # Episodes -----------------------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+        """Begin the episode anew; the same scene and script every time.
+
+        Args:
+            seed: without effect on the scene, which the environment's own seed fixes.
+            options: none are known.
+
+        Returns:
+            Observation lists (conditioning video, then the present frame) and the info of the present frame.
+
+        Raises:
+            UserError: the environment is closed.
+        """
+        task = self._open_task()
+        super().reset(seed=seed)
+        # Leftovers of an episode, in the solver and in what the script added, go only with the scene.
+        self._muted = True
+        task.reset(options={"reconfigure": self._episodes > 0})
+        self._muted = False
+        self._episodes += 1
+        control = Control(task, self._step_control, Demonstrator(task, self._step_control))
+        run = self._run = _Run(control, task.progress.shown, task.reset_action)
+        self._grounding.clear()
+        self._observer.start()
+        for subtask in task.progress.subtasks:
+            if subtask.video:
+                self._demonstrate(subtask)
+        run.in_video = False
+        self._step_control(task.start_action)
+        return as_lists(run.frames, self._keys), dict(run.info)
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Perform one action.
+
+        Args:
+            action: as the action space describes it.
+
+        Returns:
+            Observation lists, reward (always 0), terminated, truncated (0-d tensors) and the info of the last frame.
+            After an exception `(None, 0.0, True, False, info)` with the status `error`; after failed inverse kinematics
+            the observation is `{}`.
+
+        Raises:
+            UserError: the environment is closed, or was never reset.
+        """
+        self._open_task()
+        run = self._require_run()
+        run.frames = []
+        try:
+            self._space.act(run.control, action)
+            if run.frames and run.terminated:
+                self._settle()
+        except UnreachableError as error:
+            return {}, 0.0, True, False, {"status": "error", "error_message": str(error)}
+        except Exception as error:  # the official contract: whatever goes wrong is a status
+            log.debug("step failed", exc_info=True)
+            info = {"status": "error", "error_message": str(error), "exception_type": type(error).__name__}
+            return None, 0.0, True, False, info
+        observation = as_lists(run.frames, self._keys)
+        return observation, torch.zeros(()), run.terminated, run.truncated, dict(run.info)
+
+    def render(self) -> np.ndarray | None:
+        """The newest front picture [256, 256, 3], or None without rendering or before the first reset."""
+        self._open_task()
+        return None if self._run is None else self._run.newest.get("front_rgb")
+
+    def close(self) -> None:
+        """Free the simulator; closing twice is harmless."""
+        if self._task is not None:
+            self._task.close()
+            self._task = self._run = None
+
+    @property
+    def task(self) -> "MemoryTask":
+        """The simulated task."""
+        return self._open_task()
+
+    @property
+    def steps_counted(self) -> int:
+        """Control steps that count towards the limit."""
+        return 0 if self._run is None else self._run.count
+
+    # One control step ---------------------------------------------------------------------------------------------
+
+    def _on_observation(self, info: dict[str, Any] | None = None, unflattened: bool = False) -> dict[str, Any]:
+        if self._muted or info is None:
+            return {}
+        run = self._require_run()
+        self._observer.follow()
+        if run.in_video and run.shown.text == NO_RECORD:
+            return {}  # neither rendered nor returned
+        frame = run.newest = self._observer.frame(info)
+        run.info = self._info(run, info)
+        run.frames.append(frame)
+        if self.on_frame is not None:
+            self.on_frame(frame, run.info, run.in_video)
+        return {}
+
+    def _step_control(self, action: np.ndarray) -> None:
+        task, run = self._open_task(), self._require_run()
+        run.count += not run.in_video
+        # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to.
+        run.shown = task.progress.shown
+        run.last_action = np.asarray(action, np.float32)
+        _, _, terminated, _, _ = task.step(run.last_action)
+        run.terminated = terminated.reshape(-1)[0].clone()
+        run.truncated = torch.tensor(self._timed_out(run))
+
+    def _demonstrate(self, subtask: "SubTask") -> None:
+        """Carry out a sub-task of the video, evaluating before and after it as at recording."""
+        self._evaluate()
+        try:
+            subtask.run(self._require_run().control.demonstrator)
+        except PlanningError as error:  # the benchmark goes on with the rest of the video
+            log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
+        self._evaluate()
+
+    def _evaluate(self) -> None:
+        task = self._open_task()
+        task.evaluate()
+        task.progress.planned = task.progress.index
+
+    def _settle(self) -> None:
+        """One more step with the same action, which nobody sees, as the benchmark takes at the end of an episode."""
+        self._muted = True
+        try:
+            self._open_task().step(self._require_run().last_action)
+        finally:
+            self._muted = False
+
+    # What is handed out -------------------------------------------------------------------------------------------
+
+    def _info(self, run: _Run, evaluated: dict[str, Any]) -> dict[str, Any]:
+        task = self._open_task()
+        shown = run.shown
+        success, fail = evaluated["success"].clone(), evaluated["fail"].clone()
+        info: dict[str, Any] = {
+            "task_goal": list(task.goals()),
+            "simple_subgoal_online": shown.text,
+            "grounded_subgoal_online": self._grounding.update(
+                shown, self._observer.segmentation if self._render else None
+            ),
+            "status": self._status(run, bool(success), bool(fail)),
+            "success": success,
+            "fail": fail,
+            "elapsed_steps": evaluated["elapsed_steps"].clone(),
+        }
+        if self.include.available_multi_choices or self._space.name == "multi_choice":
+            info["available_multi_choices"] = [
+                {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}
+                for choice in task.choices()
+            ]
+        for name in ("front", "wrist"):
+            if getattr(self.include, f"{name}_camera_intrinsic"):
+                info[f"{name}_camera_intrinsic"] = INTRINSIC.copy()
+        return info
+
+    def _status(self, run: _Run, success: bool, fail: bool) -> str:
+        if success or fail:
+            return "success" if success else "fail"
+        return "timeout" if self._timed_out(run) else "ongoing"
+
+    def _timed_out(self, run: _Run) -> bool:
+        return run.count >= self.max_steps + _MARGIN
+
+    def _require_run(self) -> _Run:
+        if self._run is None:
+            raise UserError("step() before reset(): call reset() first.")
+        return self._run
+
+    def _open_task(self) -> "MemoryTask":
+        if self._task is None:
+            raise UserError("The environment is closed; make a new one.")
+        return self._task

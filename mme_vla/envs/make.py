@@ -1,0 +1,143 @@
+"""`make_env`: one benchmark episode as an environment, in one line."""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from mme_vla.envs import metadata
+from mme_vla.envs.names import TASK_NAMES
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.registry import TASKS
+
+if TYPE_CHECKING:
+    from mme_vla.envs.interface import RoboMMEEnv
+    from mme_vla.envs.official import OfficialEnv
+
+ENVS = ("mme_vla", "official")
+ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
+_DIFFICULTIES = ("easy", "medium", "hard")
+
+
+def make_env(
+    task: str,
+    split: str = "test",
+    episode: int = 0,
+    action_space: str = "joint_angle",
+    *,
+    seed: int | None = None,
+    difficulty: str | None = None,
+    max_steps: int = 1300,
+    render: bool = True,
+    env: str = "mme_vla",
+    **include: bool,
+) -> "RoboMMEEnv | OfficialEnv":
+    """Make the environment of one episode.
+
+    Args:
+        task: one of the 16 task names, or a task of your own registered in `TASKS`.
+        split: `train`, `val` or `test`.
+        episode: which episode of the split.
+        action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
+        seed: builds the scene of this seed instead of an episode of the split.
+        difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
+        max_steps: control steps until the status becomes `timeout`.
+        render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
+        env: `mme_vla`, or `official` for the installed package `robomme`.
+        include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
+            `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
+            `include_available_multi_choices`, `include_maniskill_obs`.
+
+    Returns:
+        The environment; call `reset()` first. Close it when done.
+
+    Raises:
+        UserError: an unknown name, episode or option, a missing package, or no Vulkan driver.
+    """
+    check_names(task, env, action_space, difficulty, seed)
+    if env == "official":
+        from mme_vla.envs.official import make_official_env
+
+        if seed is not None or not render:
+            raise UserError('env="official" takes episodes of a split and always renders: leave out seed and render.')
+        return make_official_env(task, split, episode, action_space, max_steps, include)
+    if seed is None:
+        spec = metadata.episode(task, split, episode)
+        seed, difficulty = spec.seed, spec.difficulty
+    return _make_own(task, action_space, seed, difficulty, max_steps, render, include)
+
+
+def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
+    """Refuse what can be refused without the simulator.
+
+    Raises:
+        UserError: an unknown task, environment, action space or difficulty, or a difficulty without a seed.
+    """
+    if task not in TASK_NAMES and task not in TASKS:
+        raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
+    for kind, value, known in (("environment", env, ENVS), ("action space", action_space, ACTION_SPACES)):
+        if value not in known:
+            raise UserError(f"Unknown {kind} {value!r}. {did_you_mean(str(value), known)}")
+    if difficulty is not None and difficulty not in _DIFFICULTIES:
+        raise UserError(f"Unknown difficulty {difficulty!r}. {did_you_mean(str(difficulty), _DIFFICULTIES)}")
+    if difficulty is not None and seed is None:
+        raise UserError("A difficulty needs a seed: an episode of a split has its own.")
+
+
+def require_simulator() -> None:
+    """Refuse to go on without the simulator's packages.
+
+    Raises:
+        UserError: mani-skill is not installed.
+    """
+    if find_spec("mani_skill") is None:
+        raise UserError("The simulator is not installed; run: pip install 'mme-vla[sim]'")
+
+
+def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any) -> Any:
+    """Build one task as a bare ManiSkill environment.
+
+    Args:
+        task: its registered name.
+        render: build what is there to be seen; otherwise no Vulkan is needed.
+        obs_mode: ManiSkill's observation mode.
+        options: `seed`, `difficulty`, `recovery`, and what ManiSkill's `BaseEnv` takes.
+
+    Raises:
+        UserError: the simulator is missing, rendering is not possible here, or no such task is registered.
+    """
+    require_simulator()
+    from mme_vla.envs.tasks import module_name
+
+    if task in TASK_NAMES:
+        import_module(f"mme_vla.envs.tasks.{module_name(task)}")
+    backend = "none"
+    if render:
+        from mme_vla.envs.rendering_check import render_backend
+
+        backend = render_backend()
+    return TASKS[task](obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options)
+
+
+def _make_own(
+    task: str,
+    space: str,
+    seed: int,
+    difficulty: str | None,
+    max_steps: int,
+    render: bool,
+    options: dict[str, Any],
+) -> "RoboMMEEnv":
+    from mme_vla.envs.observations import Include
+
+    if space == "multi_choice":
+        # Who chooses a pixel needs the front camera to know what it shows.
+        options = options | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
+    include = Include.from_options(options)
+    obs_mode = "none"
+    if include.maniskill_obs:
+        obs_mode = "rgb+depth+segmentation" if render else "state_dict"
+    require_simulator()
+    from mme_vla.envs.interface import RoboMMEEnv
+
+    built = make_task(task, render=render, obs_mode=obs_mode, seed=seed, difficulty=difficulty)
+    return RoboMMEEnv(built, space, max_steps, include, render)

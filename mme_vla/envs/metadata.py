@@ -1,0 +1,152 @@
+"""Which seed and difficulty every episode of the benchmark's splits has; importing this needs no simulator.
+
+A seed follows from task, split and episode by a formula, except where the official demonstrator failed on it: the seed
+was then raised by one until it succeeded, which no formula tells. The shipped table therefore marks the seeds that are
+confirmed by an official episode; the others are the formula's. With the official files at hand (the `robomme` package
+installed, or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`) theirs are used.
+"""
+
+import csv
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from importlib.util import find_spec
+from pathlib import Path
+
+from mme_vla.envs.names import TASK_NAMES
+from mme_vla.errors import UserError, did_you_mean
+
+SPLITS = {"train": 100, "val": 50, "test": 50}
+"""Episodes a task has in each split."""
+FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
+_FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000)}
+_CYCLE = ("easy", "easy", "medium", "hard")
+_RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
+_PACKAGE_FOLDER = Path("env_metadata")
+
+
+@dataclass(frozen=True)
+class EpisodeSpec:
+    """One episode of a split."""
+
+    task: str
+    split: str
+    episode: int
+    seed: int
+    difficulty: str
+    source: str
+    """`official`: an official file or demonstration says so; `formula`: derived, and wrong by a few where the official
+    demonstrator had to try again."""
+
+    @property
+    def recovery(self) -> str | None:
+        """How the demonstration's one failed grasp misses: `z` in train episodes 0-2, `xy` in 3-5, None elsewhere."""
+        return _RECOVERY[self.episode] if self.split == "train" and self.episode < len(_RECOVERY) else None
+
+
+def formula(task: str, split: str, episode: int) -> tuple[int, str]:
+    """Seed before any retry, and difficulty, of an episode."""
+    offset, stride = _FIRST_SEED[split]
+    return offset + stride * (TASK_NAMES.index(task) + 1) + 100 * episode, _CYCLE[episode % 4]
+
+
+def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
+    """The episodes of a task in a split, in order.
+
+    Args:
+        task: one of the 16 task names.
+        split: `train`, `val` or `test`.
+        folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
+            `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
+
+    Raises:
+        UserError: an unknown task or split, or a folder without the file, or a file that is not of that layout.
+    """
+    if task not in TASK_NAMES:
+        raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), TASK_NAMES)}")
+    if split not in SPLITS:
+        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), SPLITS)}")
+    folder = folder or os.environ.get(FOLDER_VARIABLE)
+    if folder:
+        return _official(Path(folder), task, split)
+    installed = _installed_folder()
+    if installed is not None and _file(installed, task, split).is_file():
+        return _official(installed, task, split)
+    return list(_table(split)[task])
+
+
+def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:
+    """One episode of a split.
+
+    Raises:
+        UserError: as `episodes`, or an episode number the split does not have.
+    """
+    known = episodes(task, split, folder)
+    if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(known):
+        raise UserError(f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
+    return known[index]
+
+
+def generate(confirmed: Iterable[EpisodeSpec] = ()) -> dict[str, list[EpisodeSpec]]:
+    """The table of every split: the formula, overruled by what official episodes confirm."""
+    overruled = {(spec.task, spec.split, spec.episode): spec for spec in confirmed}
+    return {
+        split: [
+            overruled.get((task, split, index))
+            or EpisodeSpec(task, split, index, *formula(task, split, index), source="formula")
+            for task in TASK_NAMES
+            for index in range(count)
+        ]
+        for split, count in SPLITS.items()
+    }
+
+
+def write(table: dict[str, list[EpisodeSpec]], folder: Path) -> None:
+    """Write a table as one CSV file a split."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for split, specs in table.items():
+        with (folder / f"{split}.csv").open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(["task", "episode", "seed", "difficulty", "source"])
+            writer.writerows([spec.task, spec.episode, spec.seed, spec.difficulty, spec.source] for spec in specs)
+
+
+@cache
+def _table(split: str) -> dict[str, list[EpisodeSpec]]:
+    text = files("mme_vla").joinpath("assets", "robomme_metadata", f"{split}.csv").read_text()
+    table: dict[str, list[EpisodeSpec]] = {task: [] for task in TASK_NAMES}
+    for row in csv.DictReader(text.splitlines()):
+        index, seed = int(row["episode"]), int(row["seed"])
+        table[row["task"]].append(EpisodeSpec(row["task"], split, index, seed, row["difficulty"], row["source"]))
+    return table
+
+
+def _installed_folder() -> Path | None:
+    spec = find_spec("robomme")
+    places = (spec.submodule_search_locations or []) if spec is not None else []
+    return next((Path(place) / _PACKAGE_FOLDER for place in places), None)
+
+
+def _file(folder: Path, task: str, split: str) -> Path:
+    return folder / split / f"record_dataset_{task}_metadata.json"
+
+
+def _official(folder: Path, task: str, split: str) -> list[EpisodeSpec]:
+    path = _file(folder, task, split)
+    try:
+        records = json.loads(path.read_text())["records"]
+        specs = [
+            EpisodeSpec(task, split, int(r["episode"]), int(r["seed"]), str(r["difficulty"]), "official")
+            for r in records
+        ]
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist; expected official metadata of {task}, split {split!r}.") from None
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path} is not official metadata: {error!r}. Get the file again.") from None
+    specs.sort(key=lambda spec: spec.episode)
+    if [spec.episode for spec in specs] != list(range(len(specs))):
+        raise UserError(f"{path} does not number its episodes 0, 1, 2, …; get the file again.")
+    return specs

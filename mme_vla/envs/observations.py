@@ -1,0 +1,224 @@
+"""What a policy sees of a task: robot state and camera pictures of one frame, and only what was asked for.
+
+A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mme_vla.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    import sapien
+
+    from mme_vla.envs.base import MemoryTask
+
+IMAGE_SIZE = 256
+FOCAL_LENGTH = 128.0  # pixels: 90 degrees over 256 pixels
+INTRINSIC = np.array([[FOCAL_LENGTH, 0, 128], [0, FOCAL_LENGTH, 128], [0, 0, 1]], np.float32)
+"""Intrinsic matrix of both cameras, [3, 3]."""
+CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
+"""The benchmark's names of the cameras, and the simulator's."""
+_FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2])
+
+
+@dataclass(frozen=True)
+class Include:
+    """What a frame or an info dict holds beyond the standard keys."""
+
+    front_depth: bool = False
+    wrist_depth: bool = False
+    front_camera_extrinsic: bool = False
+    wrist_camera_extrinsic: bool = False
+    front_camera_intrinsic: bool = False
+    wrist_camera_intrinsic: bool = False
+    available_multi_choices: bool = False
+    maniskill_obs: bool = False
+
+    @classmethod
+    def from_options(cls, options: dict[str, Any]) -> "Include":
+        """Read `include_front_depth=True` and the like.
+
+        Raises:
+            UserError: an option that does not exist, or a value that is not a bool.
+        """
+        known = {f"include_{field.name}" for field in fields(cls)}
+        for name, value in options.items():
+            if name not in known:
+                raise UserError(f"Unknown option {name!r}. {did_you_mean(name, known)}")
+            if not isinstance(value, bool):
+                raise UserError(f"{name} is {value!r}; expected True or False.")
+        return cls(**{name.removeprefix("include_"): value for name, value in options.items()})
+
+    @property
+    def options(self) -> dict[str, bool]:
+        """The keyword arguments that say the same."""
+        return {f"include_{field.name}": getattr(self, field.name) for field in fields(self)}
+
+
+class AngleTrack:
+    """Roll, pitch and yaw that go on where the previous frame's left off instead of jumping by a full turn.
+
+    Extrinsic x-y-z angles; the quaternion's sign follows the previous frame's, and each angle's change is folded into
+    [-π, π) and added, so that values may leave ±π.
+    """
+
+    def __init__(self) -> None:
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the previous frame."""
+        self._quaternion: np.ndarray | None = None
+        self._angles: np.ndarray | None = None
+
+    def follow(self, quaternion: np.ndarray) -> np.ndarray:
+        """Angles [3] float64 of the next frame, from its quaternion [4] (w, x, y, z)."""
+        q = np.asarray(quaternion, np.float64)
+        q = q / np.linalg.norm(q)
+        if self._quaternion is not None and q @ self._quaternion < 0:
+            q = -q
+        angles = Rotation.from_quat(q, scalar_first=True).as_euler("xyz")
+        if self._angles is not None:
+            change = (angles - self._angles + np.pi) % (2 * np.pi) - np.pi
+            angles = self._angles + change
+        self._quaternion, self._angles = q, angles
+        return angles.copy()
+
+
+class Observer:
+    """Makes frames of a task.
+
+    Args:
+        task: the simulated task.
+        include: what the frames hold beyond the standard keys.
+        render: take pictures; without it frames hold the robot's state only.
+    """
+
+    def __init__(self, task: "MemoryTask", include: Include, render: bool) -> None:
+        self.task = task
+        self.include = include
+        self.render = render
+        self._angles = AngleTrack()
+        self._eef = np.zeros(6)
+
+    def start(self) -> None:
+        """Begin an episode."""
+        self._angles.clear()
+        self.follow()
+
+    def follow(self) -> None:
+        """Take note of the tool's pose; due at every control step, whether or not it becomes a frame."""
+        pose = self.task.tcp_pose
+        self._eef = np.concatenate([pose.p, self._angles.follow(pose.q)]).astype(np.float64)
+
+    def frame(self, info: dict[str, Any]) -> dict[str, Any]:
+        """The present moment; `info` is what the task has just evaluated."""
+        qpos = self.task.qpos
+        frame: dict[str, Any] = {
+            "joint_state": qpos[:7].astype(np.float32),
+            "eef_state": self._eef.copy(),
+            "gripper_state": np.zeros(2) if self.task.stick else qpos[-2:].astype(np.float32),
+        }
+        if self.include.maniskill_obs:
+            frame["maniskill_obs"] = type(self.task).get_obs(self.task, info)
+        elif self.render:
+            self._take_pictures()
+        for name, camera in CAMERAS.items():
+            if self.render:
+                depth = getattr(self.include, f"{name}_depth")
+                images = self._read(camera, rgb=True, depth=depth)
+                frame[f"{name}_rgb"] = images["rgb"]
+                if depth:
+                    frame[f"{name}_depth"] = images["depth"].astype(np.int16)
+            if getattr(self.include, f"{name}_camera_extrinsic"):
+                frame[f"{name}_camera_extrinsic"] = self.extrinsic(name)
+        return frame
+
+    def segmentation(self) -> np.ndarray:
+        """Object ids [256, 256] of the front picture that was taken last; nothing is rendered for it."""
+        return self._read(CAMERAS["front"], segmentation=True)["segmentation"][..., 0]
+
+    def extrinsic(self, name: str) -> np.ndarray:
+        """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
+        return front_extrinsic() if name == "front" else extrinsic_of(self._wrist_pose())
+
+    def _wrist_pose(self) -> "sapien.Pose":
+        return self.task.agent.robot.links_map["camera_link"].pose.sp
+
+    def _take_pictures(self) -> None:
+        scene = self.task.scene
+        scene.update_render(update_sensors=True, update_human_render_cameras=False)
+        for camera in CAMERAS.values():
+            scene.sensors[camera].capture()
+
+    def _read(
+        self, camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
+    ) -> dict[str, np.ndarray]:
+        sensor = self.task.scene.sensors[camera]
+        images = sensor.get_obs(rgb=rgb, depth=depth, position=False, segmentation=segmentation)
+        return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
+
+
+def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:
+    """World-to-camera matrix in OpenCV's axes (x right, y down, z forward), float32 [3, 4].
+
+    Args:
+        pose: of the camera in the world, in the simulator's axes (x forward, y left, z up).
+    """
+    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    to_camera = np.asarray(pose.inv().to_transformation_matrix(), np.float64)
+    return (axes @ to_camera[:3]).astype(np.float32)
+
+
+def front_extrinsic() -> np.ndarray:
+    """World-to-camera matrix of the front camera, float32 [3, 4]; it never moves."""
+    forward = _FRONT_TARGET - _FRONT_EYE
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([rotation, -rotation @ _FRONT_EYE]).astype(np.float32)
+
+
+def as_lists(frames: Sequence[dict[str, Any]], keys: Sequence[str]) -> dict[str, list[Any]]:
+    """The benchmark's observation: for each key the values of all frames, in time order."""
+    return {list_key(key): [frame[key] for frame in frames] for key in keys}
+
+
+def list_key(key: str) -> str:
+    """`front_rgb_list` for `front_rgb`."""
+    return key if key == "maniskill_obs" else f"{key}_list"
+
+
+def frame_keys(include: Include, render: bool) -> list[str]:
+    """The keys of every frame, in the benchmark's order."""
+    keys = ["front_rgb", "wrist_rgb"] if render else []
+    keys += ["joint_state", "eef_state", "gripper_state"]
+    for kind in ("depth", "camera_extrinsic"):
+        for name in CAMERAS:
+            if getattr(include, f"{name}_{kind}") and (render or kind != "depth"):
+                keys.append(f"{name}_{kind}")
+    return [*keys, *(["maniskill_obs"] if include.maniskill_obs else [])]
+
+
+def observation_space(keys: Sequence[str]) -> gymnasium.spaces.Dict:
+    """Lists of frames, as Gymnasium describes them; the raw simulator observation is left out."""
+    image = gymnasium.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+    depth = gymnasium.spaces.Box(-(2**15), 2**15 - 1, (IMAGE_SIZE, IMAGE_SIZE, 1), np.int16)
+    boxes: dict[str, gymnasium.Space] = {
+        "rgb": image,
+        "depth": depth,
+        "extrinsic": gymnasium.spaces.Box(-np.inf, np.inf, (3, 4), np.float32),
+        "joint_state": gymnasium.spaces.Box(-np.inf, np.inf, (7,), np.float32),
+        "eef_state": gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64),
+        "gripper_state": gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64),
+    }
+    spaces = {list_key(key): boxes.get(key) or boxes.get(key.rsplit("_", 1)[-1]) for key in keys}
+    return gymnasium.spaces.Dict(
+        {key: gymnasium.spaces.Sequence(box) for key, box in spaces.items() if box is not None}
+    )

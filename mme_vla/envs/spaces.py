@@ -1,0 +1,190 @@
+"""The four action spaces: each turns one action of a policy into control steps of the robot.
+
+| name | action | control steps |
+|---|---|---|
+| `joint_angle` | seven joint targets, gripper | one |
+| `ee_pose` | x, y, z, roll, pitch, yaw, gripper | one, by inverse kinematics |
+| `waypoint` | the same | a planned motion, then the gripper |
+| `multi_choice` | `{"choice": "A", "point": [y, x]}` | the whole option |
+
+Positions in metres and angles in radians, in the world; gripper -1 closed, +1 open. The robots that hold a stick need
+no gripper number.
+"""
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import gymnasium
+import numpy as np
+import sapien
+from scipy.spatial.transform import Rotation
+
+from mme_vla.envs.choices import nearest_to_pixel
+from mme_vla.envs.grounding import project
+from mme_vla.envs.observations import IMAGE_SIZE
+from mme_vla.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    from mme_vla.envs.base import MemoryTask
+    from mme_vla.envs.demonstrator import Demonstrator
+
+
+class UnreachableError(RuntimeError):
+    """A pose that no joint angles reach from where the arm stands."""
+
+
+@dataclass
+class Control:
+    """What an action space acts with during one episode."""
+
+    task: "MemoryTask"
+    step: Callable[[np.ndarray], Any]
+    """Does one control step with an action [8], or [7] for the stick."""
+    demonstrator: "Demonstrator"
+
+
+class ActionSpace:
+    """One way to command the robot."""
+
+    name: ClassVar[str]
+
+    def space(self, stick: bool) -> gymnasium.Space:
+        """The Gymnasium space of actions."""
+        raise NotImplementedError
+
+    def act(self, control: Control, action: Any) -> None:
+        """Do the control steps of one action.
+
+        Raises:
+            UserError: a malformed action.
+            UnreachableError: inverse kinematics found no joint angles.
+            PlanningError: no motion to the pose was found.
+        """
+        raise NotImplementedError
+
+
+class JointAngle(ActionSpace):
+    """Absolute joint targets; the stick takes the first seven of at least seven numbers."""
+
+    name = "joint_angle"
+
+    def space(self, stick: bool) -> gymnasium.Space:
+        return _unbounded(7 if stick else 8)
+
+    def act(self, control: Control, action: Any) -> None:
+        stick = control.task.stick
+        numbers = _numbers(action, 7 if stick else 8, "seven joint angles and the gripper", longer=stick)
+        control.step(numbers[: 7 if stick else 8])
+
+
+class EndEffectorPose(ActionSpace):
+    """An absolute pose of the tool, reached in one control step from inverse kinematics at the present joints."""
+
+    name = "ee_pose"
+
+    def space(self, stick: bool) -> gymnasium.Space:
+        return _unbounded(6 if stick else 7)
+
+    def act(self, control: Control, action: Any) -> None:
+        stick = control.task.stick
+        numbers = _pose_numbers(action, stick)
+        joints = control.demonstrator.arm.ik(_pose(numbers), control.task.qpos)
+        if joints is None:
+            raise UnreachableError(f"IK failed: no joint angles reach the pose {np.round(numbers[:6], 4).tolist()}.")
+        control.step(joints if stick else np.append(joints, numbers[6]))
+
+
+class Waypoint(ActionSpace):
+    """An absolute pose of the tool, reached by a planned motion; then the gripper closes at -1 or opens at +1."""
+
+    name = "waypoint"
+
+    def space(self, stick: bool) -> gymnasium.Space:
+        return _unbounded(6 if stick else 7)
+
+    def act(self, control: Control, action: Any) -> None:
+        stick = control.task.stick
+        numbers = _pose_numbers(action, stick)
+        control.demonstrator.move_to(_pose(numbers))
+        if stick:
+            return
+        if numbers[6] == -1:
+            control.demonstrator.close()
+        elif numbers[6] == 1:
+            control.demonstrator.open()
+
+
+class MultiChoice(ActionSpace):
+    """One of the task's options by its letter, with a pixel [y, x] of the front picture where it needs an object."""
+
+    name = "multi_choice"
+
+    def space(self, stick: bool) -> gymnasium.Space:
+        point = gymnasium.spaces.Box(0, IMAGE_SIZE, (2,), np.float64)
+        return gymnasium.spaces.Dict({"choice": gymnasium.spaces.Text(1), "point": point})
+
+    def act(self, control: Control, action: Any) -> None:
+        if not isinstance(action, dict) or not isinstance(action.get("choice"), str):
+            raise UserError(f'Action {action!r} is no choice; expected {{"choice": "A", "point": [y, x]}}.')
+        label = action["choice"].strip().lower()
+        choices = {choice.label: choice for choice in control.task.choices()}
+        if label not in choices:
+            # The benchmark answers an unknown letter with no step at all; say so instead of leaving it a riddle.
+            warnings.warn(f"Unknown choice {action['choice']!r}: no step. {did_you_mean(label, choices)}", stacklevel=2)
+            return
+        choice = choices[label]
+        if choice.candidates is None:
+            choice.run(control.demonstrator, None)
+            return
+        point = action.get("point")
+        if point is None or len(point) == 0:
+            raise UserError(f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object meant.")
+        pixel = _numbers(point, 2, "a pixel's row and column").tolist()
+        choice.run(control.demonstrator, nearest_to_pixel(pixel, choice.candidates(), project))
+
+
+SPACES: dict[str, ActionSpace] = {
+    space.name: space for space in (JointAngle(), EndEffectorPose(), Waypoint(), MultiChoice())
+}
+
+
+def action_space(name: str) -> ActionSpace:
+    """The action space of that name.
+
+    Raises:
+        UserError: no such action space.
+    """
+    if name not in SPACES:
+        raise UserError(f"Unknown action space {name!r}. {did_you_mean(str(name), SPACES)}")
+    return SPACES[name]
+
+
+def _unbounded(size: int) -> gymnasium.spaces.Box:
+    return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+
+def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.ndarray:
+    """The action as float64, checked: `size` finite numbers, or more where `longer` allows it."""
+    try:
+        numbers = np.asarray(action, np.float64)
+    except (TypeError, ValueError):
+        raise UserError(f"Action {action!r} is not made of numbers; expected {size}: {meaning}.") from None
+    fits = numbers.ndim == 1 and (len(numbers) == size or (longer and len(numbers) > size))
+    if not fits:
+        least = "at least " if longer else ""
+        raise UserError(f"Action has shape {numbers.shape}; expected {least}{size} numbers: {meaning}.")
+    if not np.isfinite(numbers).all():
+        raise UserError(f"Action {numbers.tolist()} holds numbers that are not finite.")
+    return numbers
+
+
+def _pose_numbers(action: Any, stick: bool) -> np.ndarray:
+    if stick:
+        return _numbers(action, 6, "x, y, z, roll, pitch, yaw", longer=True)
+    return _numbers(action, 7, "x, y, z, roll, pitch, yaw and the gripper")
+
+
+def _pose(numbers: np.ndarray) -> sapien.Pose:
+    return sapien.Pose(numbers[:3], Rotation.from_euler("xyz", numbers[3:6]).as_quat(scalar_first=True))

@@ -1,0 +1,31 @@
+"""The sixteen tasks, one file each; importing a task registers it."""
+
+import re
+from importlib import import_module
+
+import gymnasium
+from mani_skill.utils.registration import register_env
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.names import TASK_NAMES
+from mme_vla.registry import TASKS
+
+
+def register_task[T: type[MemoryTask]](task: T) -> T:
+    """File a task under its class name, in `TASKS` and as a Gymnasium id."""
+    TASKS.register(task.__name__)(task)
+    # The official package uses the same ids; whoever was imported first keeps them.
+    if task.__name__ not in gymnasium.registry:
+        register_env(task.__name__)(task)
+    return task
+
+
+def load_tasks() -> None:
+    """Import every task, so that all are registered."""
+    for name in TASK_NAMES:
+        import_module(f"{__name__}.{module_name(name)}")
+
+
+def module_name(task: str) -> str:
+    """`pick_xtimes` for `PickXtimes`."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "_", task).lower()

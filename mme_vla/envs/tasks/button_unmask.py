@@ -1,0 +1,57 @@
+"""ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.containers import add_containers, add_hidden_cubes, container_choices, container_picks, hiding_goal
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.motions import Cover
+from mme_vla.envs.objects import build_button
+from mme_vla.envs.placement import draw_button
+from mme_vla.envs.predicates import pressed
+from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.video_unmask import CONTAINERS, PICKS
+
+LETTERS = ("b", "c")
+
+
+@register_task
+class ButtonUnmask(MemoryTask):
+    """Containers cover three cubes while the robot presses a button."""
+
+    def build(self, draws: Draws) -> None:
+        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0), (0.1, 0.1))))
+        self.containers = add_containers(self, draws, CONTAINERS[self.difficulty], [self.button])
+        self.colours = [("red", "green", "blue")[i] for i in draws.permutation(3)]
+        add_hidden_cubes(self, self.colours, self.containers)
+
+    def start_episode(self, draws: Draws) -> None:
+        self.cover = Cover(self.containers)
+
+    def before_physics(self, k: int) -> None:
+        self.cover.apply(k)
+
+    def draw_failed_pick(self, draws: Draws, picks: int) -> int | None:
+        # Here alone the stream is one of its own, in which a number without effect comes first.
+        own = Draws(self.seed)
+        own.integer(1, 6)
+        return own.integer(0, picks)
+
+    def subtasks(self) -> list[SubTask]:
+        press = SubTask(
+            "press the button",
+            done=lambda: pressed(self.button),
+            run=lambda demo: demo.press(self.button),
+            grounded="press the button at <>",
+            targets=[self.button],
+            choice="a",
+        )
+        wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
+        return [press, *container_picks(self, wanted, self.containers, LETTERS)]
+
+    def choices(self) -> list[Choice]:
+        press = Choice("a", "press the button", lambda demo, _: demo.press(self.button))
+        return [press, *container_choices(self.containers, LETTERS)]
+
+    def goals(self) -> list[str]:
+        return [f"first press the button, then {hiding_goal(self.colours[: PICKS[self.difficulty]])}"]

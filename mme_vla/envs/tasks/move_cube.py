@@ -1,0 +1,195 @@
+"""MoveCube (Imitation): the video moves a cube to a target in one of three manners; move it in the same manner."""
+
+import math
+
+import sapien
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.objects import PEG_COLOUR, H, build_cube, build_disc, build_peg
+from mme_vla.envs.objects.shapes import at
+from mme_vla.envs.placement import Region, SceneError, draw_cube, draw_disc
+from mme_vla.envs.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
+from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.tasks import register_task
+
+MANNERS = ("hook", "push", "grasp")
+PEG_LENGTH, PEG_RADIUS = 0.1, 0.01
+TARGET_RADIUS = 0.04
+CUBE_FROM_TARGET = 5 * H
+CUBE_GAP = 0.005
+TRIES = 128
+HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
+
+type Point = tuple[float, float]
+
+
+@register_task
+class MoveCube(MemoryTask):
+    """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty changes nothing."""
+
+    shared_draws = True
+
+    def build(self, draws: Draws) -> None:
+        for _ in range(2):
+            draws.uniform()  # part of the official stream, without effect
+        shown_peg, peg = self._draw_peg(draws), self._draw_peg(draws)
+        for _ in range(2):
+            draws.integer(0, 2)
+        shown_goal, goal = (self._draw_goal(draws, half) for half in (0.15, 0.1))
+        self.peg = self.add(
+            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, shown_peg[:2], shown_peg[2])
+        )
+        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", shown_goal))
+        xy, yaw = self._draw_cube(draws, shown_goal, [])
+        self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
+        xy, yaw = self._draw_cube(draws, goal, [self.cube])
+        self._execution_poses = {
+            self.peg: at(peg[:2], 0, peg[2]),
+            self.target: sapien.Pose([*goal, self.target.position[2]], self.target.pose.q),
+            self.cube: at(xy, H, yaw),
+        }
+
+    @staticmethod
+    def _draw_peg(draws: Draws) -> tuple[float, float, float]:
+        side = -0.2 if draws.coin() else 0.2
+        x, y = -0.05 + 0.1 * draws.uniform(), side - 0.05 + 0.1 * draws.uniform()
+        return x, y, math.radians(-45 + 90 * draws.uniform())
+
+    def _draw_goal(self, draws: Draws, half: float) -> Point:
+        xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
+        assert xy is not None
+        return xy
+
+    def _draw_cube(self, draws: Draws, goal: Point, avoid: list) -> tuple[Point, float]:
+        """A place near a point that is not near the goal."""
+        for _ in range(TRIES):
+            centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
+            if math.dist(centre, goal) > CUBE_FROM_TARGET:
+                place = draw_cube(draws, Region(centre, 0.05), avoid, gap=CUBE_GAP)
+                if place is not None:
+                    return place
+                break
+        raise SceneError(f"MoveCube, seed {self.seed}: the cube finds no place away from the target.")
+
+    def start_episode(self, draws: Draws) -> None:
+        self.manner = MANNERS[draws.integer(0, 3)]
+        self._moved = False
+
+    def after_step(self, k: int) -> None:
+        if self.reset_in_progress and not self._moved:
+            self._moved = True
+            for thing, pose in self._execution_poses.items():
+                thing.move_to(pose)
+
+    def subtasks(self) -> list[SubTask]:
+        steps = HOLD_STEPS[self.manner]
+        between = [
+            SubTask("static", StaticFor(self, steps), lambda demo: demo.hold(steps), video=True),
+            SubTask(
+                NO_RECORD,
+                done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
+                run=lambda demo: demo.hard_reset(),
+                video=True,
+            ),
+        ]
+        moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
+        return [*moves(video=True), *between, *moves(video=False)]
+
+    def _on_target(self) -> bool:
+        return pushed_onto(self.cube, self.target)
+
+    def _pushed(self) -> bool:
+        return self._on_target() and gripper_open(self)
+
+    def _holds_peg(self) -> bool:
+        return any(picked_up(self, end) for end in (self.peg.head, self.peg.tail))
+
+    def _holds_cube(self) -> bool:
+        return picked_up(self, self.cube)
+
+    def _hook(self, video: bool) -> list[SubTask]:
+        return [
+            SubTask(
+                "Pick up the peg",
+                done=self._holds_peg,
+                run=lambda demo: demo.grasp_peg(self.peg, "tail"),
+                grounded="Pick up the peg at <>",
+                failed=lambda: self._holds_cube() or self._on_target(),
+                targets=[self.peg],
+                choice="a",
+                video=video,
+            ),
+            SubTask(
+                "Hook the cube to the target with the peg",
+                done=self._pushed,
+                run=lambda demo: demo.hook(self.cube, self.target, self._side()),
+                grounded="Hook the cube at <> to the target at <> with the peg",
+                targets=[self.cube, self.target],
+                choice="b",
+                video=video,
+            ),
+        ]
+
+    def _side(self) -> int:
+        """From which side the peg reaches around the cube."""
+        return 1 if self.cube.position[1] > self.target.position[1] else -1
+
+    def _push(self, video: bool) -> list[SubTask]:
+        return [
+            SubTask(
+                "Close the gripper and push the cube to the target",
+                done=self._pushed,
+                run=lambda demo: demo.push(self.cube, self.target),
+                grounded="Close the gripper and push the cube at <> to the target at <>",
+                failed=lambda: self._holds_cube() or self._holds_peg(),
+                targets=[self.cube, self.target],
+                choice="c",
+                video=video,
+            )
+        ]
+
+    def _grasp(self, video: bool) -> list[SubTask]:
+        return [
+            SubTask(
+                "Pick up the cube",
+                done=self._holds_cube,
+                run=lambda demo: demo.pick(self.cube),
+                grounded="Pick up the cube at <>",
+                failed=lambda: self._on_target() or self._holds_peg(),
+                targets=[self.cube],
+                choice="d",
+                video=video,
+            ),
+            SubTask(
+                "place the cube onto the target",
+                done=lambda: dropped_onto(self, self.cube, self.target),
+                run=lambda demo: demo.place_on(self.target),
+                grounded="place the cube onto the target at <>",
+                targets=[self.target],
+                choice="e",
+                video=video,
+            ),
+        ]
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "pick up the peg", lambda demo, _: demo.grasp_peg(self.peg, "tail")),
+            Choice(
+                "b",
+                "hook the cube to the target with the peg",
+                lambda demo, _: demo.hook(self.cube, self.target, self._side()),
+            ),
+            Choice(
+                "c",
+                "close gripper and push the cube to the target",
+                lambda demo, _: demo.push(self.cube, self.target),
+            ),
+            Choice("d", "pick up the cube", lambda demo, _: demo.pick(self.cube)),
+            Choice("e", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)),
+        ]
+
+    def goals(self) -> list[str]:
+        goal = "watch the video carefully, then move the cube to the target in the same manner"
+        return [f"{goal} as before", f"{goal} shown in the video"]

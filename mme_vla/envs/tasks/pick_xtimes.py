@@ -1,0 +1,102 @@
+"""PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.language import number, ordinal
+from mme_vla.envs.objects import Cube, H, build_button, build_cube, build_disc
+from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.predicates import any_picked_up, dropped_onto, picked_up, pressed
+from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.tasks import register_task
+
+COLOURS = ("red", "blue", "green")
+CUBES = {"easy": 1, "medium": 3, "hard": 3}
+REPETITIONS = {"easy": (1, 3), "medium": (1, 3), "hard": (4, 5)}  # fewest and most
+TABLE = Region((-0.1, 0.0), 0.2)
+TARGET_RADIUS, TARGET_THICKNESS = 0.04, 0.005
+
+
+@register_task
+class PickXtimes(MemoryTask):
+    """One cube is picked up and placed on the target again and again, as often as the goal says."""
+
+    latch_failure = True
+
+    def plan(self, draws: Draws) -> None:
+        fewest, most = REPETITIONS[self.difficulty]
+        self.repetitions = draws.integer(fewest, most + 1)
+
+    def build(self, draws: Draws) -> None:
+        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0.0))))
+        colours = [COLOURS[i] for i in draws.permutation(3)][: CUBES[self.difficulty]]
+        draws.integer(0, 3)  # drawn, and not used, in the official scene
+        self.cubes: list[Cube] = []
+        for colour in colours:
+            place = draw_cube(draws, TABLE, [self.button, *self.cubes], gap=H)
+            if place is None:
+                raise SceneError(f"PickXtimes, seed {self.seed}: the {colour} cube finds no place.")
+            self.cubes.append(self.add(build_cube(self, f"cube_{colour}", colour, *place)))
+        xy = draw_disc(draws, TABLE, TARGET_RADIUS, [self.button, *self.cubes], gap=2 * H)
+        if xy is None:
+            raise SceneError(f"PickXtimes, seed {self.seed}: the target finds no place.")
+        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, TARGET_THICKNESS, "purple", xy))
+        self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+
+    def subtasks(self) -> list[SubTask]:
+        steps = []
+        for i in range(self.repetitions):
+            steps += [self._pick(i), self._place()]
+        press = SubTask(
+            "press the button to stop",
+            done=lambda: pressed(self.button),
+            run=lambda demo: demo.press(self.button),
+            grounded="press the button at <> to stop",
+            failed=lambda: any_picked_up(self, self.cubes),
+            targets=[self.button],
+            choice="c",
+        )
+        return [*steps, press]
+
+    def _pick(self, i: int) -> SubTask:
+        return SubTask(
+            f"pick up the {self.cube.colour} cube for the {ordinal(i)} time",
+            done=lambda: picked_up(self, self.cube),
+            run=lambda demo: demo.pick(self.cube),
+            grounded=f"pick up the {self.cube.colour} cube at <> for the {ordinal(i)} time",
+            failed=self._strayed,
+            targets=[self.cube],
+            choice="a",
+            pick=True,
+        )
+
+    def _place(self) -> SubTask:
+        return SubTask(
+            f"place the {self.cube.colour} cube onto the target",
+            done=lambda: dropped_onto(self, self.cube, self.target),
+            run=lambda demo: demo.place_on(self.target),
+            grounded=f"place the {self.cube.colour} cube onto the target at <>",
+            failed=self._strayed,
+            targets=[self.target],
+            choice="b",
+        )
+
+    def _strayed(self) -> bool:
+        others = [cube for cube in self.cubes if cube is not self.cube]
+        return any_picked_up(self, others) or pressed(self.button)
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice("b", "place the cube onto the target", lambda demo, _: demo.place_on(self.target)),
+            Choice("c", "press the button to stop", lambda demo, _: demo.press(self.button)),
+        ]
+
+    def goals(self) -> list[str]:
+        start = f"pick up the {self.cube.colour} cube and place it on the target"
+        if self.repetitions == 1:
+            return [f"{start}, then press the button to stop"]
+        return [
+            f"{start}, repeating this {action} {number(self.repetitions)} times, then press the button to stop"
+            for action in ("action", "pick-and-place action")
+        ]

@@ -1,0 +1,143 @@
+"""RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same route."""
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.motions import Mark, Trace, build_mark
+from mme_vla.envs.objects import Disc, build_disc, build_obstacle
+from mme_vla.envs.predicates import over
+from mme_vla.envs.stick import back_to_start
+from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.tasks import register_task
+from mme_vla.envs.things import distance_xy
+
+if TYPE_CHECKING:
+    from mme_vla.envs.demonstrator import Demonstrator
+
+PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
+MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
+VISIT, VISIT_HEIGHT = 0.03, 0.15
+MARK_RADIUS, MARK_STEPS = 0.02004, 40
+HOME_STEPS = 200
+SIDES = (("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"))
+
+
+@register_task
+class RouteStick(MemoryTask):
+    """Five discs in a row with an obstacle between each two; left is the larger y."""
+
+    stick = True
+    latch_failure = True
+
+    def build(self, draws: Draws) -> None:
+        angle = math.radians(-30 + 60 * draws.uniform())
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        places = [turn @ (CENTRE_X, (i - PLACES // 2) * SPACING) for i in range(PLACES)]
+        self.all_discs = [
+            self.add(build_disc(self, f"disc_{i}", 0.02, 0.01, "gray", xy, z=-0.01 if i % 2 else 0.01))
+            for i, xy in enumerate(places)
+        ]
+        for i in range(1, PLACES, 2):
+            self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, draws.uniforms(3).tolist()))
+        self.discs = self.all_discs[::2]
+        self._draw_route(draws)
+        self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(5)]
+        self._dots = Trace(self)
+
+    def _draw_route(self, draws: Draws) -> None:
+        low, high = MOVES[self.difficulty]
+        moves = draws.integer(low, high + 1)
+        route = [draws.integer(0, len(self.discs))]
+        for _ in range(moves):
+            nearby = [i for i in (route[-1] - 1, route[-1] + 1) if 0 <= i < len(self.discs)]
+            if self.difficulty != "hard" and len(route) > 1 and len(nearby) > 1:
+                nearby.remove(route[-2])
+            route.append(nearby[draws.integer(0, len(nearby))])
+        self.route = [self.discs[i] for i in route]
+        self.turns = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+
+    def start_episode(self, draws: Draws) -> None:
+        self.marks = [Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)]
+        self._dots.restart()
+        self._way: list[np.ndarray] = []
+        self._way_of: SubTask | None = None
+
+    def after_step(self, k: int) -> None:
+        tcp = self.tcp_pose.p
+        for mark, disc in zip(self.marks, self.discs, strict=True):
+            mark.update(k, over(tcp, disc, VISIT, VISIT_HEIGHT))
+        self._dots.update(k)
+
+    def failure(self) -> bool:
+        """Remembers the way of the tool since the last visit; the rules belong to the moves."""
+        if self.progress.current is not self._way_of:
+            self._way_of, self._way = self.progress.current, []
+        self._way.append(np.asarray(self.tcp_pose.p[:2], np.float64))
+        return False
+
+    def _turned(self, previous: Disc, goal: Disc) -> str:
+        """How the tool went around what lies between two discs: on which side of the chord it was on average."""
+        way = np.mean(self._way, axis=0) - previous.position[:2]
+        chord = goal.position[:2] - previous.position[:2]
+        return "clockwise" if chord[0] * way[1] - chord[1] * way[0] > 0 else "counterclockwise"
+
+    def subtasks(self) -> list[SubTask]:
+        first = self.route[0]
+        approach = SubTask(
+            NO_RECORD,
+            done=lambda: over(self.tcp_pose.p, first),
+            run=lambda demo: demo.stick_to(first, store=True),
+            video=True,
+        )
+        return [approach, *self._moves(video=True), *back_to_start(self, HOME_STEPS), *self._moves(video=False)]
+
+    def _moves(self, video: bool) -> list[SubTask]:
+        legs = zip(self.route, self.route[1:], self.turns, strict=False)
+        return [self._move(previous, goal, turn, video) for previous, goal, turn in legs]
+
+    def _move(self, previous: Disc, goal: Disc, turn: str, video: bool) -> SubTask:
+        others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]
+        side = "left" if goal.position[1] > previous.position[1] else "right"
+
+        def there() -> bool:
+            return over(self.tcp_pose.p, goal, VISIT, VISIT_HEIGHT)
+
+        def failed() -> bool:
+            astray = any(over(self.tcp_pose.p, disc) for disc in others)
+            return astray or (there() and self._turned(previous, goal) != turn)
+
+        return SubTask(
+            self._text(side, turn),
+            done=there,
+            run=lambda demo: demo.stick_arc(goal, turn),
+            failed=failed,
+            choice="abcd"[SIDES.index((side, turn))],
+            video=video,
+        )
+
+    @staticmethod
+    def _text(side: str, turn: str) -> str:
+        return f"move to the nearest {side} target by circling around the stick {turn}"
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice(letter, self._text(*side), lambda demo, _, side=side: self._go(demo, *side))
+            for letter, side in zip("abcd", SIDES, strict=True)
+        ]
+
+    def _go(self, demo: "Demonstrator", side: str, turn: str) -> None:
+        tcp = self.tcp_pose.p
+        here = min(range(len(self.discs)), key=lambda i: distance_xy(self.discs[i].position, tcp))
+        there = here + (1 if side == "left" else -1)
+        if 0 <= there < len(self.discs):
+            demo.stick_arc(self.discs[there], turn)
+
+    def goals(self) -> list[str]:
+        around = "use the stick attached to the robot to navigate around the sticks on the table"
+        goal = f"watch the video carefully, then {around}, following the same path"
+        return [goal, f"{goal} shown in the video"]

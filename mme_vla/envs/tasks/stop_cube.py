@@ -1,0 +1,131 @@
+"""StopCube (Counting): a cube goes back and forth over a target; stop it there on the right visit."""
+
+import math
+
+import numpy as np
+import sapien
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.language import ordinal
+from mme_vla.envs.motions import smoothstep
+from mme_vla.envs.objects import build_button, build_disc, build_moving_cube
+from mme_vla.envs.placement import draw_button
+from mme_vla.envs.predicates import hovering, pressed
+from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.tasks import register_task
+from mme_vla.envs.things import distance_xy
+
+INTERVALS = (60, 80, 120)  # steps of one pass
+PASSES = 5
+REACH = 0.3  # from the target to either end of the line
+STOPPED_AT = 0.06
+LEAD = 30  # steps before the crossing at which the demonstrator begins to press
+CHECKPOINT = 100
+
+
+@register_task
+class StopCube(MemoryTask):
+    """The difficulty changes nothing."""
+
+    latch_failure = True
+
+    def build(self, draws: Draws) -> None:
+        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
+        xy = (draws.between(-0.1, 0.1), draws.between(-0.1, 0.1))
+        self.target = self.add(build_disc(self, "target", 0.036, 0.01, "purple", xy))
+        self.cube = self.add(build_moving_cube(self, "cube", draws.uniforms(3).tolist(), xy, z=0.01))
+
+    def start_episode(self, draws: Draws) -> None:
+        draws = Draws(self.seed)
+        draws.integer(27, 33)
+        self.interval = INTERVALS[draws.integer(0, 3)]
+        self.visit = draws.integer(2, 6)
+        angle = math.radians(draws.between(-30, 30))
+        self._reach = REACH * np.array([-math.sin(angle), math.cos(angle)])
+        self.stopped_at: int | None = None
+        self._place(0)
+
+    def _place(self, k: int) -> None:
+        """Put the cube where it is after `k` steps."""
+        turn, steps = divmod(min(k, self.interval * PASSES), self.interval)
+        if turn == PASSES:
+            turn, steps = PASSES - 1, self.interval
+        side = 2 * smoothstep(steps / self.interval) - 1
+        xy = self.target.position[:2] + self._reach * (side if turn % 2 == 0 else -side)
+        self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
+
+    def before_physics(self, k: int) -> None:
+        if self.stopped_at is None and pressed(self.button):
+            self.stopped_at = k
+
+    def after_step(self, k: int) -> None:
+        if self.stopped_at is None:
+            self._place(k)
+
+    @property
+    def deadline(self) -> int:
+        """The step at which the wanted visit's pass ends."""
+        return self.interval * self.visit
+
+    def _in_time(self) -> bool:
+        return self.stopped_at is not None and self.deadline - self.interval <= self.stopped_at <= self.deadline
+
+    def _on_target(self) -> bool:
+        return distance_xy(self.cube.position, self.target.position) <= STOPPED_AT
+
+    def failure(self) -> bool:
+        if self.stopped_at is not None:
+            return not (self._on_target() and self._in_time())
+        return self.steps_done > self.deadline
+
+    def checkpoints(self) -> list[int]:
+        """Steps until which the arm waits: every 100th, then the one at which to press."""
+        last = self.deadline - self.interval // 2 - LEAD
+        return [*range(CHECKPOINT, last, CHECKPOINT), last]
+
+    def subtasks(self) -> list[SubTask]:
+        hover = SubTask(
+            "move to the top of the button to prepare",
+            done=lambda: hovering(self, self.button),
+            run=lambda demo: demo.hover(self.button),
+            grounded="move to the top of the button at <> to prepare",
+            targets=[self.button],
+            choice="a",
+        )
+        press = SubTask(
+            "press the button to stop the cube on the target",
+            done=lambda: self._in_time() and self._on_target(),
+            run=lambda demo: demo.press(self.button, hold=False),
+            grounded="press the button to stop the cube on the target at <>",
+            targets=[self.target],
+            choice="c",
+        )
+        return [hover, *map(self._wait, self.checkpoints()), press]
+
+    def _wait(self, until: int) -> SubTask:
+        return SubTask(
+            "remain static",
+            done=lambda: self.steps_done >= until,
+            run=lambda demo: demo.hold_until(until),
+            choice="b",
+        )
+
+    def _next_checkpoint(self) -> int:
+        now = self.steps_done
+        return next((k for k in self.checkpoints() if k > now), now)
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "move to the top of the button to prepare", lambda demo, _: demo.hover(self.button)),
+            Choice("b", "remain static", lambda demo, _: demo.hold_until(self._next_checkpoint())),
+            Choice("c", "press button to stop the cube", lambda demo, _: demo.press(self.button, hold=False)),
+        ]
+
+    def goals(self) -> list[str]:
+        visit = ordinal(self.visit - 1)
+        return [
+            f"press the button to stop the cube just as it reaches the target for the {visit} time",
+            f"press the button to stop the cube exactly at the target on its {visit} visit",
+        ]

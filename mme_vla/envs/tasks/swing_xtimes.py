@@ -1,0 +1,148 @@
+"""SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.language import number, ordinal
+from mme_vla.envs.motions import Mark, build_mark
+from mme_vla.envs.objects import Cube, Disc, H, build_button, build_cube, build_disc
+from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.predicates import any_picked_up, dropped, picked_up, pressed
+from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.tasks import register_task
+from mme_vla.envs.things import distance_xy
+
+SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
+CUBES = {"easy": 1, "medium": 3, "hard": 3}
+TARGET_RADIUS = 0.04
+NEAR, LEFT = 0.03, 0.04  # a swing is entered within the first distance and left beyond the second
+LOW, HIGH = 0.12, 0.3  # likewise for the cube's height
+MARK_STEPS = 20
+
+
+class Swings:
+    """Counts how often the cube comes over one target, with hysteresis."""
+
+    def __init__(self, cube: Cube, target: Disc) -> None:
+        self._cube, self._target = cube, target
+        self.inside = False
+        self.count = 0
+
+    @property
+    def over(self) -> bool:
+        """The cube is above the target and low."""
+        cube = self._cube.position
+        return distance_xy(cube, self._target.position) <= NEAR and cube[2] < LOW
+
+    def update(self) -> None:
+        """Count, once a step."""
+        cube = self._cube.position
+        if not self.inside and self.over:
+            self.inside, self.count = True, self.count + 1
+        elif self.inside and (distance_xy(cube, self._target.position) > LEFT or cube[2] >= HIGH):
+            self.inside = False
+
+
+@register_task
+class SwingXtimes(MemoryTask):
+    """The cube goes right, then left, `repetitions` times."""
+
+    latch_failure = True
+
+    def plan(self, draws: Draws) -> None:
+        low, high = SWINGS[self.difficulty]
+        self.repetitions = draws.integer(low, high + 1)
+
+    def build(self, draws: Draws) -> None:
+        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
+        colours = [("red", "blue", "green")[i] for i in draws.permutation(3)]
+        draws.integer(0, 3)
+        self.cubes: list[Cube] = []
+        for colour in colours[: CUBES[self.difficulty]]:
+            place = draw_cube(draws, Region((-0.1, 0), 0.25), [self.button, *self.cubes], gap=H)
+            if place is None:
+                raise SceneError(f"SwingXtimes, seed {self.seed}: the {colour} cube finds no place.")
+            self.cubes.append(self.add(build_cube(self, f"cube_{colour}", colour, *place)))
+        targets: list[Disc] = []
+        for y in (-0.2, 0.2):
+            avoid = [self.button, *self.cubes, *targets]
+            xy = draw_disc(draws, Region((-0.1, y), 0.1), TARGET_RADIUS, avoid, gap=H)
+            if xy is None:
+                raise SceneError(f"SwingXtimes, seed {self.seed}: a target finds no place.")
+            targets.append(self.add(build_disc(self, f"target_{len(targets)}", TARGET_RADIUS, 0.005, "gray", xy)))
+        # Right and left as the robot sees them.
+        self.right, self.left = sorted(targets, key=lambda target: target.position[1])
+        self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+        self._marks = [build_mark(self, f"mark_{i}", TARGET_RADIUS * 1.003, 0.014) for i in (0, 1)]
+
+    def start_episode(self, draws: Draws) -> None:
+        self.swings = [Swings(self.cube, target) for target in (self.right, self.left)]
+        targets = (self.right, self.left)
+        self.marks = [Mark(d, t.position, MARK_STEPS) for d, t in zip(self._marks, targets, strict=True)]
+
+    def after_step(self, k: int) -> None:
+        for mark, swings in zip(self.marks, self.swings, strict=True):
+            mark.update(k, swings.over)
+
+    def failure(self) -> bool:
+        for swings in self.swings:
+            swings.update()
+        early = self.progress.index < len(self.progress.subtasks) - 1 and pressed(self.button)
+        wrong = any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube])
+        return early or wrong or sum(swings.count for swings in self.swings) > 2 * self.repetitions
+
+    def subtasks(self) -> list[SubTask]:
+        cube, colour = self.cube, self.cube.colour
+        pick = SubTask(
+            f"pick up the {colour} cube",
+            done=lambda: picked_up(self, cube),
+            run=lambda demo: demo.pick(cube),
+            grounded=f"pick up the {colour} cube at <>",
+            targets=[cube],
+            choice="a",
+            pick=True,
+        )
+        put_down = SubTask(
+            f"put the {colour} cube on the table",
+            done=lambda: dropped(self, cube),
+            run=lambda demo: demo.put_down(),
+            targets=[cube],
+            choice="c",
+        )
+        press = SubTask(
+            "press the button",
+            done=lambda: pressed(self.button),
+            run=lambda demo: demo.press(self.button),
+            grounded="press the button at <>",
+            targets=[self.button],
+            choice="d",
+        )
+        sides = [("right", self.right, self.swings[0]), ("left", self.left, self.swings[1])]
+        moves = [self._move(i, *side) for i in range(self.repetitions) for side in sides]
+        return [pick, *moves, put_down, press]
+
+    def _move(self, i: int, side: str, target: Disc, swings: Swings) -> SubTask:
+        return SubTask(
+            f"move to the top of the {side}-side target for the {ordinal(i)} time",
+            done=lambda: swings.over,
+            run=lambda demo: demo.move_over(target, 0.1),
+            grounded=f"move to the top of the {side}-side target at <> for the {ordinal(i)} time",
+            targets=[target],
+            choice="b",
+        )
+
+    def choices(self) -> list[Choice]:
+        targets = [self.right, self.left]
+        return [
+            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice("b", "move to the top of the target", lambda demo, disc: demo.move_over(disc, 0.1), lambda: targets),
+            Choice("c", "put the cube on the table", lambda demo, _: demo.put_down()),
+            Choice("d", "press the button", lambda demo, _: demo.press(self.button)),
+        ]
+
+    def goals(self) -> list[str]:
+        pick = f"pick up the {self.cube.colour} cube, move it to the top of the right-side target, then"
+        if self.repetitions == 1:
+            return [f"{pick} put it down on the left-side target, finally press the button to stop"]
+        times = f"repeating this back-and-forth motion {number(self.repetitions)} times"
+        return [f"{pick} move it to the top of the left-side target, {times}, finally press the button to stop"]

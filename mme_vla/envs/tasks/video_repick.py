@@ -1,0 +1,172 @@
+"""VideoRepick (Reference): the video picks up a cube; pick the same one up again, wherever it is now."""
+
+from typing import TYPE_CHECKING
+
+from mme_vla.envs.anchors import ANCHOR_HALF, rotated_anchors, swaps_in_turn
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.language import number, ordinal
+from mme_vla.envs.motions import SWAP_STEPS, Swap
+from mme_vla.envs.objects import Cube, H, build_button, build_cube
+from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
+from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.tasks import register_task
+
+if TYPE_CHECKING:
+    from mme_vla.envs.demonstrator import Demonstrator
+
+SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
+ROUNDS = 5  # of the three colours, in hard episodes
+GO_HOME_STEPS = 20
+SHOWN_RELEASE_Z, RELEASE_Z = 0.03, 0.01
+PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
+
+
+@register_task
+class VideoRepick(MemoryTask):
+    """Three cubes of one colour that change places, or fifteen that do not."""
+
+    shared_draws = True
+    latch_failure = True
+    recovery_drawn_per_episode = True
+
+    def plan(self, draws: Draws) -> None:
+        self.repetitions = draws.integer(1, 4)
+        low, high = SWAPS[self.difficulty]
+        self.swap_count = draws.integer(low, high + 1)
+
+    def build(self, draws: Draws) -> None:
+        self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0), (0.1, 0.1))))
+        self.cubes: list[Cube] = []
+        self.initiators: list[Cube] = []
+        if self.difficulty == "hard":
+            for _ in range(ROUNDS):
+                for i in draws.permutation(3):
+                    self._add_cube(draws, ("red", "blue", "green")[i], Region((-0.1, 0), (0.2, 0.25)))
+            self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+            return
+        colour = ("red", "blue", "green")[draws.integer(0, 3)]
+        draws.permutation(4)  # part of the official stream, without effect
+        for anchor in rotated_anchors(draws, 3):
+            self._add_cube(draws, colour, Region(anchor, ANCHOR_HALF))
+        self.cube = self.cubes[draws.permutation(3)[0]]
+        others = [cube for cube in self.cubes if cube is not self.cube]
+        self.initiators = [self.cube, *(others[i] for i in draws.permutation(2))][: self.swap_count]
+
+    def _add_cube(self, draws: Draws, colour: str, region: Region) -> None:
+        place = draw_cube(draws, region, [self.button, *self.cubes], gap=H)
+        if place is None:
+            raise SceneError(f"VideoRepick, seed {self.seed}: cube {len(self.cubes)} finds no place.")
+        self.cubes.append(self.add(build_cube(self, f"cube_{len(self.cubes)}", colour, *place)))
+
+    def start_episode(self, draws: Draws) -> None:
+        self.swaps: list[Swap] = []
+        self._entered: dict[str, int] = {}
+
+    def before_physics(self, k: int) -> None:
+        if self.initiators and not self.swaps and self.progress.current is self._swap_stage:
+            self.swaps = swaps_in_turn(self.initiators, self.cubes, start=k)
+        for swap in self.swaps:
+            swap.apply(k)
+
+    def _pressed_early(self, kind: str) -> bool:
+        waited = self.steps_done - self._entered.setdefault(kind, self.steps_done)
+        return PRESS_PUNISHED[0] <= waited <= PRESS_PUNISHED[1] and pressed(self.button)
+
+    def subtasks(self) -> list[SubTask]:
+        return [*self._video(), *self._execution()]
+
+    def _video(self) -> list[SubTask]:
+        cube = self.cube
+        pick = SubTask(
+            "pick up the cube",
+            done=lambda: picked_up(self, cube),
+            run=lambda demo: demo.pick(cube),
+            targets=[cube],
+            choice="a",
+            video=True,
+        )
+        drop = SubTask(
+            "drop the cube on the table",
+            done=lambda: dropped(self, cube),
+            run=lambda demo: demo.put_down(SHOWN_RELEASE_Z),
+            targets=[cube],
+            choice="b",
+            video=True,
+        )
+        swaps = [
+            SubTask("static", StaticFor(self, SWAP_STEPS), lambda demo: demo.hold(SWAP_STEPS), video=True)
+            for _ in self.initiators
+        ]
+        self._swap_stage = swaps[0] if swaps else None
+        home = [SubTask("static", StaticFor(self, GO_HOME_STEPS), self._go_home, video=True)] if swaps else []
+        back = SubTask(
+            NO_RECORD,
+            done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
+            run=lambda demo: demo.hard_reset(),
+            video=True,
+        )
+        return [pick, drop, *home, *swaps, back]
+
+    @staticmethod
+    def _go_home(demo: "Demonstrator") -> None:
+        demo.go_home()
+        demo.hold(GO_HOME_STEPS)
+
+    def _execution(self) -> list[SubTask]:
+        press = SubTask(
+            "press the button to finish",
+            done=lambda: pressed(self.button),
+            run=lambda demo: demo.press(self.button),
+            grounded="press the button at <> to finish",
+            failed=lambda: any_picked_up(self, self.cubes),
+            targets=[self.button],
+            choice="c",
+        )
+        return [*(step for i in range(self.repetitions) for step in (self._pick(i), self._put())), press]
+
+    def _pick(self, i: int) -> SubTask:
+        return SubTask(
+            f"pick up the correct cube for the {ordinal(i)} time",
+            done=lambda: picked_up(self, self.cube),
+            run=lambda demo: demo.pick(self.cube),
+            grounded=f"pick up the correct cube at <> for the {ordinal(i)} time",
+            failed=lambda: self._other_picked_up() or self._pressed_early("pick"),
+            targets=[self.cube],
+            choice="a",
+            pick=True,
+        )
+
+    def _put(self) -> SubTask:
+        return SubTask(
+            "put it down",
+            done=lambda: dropped(self, self.cube),
+            run=lambda demo: demo.put_down(RELEASE_Z),
+            failed=lambda: self._other_picked_up() or self._pressed_early("put"),
+            targets=[self.cube],
+            choice="b",
+        )
+
+    def _other_picked_up(self) -> bool:
+        return any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube])
+
+    def choices(self) -> list[Choice]:
+        return [
+            Choice("a", "pick up the cube", lambda demo, cube: demo.pick(cube), lambda: self.cubes),
+            Choice("b", "put it down", lambda demo, _: demo.put_down(RELEASE_Z)),
+            Choice("c", "press the button to finish", lambda demo, _: demo.press(self.button)),
+        ]
+
+    def goals(self) -> list[str]:
+        start = "watch the video carefully, then"
+        if self.repetitions == 1:
+            again = "pick up the same block that was previously picked up again"
+            return [f"{start} {again}, finally put it down and press the button to stop"]
+        times = f"for {number(self.repetitions)} times"
+        again = f"repeatedly pick up and put down the same block that was previously picked up {times}"
+        return [
+            f"{start} {again}, finally put it down and press the button to stop",
+            f"{start} {again}, finally press the button to stop",
+        ]

@@ -1,0 +1,41 @@
+"""VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
+
+from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.containers import add_containers, add_hidden_cubes, container_choices, container_picks, hiding_goal
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.motions import COVER_STEPS, Cover
+from mme_vla.envs.predicates import StaticFor
+from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.tasks import register_task
+
+CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # asked for; in hard episodes as many as fit
+PICKS = {"easy": 1, "medium": 1, "hard": 2}
+
+
+@register_task
+class VideoUnmask(MemoryTask):
+    """Containers cover three cubes during the conditioning video."""
+
+    def build(self, draws: Draws) -> None:
+        self.containers = add_containers(self, draws, CONTAINERS[self.difficulty])
+        self.colours = [("red", "green", "blue")[i] for i in draws.permutation(3)]
+        add_hidden_cubes(self, self.colours, self.containers)
+
+    def start_episode(self, draws: Draws) -> None:
+        self.cover = Cover(self.containers)
+
+    def before_physics(self, k: int) -> None:
+        self.cover.apply(k)
+
+    def subtasks(self) -> list[SubTask]:
+        static = StaticFor(self, COVER_STEPS)
+        wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
+        picks = container_picks(self, wanted, self.containers)
+        return [SubTask("static", static, lambda demo: demo.hold(COVER_STEPS), video=True), *picks]
+
+    def choices(self) -> list[Choice]:
+        return container_choices(self.containers)
+
+    def goals(self) -> list[str]:
+        return [f"watch the video carefully, then {hiding_goal(self.colours[: PICKS[self.difficulty]])}"]

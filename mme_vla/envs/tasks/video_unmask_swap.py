@@ -1,0 +1,29 @@
+"""VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick up the right one."""
+
+from mme_vla.envs.anchors import rotated_anchors
+from mme_vla.envs.choices import Choice
+from mme_vla.envs.containers import container_choices, container_picks, hiding_goal
+from mme_vla.envs.draws import Draws
+from mme_vla.envs.predicates import StaticFor
+from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.tasks import register_task
+from mme_vla.envs.unmask_swap import CONTAINERS, UnmaskSwap
+
+
+@register_task
+class VideoUnmaskSwap(UnmaskSwap):
+    """Covering and swapping take place in the conditioning video."""
+
+    def build(self, draws: Draws) -> None:
+        self.build_containers(draws, rotated_anchors(draws, CONTAINERS[self.difficulty]))
+
+    def subtasks(self) -> list[SubTask]:
+        static = StaticFor(self, self.swapped_after)
+        watch = SubTask("static", static, lambda demo: demo.hold(self.swapped_after), video=True)
+        return [watch, *container_picks(self, self.wanted, self.containers)]
+
+    def choices(self) -> list[Choice]:
+        return container_choices(self.containers)
+
+    def goals(self) -> list[str]:
+        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.wanted])}"]

@@ -1,0 +1,68 @@
+"""What stands on the table, as the tasks see it: an entity with a name, a place, and a place to go back to."""
+
+from typing import Any
+
+import numpy as np
+import sapien
+
+AWAY = (10.0, 10.0, 10.0)
+"""Where objects are kept while they are not in the scene."""
+
+
+class Thing:
+    """One object of a scene: a ManiSkill actor, or one link of an articulation.
+
+    Args:
+        name: unique in the scene.
+        entity: the `Actor` or `Link` whose pose and pixels count.
+    """
+
+    def __init__(self, name: str, entity: Any) -> None:
+        self.name = name
+        self.entity = entity
+        self._initial = self.pose
+
+    @property
+    def pose(self) -> sapien.Pose:
+        """Pose in the world."""
+        return self.entity.pose.sp
+
+    @property
+    def position(self) -> np.ndarray:
+        """Origin in the world [3], metres."""
+        return np.asarray(self.pose.p)
+
+    @property
+    def initial_pose(self) -> sapien.Pose:
+        """Where the object was put when the scene was built; `restore` brings it back there."""
+        return self._initial
+
+    def move_to(self, pose: sapien.Pose) -> None:
+        """Teleport the object, at rest."""
+        self.entity.set_pose(pose)
+        if self.entity.px_body_type == "dynamic":
+            self.entity.set_linear_velocity(np.zeros((1, 3), np.float32))
+            self.entity.set_angular_velocity(np.zeros((1, 3), np.float32))
+
+    def move_away(self) -> None:
+        """Take the object out of the scene, keeping its orientation."""
+        self.move_to(sapien.Pose(AWAY, self.pose.q))
+
+    def set_home(self, pose: sapien.Pose) -> None:
+        """Make `pose` the place the object is restored to, and put it there."""
+        self._initial = pose
+        self.move_to(pose)
+
+    def restore(self) -> None:
+        """Put the object where it was when the scene was built."""
+        self.move_to(self._initial)
+
+    @property
+    def segmentation_ids(self) -> list[int]:
+        """Ids of the object's pixels in a segmentation image."""
+        return [int(self.entity.per_scene_id[0])]
+
+
+def distance_xy(a: np.ndarray, b: np.ndarray) -> float:
+    """Distance of two points on the table, metres."""
+    return float(np.linalg.norm(np.asarray(a)[:2] - np.asarray(b)[:2]))

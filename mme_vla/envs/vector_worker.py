@@ -1,0 +1,156 @@
+"""One worker process of a `VecEnv`: builds environments, steps them, and hands frames over through shared memory."""
+
+import contextlib
+import pickle
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+LARGE = 4096
+"""Arrays of at least this many bytes go through shared memory; everything else is pickled."""
+FRAMES_PER_BLOCK = 8
+BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
+"""Shared memory of one worker: long videos are handed over in pieces of this size."""
+
+# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any answer. RESULT: the
+# outcome of a command. FAILURE: the command raised.
+PIECE, RESULT, FAILURE = "piece", "result", "failure"
+# Commands to a worker.
+RESET, STEP, CLOSE, GO_ON = "reset", "step", "close", "go on"
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Stands in a message for an array that came through shared memory: the n-th of the message."""
+
+    index: int
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Where one array lies in the block."""
+
+    offset: int
+    shape: tuple[int, ...]
+    dtype: str
+
+
+def send(connection: Any, *message: Any) -> None:
+    """Send a message as a plain pickle, so that tensors travel by value and not as file descriptors."""
+    connection.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+
+
+def receive(connection: Any) -> tuple:
+    """Receive what `send` sent."""
+    return pickle.loads(connection.recv_bytes())
+
+
+def read(block: Any, slots: list[Slot]) -> list[np.ndarray]:
+    """Copies of the arrays that lie in a block."""
+    return [
+        np.frombuffer(block, slot.dtype, int(np.prod(slot.shape)), slot.offset).reshape(slot.shape).copy()
+        for slot in slots
+    ]
+
+
+def restore(value: Any, arrays: list[np.ndarray]) -> Any:
+    """Put the arrays back where `Placed` stands for them."""
+    if isinstance(value, Placed):
+        return arrays[value.index]
+    if isinstance(value, dict):
+        return {key: restore(item, arrays) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(restore(item, arrays) for item in value)
+    return value
+
+
+def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
+    """Run commands until told to close, or until the other side is gone."""
+    with contextlib.suppress(ImportError):
+        import torch
+
+        torch.set_num_threads(1)  # the workers themselves are the parallelism
+    env: Any = None
+    try:
+        while True:
+            command, *arguments = receive(connection)
+            if command == CLOSE:
+                return
+            try:
+                if command == RESET:
+                    if env is not None:
+                        env.close()
+                        env = None
+                    env = factory(**arguments[0], **options)
+                    outcome: Any = env.reset()
+                elif command == STEP:
+                    outcome = env.step(arguments[0])
+                else:
+                    continue
+            except Exception as error:
+                send(connection, FAILURE, type(error).__name__, str(error))
+                continue
+            _hand_over(connection, block, outcome)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        return
+    finally:
+        if env is not None:
+            env.close()
+
+
+def _hand_over(connection: Any, block: Any, outcome: Any) -> None:
+    large: list[np.ndarray] = []
+    light = _lift(outcome, large)
+    for slots in _pieces(block, large):
+        send(connection, PIECE, slots)
+        receive(connection)
+    send(connection, RESULT, light)
+
+
+def _lift(value: Any, large: list[np.ndarray]) -> Any:
+    """Take the large arrays out of a nested value."""
+    if isinstance(value, np.ndarray) and LARGE <= value.nbytes <= BLOCK_BYTES and value.dtype != object:
+        large.append(value)
+        return Placed(len(large) - 1)
+    if isinstance(value, dict):
+        return {key: _lift(item, large) for key, item in value.items()}
+    if type(value) in (list, tuple):
+        return type(value)(_lift(item, large) for item in value)
+    return value
+
+
+def _pieces(block: Any, arrays: list[np.ndarray]) -> Iterator[list[Slot]]:
+    """Fill the block with as many arrays as it holds, again and again."""
+    memory = np.frombuffer(block, np.uint8)
+    slots: list[Slot] = []
+    used = 0
+    for array in arrays:
+        size = -(-array.nbytes // 64) * 64
+        if used + array.nbytes > len(memory):
+            yield slots
+            slots, used = [], 0
+        memory[used : used + array.nbytes] = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        slots.append(Slot(used, array.shape, array.dtype.str))
+        used += size
+    if slots:
+        yield slots
+
+
+def last_words(process: Any) -> str:
+    """How a process ended."""
+    process.join(1.0)
+    code = process.exitcode
+    return f"died of signal {-code}" if code is not None and code < 0 else f"ended with exit code {code}"
+
+
+def end(process: Any) -> None:
+    """Stop a process, by force if need be, and forget it."""
+    if process.is_alive():
+        process.terminate()
+        process.join(1.0)
+    if process.is_alive():
+        process.kill()
+        process.join()
+    process.close()

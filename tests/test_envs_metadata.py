@@ -1,0 +1,116 @@
+"""Seeds and difficulties of the benchmark's episodes."""
+
+import json
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from mme_vla.envs import metadata
+from mme_vla.envs.metadata import episode, episodes, formula, generate, write
+from mme_vla.envs.names import TASK_NAMES
+from mme_vla.errors import UserError
+
+
+@pytest.fixture(autouse=True)
+def _shipped_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(metadata.FOLDER_VARIABLE, raising=False)
+    monkeypatch.setattr(metadata, "_installed_folder", lambda: None)
+
+
+@pytest.mark.parametrize(("split", "count"), [("train", 1600), ("val", 800), ("test", 800)])
+def test_every_split_has_its_number_of_episodes(split: str, count: int) -> None:
+    table = [spec for task in TASK_NAMES for spec in episodes(task, split)]
+    assert len(table) == count
+    assert len({(spec.task, spec.seed) for spec in table}) == count
+
+
+def test_seeds_follow_the_order_of_tasks_and_episodes() -> None:
+    assert episode("PickXtimes", "train", 0).seed == 1000
+    assert episode("RouteStick", "train", 0).seed == 16000
+    assert episode("StopCube", "val", 2).seed == 1_020_200
+    assert episode("RouteStick", "test", 49).seed == 664_900
+
+
+@pytest.mark.parametrize(("split", "counts"), [("train", (50, 25, 25)), ("val", (26, 12, 12)), ("test", (26, 12, 12))])
+def test_difficulties_are_distributed_as_the_benchmark_says(split: str, counts: tuple[int, int, int]) -> None:
+    found = Counter(spec.difficulty for spec in episodes("MoveCube", split))
+    assert (found["easy"], found["medium"], found["hard"]) == counts
+
+
+def test_the_first_six_train_episodes_are_recovery_demonstrations() -> None:
+    assert [episode("BinFill", "train", index).recovery for index in range(7)] == ["z"] * 3 + ["xy"] * 3 + [None]
+    assert episode("BinFill", "test", 0).recovery is None
+
+
+def test_the_shipped_table_equals_the_generated_one_except_where_episodes_confirm_it(tmp_path: Path) -> None:
+    official = [
+        s for task in TASK_NAMES for split in metadata.SPLITS for s in episodes(task, split) if s.source != "formula"
+    ]
+    write(generate(official), tmp_path)
+    shipped = Path(metadata.__file__).parent.parent / "assets" / "robomme_metadata"
+    for split in metadata.SPLITS:
+        assert (shipped / f"{split}.csv").read_text() == (tmp_path / f"{split}.csv").read_text()
+
+
+def test_given_official_episodes_agree_with_the_table(h5_folder: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    compared = 0
+    for path in h5_folder.glob("record_dataset_*.h5"):
+        task = path.stem.removeprefix("record_dataset_")
+        with h5py.File(path) as file:
+            for name, group in file.items():
+                spec = episode(task, "train", int(name.removeprefix("episode_")))
+                assert spec.seed == int(group["setup/seed"][()])
+                assert spec.difficulty == group["setup/difficulty"][()].decode()
+                compared += 1
+    assert compared > 0
+
+
+def test_official_metadata_overrules_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "test"
+    folder.mkdir()
+    records = [{"task": "StopCube", "episode": 0, "seed": 520_003, "difficulty": "hard"}]
+    content = {"env_id": "StopCube", "record_count": 1, "records": records}
+    (folder / "record_dataset_StopCube_metadata.json").write_text(json.dumps(content))
+    monkeypatch.setenv(metadata.FOLDER_VARIABLE, str(tmp_path))
+    spec = episode("StopCube", "test", 0)
+    assert (spec.seed, spec.difficulty, spec.source) == (520_003, "hard", "official")
+    with pytest.raises(UserError, match="expected 0 to 0"):
+        episode("StopCube", "test", 1)
+    with pytest.raises(UserError, match="does not exist"):
+        episode("BinFill", "test", 0)
+
+
+def test_a_broken_official_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "test").mkdir()
+    (tmp_path / "test" / "record_dataset_StopCube_metadata.json").write_text('{"records": [{"episode": 0}]}')
+    with pytest.raises(UserError, match="not official metadata"):
+        episodes("StopCube", "test", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("PickXtime", "test", 0), "PickXtimes"),
+        (("PickXtimes", "tset", 0), "'test'"),
+        (("PickXtimes", "test", 50), "expected 0 to 49"),
+        (("PickXtimes", "test", -1), "expected 0 to 49"),
+        (("PickXtimes", "test", True), "expected 0 to 49"),
+    ],
+)
+def test_an_unknown_episode_is_refused(arguments: tuple, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        episode(*arguments)
+
+
+def test_the_formula_gives_seeds_before_retries() -> None:
+    assert formula("VideoUnmask", "train", 4) == (6400, "easy")
+    assert formula("VideoUnmask", "train", 7) == (6700, "hard")
+
+
+def test_importing_the_room_does_not_import_the_simulator() -> None:
+    code = "import sys, mme_vla.envs as e; e.make_env, e.episodes; sys.exit('mani_skill' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
