@@ -12,8 +12,11 @@ from mme_vla.config import compose, import_plugins
 from mme_vla.errors import UserError
 from mme_vla.policy import MMEPolicy
 from mme_vla.processing.processor import Processor
+from mme_vla.processing.prompt import PROMPTS
 
-SECTIONS = ("name", "plugins", "backbone", "memory", "integration", "policy", "processor", "subgoal_text")
+SECTIONS = (
+    "name", "plugins", "backbone", "memory", "integration", "policy", "processor", "subgoal_text", "token_budget",
+)  # fmt: skip
 
 
 def build_policy(
@@ -68,12 +71,34 @@ def build_from_config(
     plain = OmegaConf.to_container(config, resolve=True)
     assert isinstance(plain, dict)
     sections = {key: plain[key] for key in SECTIONS if key in plain}
+    check_token_budget(sections)
     # Shapes need no words: on meta the full-size tokenizer is not asked for.
     processor = None if torch.device(device).type == "meta" else build_processor(sections)
     with torch.random.fork_rng(devices=[]), torch.device(device):
         torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
         policy = MMEPolicy.from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()
+
+
+def check_token_budget(sections: Mapping[str, Any]) -> None:
+    """Make sure that memory and subgoal together stay within `token_budget`, where there is one.
+
+    Raises:
+        UserError: they do not, or the subgoal has no limit.
+    """
+    budget = sections.get("token_budget")
+    if budget is None:
+        return
+    memory = (sections.get("memory") or {}).get("budget", 0)
+    reads = PROMPTS[sections["processor"].get("prompt", "plain")].reads_subgoal
+    subgoal = sections["processor"].get("subgoal_length") if reads else 0
+    if subgoal is None:
+        raise UserError(f"token_budget={budget} needs a limit of the subgoal too: set processor.subgoal_length.")
+    if memory + subgoal > budget:
+        raise UserError(
+            f"memory.budget={memory} and processor.subgoal_length={subgoal} make {memory + subgoal} tokens, more than "
+            f"token_budget={budget}: lower one of them, or raise token_budget."
+        )
 
 
 def build_processor(sections: Mapping[str, Any]) -> Processor:

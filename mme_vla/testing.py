@@ -18,7 +18,8 @@ PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context"
 RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
 NEURAL = [*PERCEPTUAL, *RECURRENT]
 MODELS = ["pi05", *NEURAL]
-ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL]  # the first four are one network
+# The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
+ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hybrid"]
 SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp_dim": 64, "num_heads": 2}
 
 

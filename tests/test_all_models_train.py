@@ -1,4 +1,4 @@
-"""Each of the 16 models trains on the embedded sample as `python -m mme_vla.train` does; recurrent ones resume."""
+"""Each of the 17 models trains on the embedded sample as `python -m mme_vla.train` does; recurrent ones resume."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -29,6 +29,7 @@ SMALL = [
 ]  # fmt: skip
 SHORT_MEMORY = {
     "framesamp": ["memory.budget=64"],
+    "hybrid": ["memory.budget=64"],
     "tokendrop": ["memory.budget=128"],
     "ttt": ["memory.budget=128", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2"],
     "rmt": ["memory.budget=64", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2"],
@@ -67,7 +68,7 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(model: str, folder: Path, caches: Path, *overrides: str) -> Path:
     """Train in this process; the last checkpoint."""
-    memory = SHORT_MEMORY[model.split("_")[0]] if model in NEURAL else []
+    memory = SHORT_MEMORY[model.split("_")[0]] if model in [*NEURAL, "hybrid"] else []
     cfg = compose("train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides])
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     return train(cfg, config, folder, begun=time.perf_counter())

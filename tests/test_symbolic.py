@@ -123,3 +123,43 @@ def test_an_episode_knows_its_executed_actions_by_the_frames_that_follow():
     assert np.array_equal(episode._executed, np.concatenate([second[3:16], other]))
     with pytest.raises(UserError, match="actions must be"):
         observe(episode, 2, actions=other[:1])
+
+
+def test_hybrid_reads_subgoal_and_memory_and_both_change_its_actions(source):
+    policy, frames = small_policy("hybrid"), moving_frames(40)
+    data = TrainingDataset([source], policy.processor, subgoal=SubgoalText.from_config(policy.config["subgoal_text"]))
+    assert re.search(r"Current Subgoal: .+ at <\d+", re.sub(r"\s+", " ", words(policy, data[5])))
+
+    def act(past, subgoal):
+        episode = policy.start_episode("sort the cubes", seed=1)
+        episode.observe({"image": past, "wrist_image": past}, np.zeros((len(past), 8)))
+        episode.subgoal = subgoal
+        return policy.act([episode])
+
+    usual = act(frames, "press the button at <1, 2>")
+    assert not np.allclose(usual, act(frames, "put it down"))
+    assert not np.allclose(usual, act(np.concatenate([frames[:39][::-1], frames[39:]]), "press the button at <1, 2>"))
+
+
+def test_hybrid_keeps_memory_and_subgoal_within_one_budget():
+    policy = build_policy("hybrid")
+    most = policy.processor.subgoal_length
+    assert policy.memory.budget + most == policy.config["token_budget"] == 512
+    with pytest.warns(UserWarning, match="subgoal_length=64"):
+        _, mask = policy.processor.prompt("goal", subgoal="pick up the red cube at <10, 20> " * 30)
+    _, without = policy.processor.prompt("goal", subgoal="")
+    assert int(mask.sum()) - int(without.sum()) <= most
+    for wrong in ({"memory": {"budget": 512}}, {"processor": {"subgoal_length": 80}}):
+        with pytest.raises(UserError, match="more than token_budget=512"):
+            build_policy("hybrid", device="meta", **wrong)
+    with pytest.raises(UserError, match=r"processor\.subgoal_length"):
+        build_policy("hybrid", processor={"subgoal_length": None})
+    assert build_policy("hybrid", memory={"budget": 256}).memory.budget == 256
+
+
+def test_hybrid_is_saved_and_loaded_with_its_limits(tmp_path):
+    from mme_vla import MMEPolicy
+
+    small_policy("hybrid").save_pretrained(tmp_path)
+    loaded = MMEPolicy.from_pretrained(tmp_path)
+    assert (loaded.processor.subgoal_length, loaded.memory.budget, loaded.config["token_budget"]) == (64, 448, 512)

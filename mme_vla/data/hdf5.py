@@ -126,14 +126,29 @@ class RawEpisode:
     def __len__(self) -> int:
         return self.length
 
-    def __iter__(self) -> Iterator[RawFrame]:
+    def subgoals(self) -> Iterator[dict[str, str]]:
+        """The four texts of every step, as in `RawFrame`, without reading pictures."""
         subgoals: dict[str, str] = {}
         for k in range(self.length):
             if not subgoals or not bool(self._step(k, "info/is_completed")):
                 subgoals = {name: _text(self._step(k, f"info/{name}")).lower() for name in SUBGOALS}
+            yield subgoals
+
+    def joints(self) -> tuple[np.ndarray, np.ndarray]:
+        """Joint angles and joint targets of every step, [t, 7] each, in the file's own precision."""
+        angles = [np.asarray(self._step(k, "obs/joint_state"))[:7] for k in range(self.length)]
+        targets = [np.asarray(self._step(k, "action/joint_action"))[:7] for k in range(self.length)]
+        return np.stack(angles), np.stack(targets)
+
+    def front(self, step: int) -> np.ndarray:
+        """The front picture of one step, [H, W, 3] uint8."""
+        return np.asarray(self._step(step, "obs/front_rgb"))
+
+    def __iter__(self) -> Iterator[RawFrame]:
+        for k, subgoals in enumerate(self.subgoals()):
             fingers = np.atleast_1d(self._step(k, "obs/gripper_state"))
             yield RawFrame(
-                front=np.asarray(self._step(k, "obs/front_rgb")),
+                front=self.front(k),
                 wrist=np.asarray(self._step(k, "obs/wrist_rgb")),
                 state=np.concatenate([self._step(k, "obs/joint_state"), fingers[:1]]).astype(np.float32),
                 action=np.asarray(self._step(k, "action/joint_action")),

@@ -14,7 +14,7 @@ from mme_vla.errors import UserError, did_you_mean
 from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
 from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.normalize import NormStats, normalize, unnormalize
-from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt
+from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
 from mme_vla.processing.tokenizer import HUB, Tokenizer
 
 CONFIG_FILE = "processor.json"
@@ -33,6 +33,7 @@ class Processor:
         tokenizer: turns prompts into ids.
         prompt: name of the prompt format (`PROMPTS`).
         prompt_length: l; longest prompt in tokens.
+        subgoal_length: longest subgoal in it, in tokens; None for no limit of its own.
         action_dim: a; width of the network's actions, the robot's own padded with zeros.
         horizon: h; steps in a chunk.
         views: camera names in the order the network sees them.
@@ -52,12 +53,14 @@ class Processor:
         horizon: int = 20,
         views: Sequence[str] = VIEWS,
         stats: NormStats | None = None,
+        subgoal_length: int | None = None,
     ) -> None:
         sizes = {
             "image_size": image_size,
             "prompt_length": prompt_length,
             "action_dim": action_dim,
             "horizon": horizon,
+            **({} if subgoal_length is None else {"subgoal_length": subgoal_length}),
         }
         for name, value in sizes.items():
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
@@ -69,6 +72,7 @@ class Processor:
         self.tokenizer = tokenizer
         self.image_size = image_size
         self.prompt_length = prompt_length
+        self.subgoal_length = subgoal_length
         self.action_dim = action_dim
         self.horizon = horizon
         self.views = tuple(views)
@@ -143,6 +147,8 @@ class Processor:
         if wanted and state is not None and past_actions is not None:
             recent = to_deltas(_float(past_actions)[-wanted:], _float(state))
             past = normalize(recent, self.require_stats().actions).numpy()
+        if subgoal is not None and self.prompt_format.reads_subgoal:
+            subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
         given = PromptInput(goal, subgoal, normalised, past)
         return encode_prompt(self.prompt_format, self.tokenizer, given, self.prompt_length)
 
@@ -194,6 +200,7 @@ class Processor:
             "tokenizer_fingerprint": self.tokenizer.fingerprint,
             "prompt": self.prompt_name,
             "prompt_length": self.prompt_length,
+            "subgoal_length": self.subgoal_length,
             "action_dim": self.action_dim,
             "horizon": self.horizon,
             "views": list(self.views),

@@ -166,6 +166,18 @@ def encode_prompt(
     return ids, torch.arange(max_length) < len(tokens)
 
 
+def shorten(text: str, tokenizer: Tokenizer, length: int | None) -> str:
+    """Cut a text to its first `length` tokens, with one warning; None leaves it as it is."""
+    tokens = tokenizer.encode(text, bos=False)
+    if length is None or len(tokens) <= length:
+        return text
+    _warn_once(
+        f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one: {text!r}.",
+        key=("shortened", length),
+    )
+    return tokenizer.decode(tokens[:length])
+
+
 def _one_line(text: str) -> str:
     return text.strip().replace("_", " ").replace("\n", " ")
 

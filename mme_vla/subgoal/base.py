@@ -1,0 +1,200 @@
+"""`SubgoalPredictor`: language subgoals for many running episodes at once.
+
+As with the policy, what belongs to one episode lives in an object of its own (`start_episode`), and `predict` answers
+for many episodes in one batch.
+"""
+
+import logging
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.registry import SUBGOALS
+from mme_vla.subgoal.parsing import MalformedAnswer, Parsed, Point
+from mme_vla.subgoal.prompts import KINDS
+
+log = logging.getLogger(__name__)
+PROBLEMS = ("malformed", "empty", "refused", "failed")
+
+
+@dataclass(frozen=True)
+class Subgoal:
+    """A subgoal for the policy, and how it came about.
+
+    text: in words, points as `<row, column>` in pixels of the front picture; None while there has been none (the
+        policy's prompt is then the plain one).
+    points: those points in order, (row, column).
+    asked: whether a model was asked for this one; False for one that is kept.
+    answer: what the model said, word for word; empty if none was asked.
+    problem: why the answer could not be used (one of `PROBLEMS`), empty if it could. The last subgoal is then kept.
+    """
+
+    text: str | None
+    points: tuple[Point, ...] = ()
+    asked: bool = False
+    answer: str = ""
+    problem: str = ""
+
+
+@dataclass
+class Usage:
+    """What a predictor has done so far, over all episodes.
+
+    calls: questions that were answered by a model (the cache's answers are counted apart). tokens: as the model counts
+    them. problems: unusable answers by kind. cost: US dollars.
+    """
+
+    calls: int = 0
+    cached: int = 0
+    retries: int = 0
+    input_tokens: int = 0
+    output_tokens: int = 0
+    seconds: float = 0.0
+    cost: float = 0.0
+    problems: Counter[str] = field(default_factory=Counter)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers, for logs."""
+        return {**asdict(self), "problems": dict(self.problems)}
+
+
+class SubgoalEpisode:
+    """What a predictor knows of one episode.
+
+    goal: the task in words, lower-case as in training. task: its name, empty if unknown.
+    video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
+    frame: the current front picture [H, W, 3] uint8. step: actions executed so far.
+    info: what the environment reports beside the picture. subgoal: the last prediction.
+    """
+
+    def __init__(self, goal: str, video: np.ndarray | None = None, task: str = "") -> None:
+        self.goal, self.task = goal.strip().lower(), task
+        self.video = np.zeros((0, 1, 1, 3), np.uint8) if video is None else _checked(video, "video")
+        self.frames_seen = 0
+        self.info: Mapping[str, Any] = {}
+        self.subgoal = Subgoal(None)
+        self._frame: np.ndarray | None = None
+
+    def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
+        """Take execution frames [n, H, W, 3] uint8 in order, each once, the current one last.
+
+        Args:
+            frames: of the front camera. The first call brings the first frame that is no video.
+            info: the environment's report on the last of them (the oracle reads its subgoal there).
+
+        Raises:
+            UserError: frames of another form.
+        """
+        frames = _checked(frames, "frames")
+        if len(frames):
+            self._frame = frames[-1]
+        self.frames_seen += len(frames)
+        self.info = info or {}
+
+    @property
+    def step(self) -> int:
+        """Actions executed so far: one frame each after the first."""
+        return max(self.frames_seen - 1, 0)
+
+    @property
+    def frame(self) -> np.ndarray:
+        """The current front picture.
+
+        Raises:
+            UserError: nothing was observed yet.
+        """
+        if self._frame is None:
+            raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
+        return self._frame
+
+
+class SubgoalPredictor:
+    """The interface of every predictor. A subclass implements `answer`, and overrides the rest where it needs to.
+
+    Args:
+        kind: `simple` (words alone) or `grounded` (with points).
+        interval: ask at steps that are multiples of it; predictions are wanted whenever a new chunk is due, every 16
+            steps, so 1 asks every time.
+    """
+
+    def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
+        if kind not in KINDS:
+            raise UserError(f"subgoal.kind={kind!r}. {did_you_mean(str(kind), KINDS)}")
+        if interval < 1:
+            raise UserError(f"subgoal.interval={interval} must be a positive number of steps.")
+        self.kind, self.interval = kind, interval
+        self.usage = Usage()
+
+    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> SubgoalEpisode:
+        """Begin an episode.
+
+        Args:
+            goal: the task in words. video: [t, H, W, 3] uint8, all frames before the first execution frame.
+            task: its name (`ButtonUnmask`), for rules that hold for some tasks.
+        """
+        return SubgoalEpisode(goal, video, task)
+
+    def predict(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
+        """The subgoals of these episodes at their current frames; those that are due are asked in one batch.
+
+        An answer that cannot be used is counted in `usage.problems` and the episode keeps its last subgoal.
+        """
+        due = [episode for episode in episodes if self.due(episode)]
+        for episode, subgoal in zip(due, self.answer(due) if due else [], strict=True):
+            episode.subgoal = subgoal
+        asked = {id(episode) for episode in due}
+        return [e.subgoal if id(e) in asked else Subgoal(e.subgoal.text, e.subgoal.points) for e in episodes]
+
+    def due(self, episode: SubgoalEpisode) -> bool:
+        """Whether the episode's subgoal is to be asked for now."""
+        return episode.step % self.interval == 0
+
+    def answer(self, episodes: Sequence[Any]) -> list[Subgoal]:
+        """Ask for these episodes, all at once where that is possible."""
+        raise NotImplementedError
+
+    def accepted(self, parsed: Parsed, answer: str) -> Subgoal:
+        """A subgoal that a model gave."""
+        return Subgoal(parsed.text, parsed.points, asked=True, answer=answer)
+
+    def kept(self, episode: SubgoalEpisode, problem: str, answer: str = "", reason: str = "") -> Subgoal:
+        """The episode's last subgoal, after an answer that cannot be used; counts and reports the problem."""
+        self.usage.problems[problem] += 1
+        log.warning("Subgoal answer unusable (%s) at step %d, the last one is kept: %s", problem, episode.step, reason)
+        return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=answer, problem=problem)
+
+    def close(self) -> None:
+        """Give back what the predictor holds."""
+
+
+def problem_of(answer: str, error: MalformedAnswer) -> tuple[str, str]:
+    """Which of `PROBLEMS` an unusable answer is, and the reason in words."""
+    return ("malformed" if answer.strip() else "empty"), str(error)
+
+
+def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None:
+    """Build from the section `subgoal` of a configuration, or return None where there is none.
+
+    Raises:
+        UserError: an unknown predictor or option.
+    """
+    if not config or config.get("name") in (None, "none"):
+        return None
+    options = dict(config)
+    name = options.pop("name")
+    predictor = SUBGOALS[name]
+    try:
+        return predictor(**options)
+    except TypeError as error:
+        raise UserError(f"The subgoal predictor {name!r} does not take these options: {options} ({error}).") from error
+
+
+def _checked(frames: np.ndarray, what: str) -> np.ndarray:
+    frames = np.asarray(frames)
+    if frames.ndim != 4 or frames.shape[-1] != 3 or frames.dtype != np.uint8:
+        raise UserError(f"{what} must be uint8 [n, height, width, 3]; got {frames.dtype} {frames.shape}.")
+    return frames

@@ -1,0 +1,116 @@
+"""`gemini`: a foundation model behind an API, prompted and not trained; one conversation an episode."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from mme_vla.registry import SUBGOALS
+from mme_vla.subgoal.api import Api, ApiFailure, Reply, Settings
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
+from mme_vla.subgoal.gemini_prompts import LATE, first_query, gemini_system, next_query
+from mme_vla.subgoal.parsing import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
+
+CLIP = 4  # frames: fewer are not worth a video
+
+
+class GeminiEpisode(SubgoalEpisode):
+    """An episode, its conversation, and the frames the model has not seen.
+
+    turns: what was asked and answered, each a role and parts; a part is a text, a picture [H, W, 3] or a video
+    [t, H, W, 3].
+    """
+
+    def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
+        super().__init__(goal, video, task)
+        self.turns: list[tuple[str, list[Any]]] = []
+        self.unseen: list[np.ndarray] = []
+        self.again = False
+
+    def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
+        """Take frames, see `SubgoalEpisode`; they wait for the next question."""
+        super().observe(frames, info)
+        self.unseen += list(frames)
+
+    def next_turn(self) -> list[Any]:
+        """The parts of the next question."""
+        if self.turns:
+            return self._since(self.unseen)
+        video = [self.video] if len(self.video) else []
+        opening = [*video, self.unseen[0] if self.unseen else self.frame, first_query(self.goal, bool(video))]
+        return opening + (self._since(self.unseen[1:]) if len(self.unseen) > 1 else [])
+
+    def _since(self, frames: list[np.ndarray]) -> list[Any]:
+        clip = len(frames) >= CLIP
+        return [np.stack(frames) if clip else self.frame, next_query(clip)]
+
+
+@SUBGOALS.register("gemini")
+class Gemini(SubgoalPredictor):
+    """Asks at the first step and then at multiples of `interval`, showing all frames since the last question.
+
+    Nothing that goes wrong on the way ends an episode: it keeps its last subgoal, the problem is counted, and the
+    frames the model has not seen go with the next question.
+
+    Args:
+        interval: steps between two questions.
+        wait: for tasks with a long first subgoal, no second question before this step.
+        workers: questions under way at once.
+        client: an object with google-genai's `client.models.generate_content`; None makes one.
+        settings: keys of `api.Settings`.
+    """
+
+    def __init__(
+        self,
+        kind: str = "grounded",
+        interval: int = 48,
+        wait: int = 75,
+        workers: int = 4,
+        client: Any = None,
+        **settings: Any,
+    ) -> None:
+        super().__init__(kind, interval)
+        self.wait, self.workers = wait, workers
+        self.api = Api(Settings(**settings), self.usage, client)
+        self._lock = threading.Lock()
+
+    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> GeminiEpisode:
+        """Begin an episode, see `SubgoalPredictor`."""
+        return GeminiEpisode(goal, video, task)
+
+    def due(self, episode: SubgoalEpisode) -> bool:
+        """Whether to ask now; a question that failed is repeated at the next opportunity."""
+        assert isinstance(episode, GeminiEpisode)
+        if episode.again or episode.step == 0:
+            return True
+        return super().due(episode) and not (episode.task in LATE and episode.step < self.wait)
+
+    def answer(self, episodes: Sequence[GeminiEpisode]) -> list[Subgoal]:
+        """Ask for all of them, some at a time."""
+        with ThreadPoolExecutor(min(self.workers, len(episodes))) as pool:
+            return list(pool.map(self._ask, episodes))
+
+    def _ask(self, episode: GeminiEpisode) -> Subgoal:
+        turn = ("user", episode.next_turn())
+        try:
+            reply = self.api.ask(gemini_system(episode.task, self.kind), [*episode.turns, turn])
+        except ApiFailure as failure:
+            episode.again = True
+            with self._lock:
+                return self.kept(episode, failure.problem, reason=str(failure))
+        episode.again = False
+        episode.turns += [turn, ("model", [reply.text])]
+        episode.unseen = []
+        with self._lock:
+            return self._read(episode, reply)
+
+    def _read(self, episode: GeminiEpisode, reply: Reply) -> Subgoal:
+        try:
+            text = parse_gemini(reply.text).lower()
+        except MalformedAnswer as error:
+            return self.kept(episode, "malformed", reply.text, str(error))
+        if says_done(text):
+            return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=reply.text)
+        return self.accepted(pixels_of_pairs(text), reply.text)

@@ -1,0 +1,100 @@
+"""`memer`: a fine-tuned Qwen3-VL that chooses keyframes and reads them again (MemER, as the paper runs it)."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mme_vla.registry import SUBGOALS
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
+from mme_vla.subgoal.history import merge_keyframes, recent_frames
+from mme_vla.subgoal.media import Clip
+from mme_vla.subgoal.parsing import MalformedAnswer, parse_memer
+from mme_vla.subgoal.prompts import memer_system, memer_user
+from mme_vla.subgoal.qwenvl import VLMPredictor
+from mme_vla.subgoal.vlm import Question
+
+
+class MemerEpisode(SubgoalEpisode):
+    """An episode, its keyframes, and as many frames back as the next question may show.
+
+    keyframes: frame number (from the first execution frame) → picture.
+    """
+
+    def __init__(self, goal: str, video: np.ndarray | None, task: str, reach: int) -> None:
+        super().__init__(goal, video, task)
+        self.keyframes: dict[int, np.ndarray] = {}
+        self.asked = False
+        self._recent: dict[int, np.ndarray] = {}
+        self._reach = reach
+
+    def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
+        """Take frames, see `SubgoalEpisode`; only the last ones are kept."""
+        first = self.frames_seen
+        super().observe(frames, info)
+        self._recent |= {first + i: frame for i, frame in enumerate(frames)}
+        self._recent = {t: frame for t, frame in self._recent.items() if t >= self.frames_seen - self._reach}
+
+    def recent(self, count: int, stride: int) -> dict[int, np.ndarray]:
+        """The recent frames the next question shows, by number."""
+        wanted = recent_frames(self.step, self.asked, count, stride)
+        return {t: self._recent[t] for t in wanted}
+
+    def remember(self, frames: Mapping[int, np.ndarray], distance: int) -> None:
+        """Add keyframes and thin them out."""
+        known = self.keyframes | dict(frames)
+        self.keyframes = {t: known[t] for t in merge_keyframes(list(known), distance)}
+
+
+@SUBGOALS.register("memer")
+class Memer(VLMPredictor):
+    """Shows the model its keyframes and the recent frames; the answer names the subgoal and new keyframes.
+
+    After an answer that cannot be read the keyframes and the last subgoal stay (the released code fails there).
+
+    Args:
+        recent: frames shown besides the keyframes. stride: steps between two of them.
+        merge_distance: keyframes at most so far apart are thinned out to their middle one.
+    """
+
+    def __init__(
+        self,
+        kind: str = "grounded",
+        interval: int = 1,
+        recent: int = 8,
+        stride: int = 2,
+        merge_distance: int = 8,
+        **options: Any,
+    ) -> None:
+        super().__init__(kind, interval, **options)
+        self.recent, self.stride, self.merge_distance = recent, stride, merge_distance
+
+    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> MemerEpisode:
+        """Begin an episode, see `SubgoalPredictor`."""
+        return MemerEpisode(goal, video, task, (self.recent - 1) * self.stride + 1)
+
+    def question(self, episode: MemerEpisode) -> Question:
+        """What is asked at the current frame."""
+        recent = episode.recent(self.recent, self.stride)
+        video = len(episode.video) > 0
+        user = memer_user(episode.goal, len(episode.keyframes), len(recent), video)
+        pictures = [*episode.keyframes.values(), *recent.values()]
+        return Question(memer_system(), user, pictures, [Clip.of(episode.video)] if video else [])
+
+    def answer(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
+        """Ask for all of them in one batch."""
+        _ = [episode.frame for episode in episodes]  # every episode has seen something
+        answers = self.ask([self.question(episode) for episode in episodes])
+        return [self._read(e, answer.text) for e, answer in zip(episodes, answers, strict=True)]
+
+    def _read(self, episode: MemerEpisode, answer: str) -> Subgoal:
+        recent = episode.recent(self.recent, self.stride)
+        episode.asked = True
+        try:
+            parsed, positions = parse_memer(answer, len(recent))
+        except MalformedAnswer as error:
+            problem, reason = problem_of(answer, error)
+            return self.kept(episode, problem, answer, reason)
+        numbers = list(recent)
+        episode.remember({numbers[p - 1]: recent[numbers[p - 1]] for p in positions}, self.merge_distance)
+        return self.accepted(parsed, answer)

@@ -1,0 +1,107 @@
+"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current picture, the video and its own past subgoals."""
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mme_vla.registry import SUBGOALS
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
+from mme_vla.subgoal.history import SubgoalHistory, hold_until
+from mme_vla.subgoal.media import Clip
+from mme_vla.subgoal.parsing import MalformedAnswer, parse_subgoal, write_boxes
+from mme_vla.subgoal.prompts import subgoal_system, subgoal_user
+from mme_vla.subgoal.vlm import VLM, Answer, Question
+
+
+class VLMPredictor(SubgoalPredictor):
+    """What `qwenvl` and `memer` share: one model that answers for all episodes at once.
+
+    Args:
+        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
+        max_new_tokens: longest answer. batch_size: questions answered at once.
+        device, dtype: where and how the model runs. vlm: a model that is loaded already, instead of all these.
+    """
+
+    def __init__(
+        self,
+        kind: str = "grounded",
+        interval: int = 1,
+        model: str = "Qwen/Qwen3-VL-4B-Instruct",
+        adapter: str | None = None,
+        max_new_tokens: int = 128,
+        batch_size: int = 8,
+        device: str = "auto",
+        dtype: str = "bfloat16",
+        vlm: VLM | None = None,
+    ) -> None:
+        super().__init__(kind, interval)
+        self.max_new_tokens = max_new_tokens
+        self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=batch_size)
+
+    def ask(self, questions: Sequence[Question]) -> list[Answer]:
+        """Answer and keep count."""
+        started = time.perf_counter()
+        answers = self.vlm.generate(questions, self.max_new_tokens)
+        self.usage.seconds += time.perf_counter() - started
+        self.usage.calls += len(answers)
+        self.usage.input_tokens += sum(answer.input_tokens for answer in answers)
+        self.usage.output_tokens += sum(answer.output_tokens for answer in answers)
+        return answers
+
+
+class QwenEpisode(SubgoalEpisode):
+    """An episode and the subgoals it has had."""
+
+    def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
+        super().__init__(goal, video, task)
+        self.history = SubgoalHistory()
+
+
+@SUBGOALS.register("qwenvl")
+class QwenVL(VLMPredictor):
+    """Asks for the next subgoal, given all that were different from the one before.
+
+    Args:
+        hold: keep the first subgoals of four tasks for a fixed time, as released.
+    """
+
+    def __init__(self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any) -> None:
+        super().__init__(kind, interval, **options)
+        self.hold = hold
+
+    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> QwenEpisode:
+        """Begin an episode, see `SubgoalPredictor`."""
+        return QwenEpisode(goal, video, task)
+
+    def due(self, episode: SubgoalEpisode) -> bool:
+        """Whether to ask now: at multiples of the interval, unless the last subgoal is to be held."""
+        last = episode.subgoal.text
+        held = self.hold and last is not None and episode.step <= hold_until(episode.task, last)
+        return super().due(episode) and not held
+
+    def question(self, episode: QwenEpisode) -> Question:
+        """What is asked at the current frame."""
+        video = len(episode.video) > 0
+        user = subgoal_user(self.kind, episode.goal, episode.history.entries, video)
+        return Question(
+            subgoal_system(self.kind),
+            write_boxes(user, episode.history.points),
+            [episode.frame],
+            [Clip.of(episode.video)] if video else [],
+        )
+
+    def answer(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
+        """Ask for all of them in one batch."""
+        answers = self.ask([self.question(episode) for episode in episodes])
+        return [self._read(e, answer.text) for e, answer in zip(episodes, answers, strict=True)]
+
+    def _read(self, episode: QwenEpisode, answer: str) -> Subgoal:
+        try:
+            parsed = parse_subgoal(answer)
+        except MalformedAnswer as error:
+            problem, reason = problem_of(answer, error)
+            return self.kept(episode, problem, answer, reason)
+        episode.history.add_parsed(parsed)
+        return self.accepted(parsed, answer)

@@ -1,0 +1,270 @@
+"""The prompted model behind an API, against a stand-in client: conversations, failures of every kind, cache, cost."""
+
+import json
+import logging
+import sys
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mme_vla.errors import UserError
+from mme_vla.subgoal import Gemini
+from mme_vla.subgoal.api import Api, ApiFailure, Settings
+from mme_vla.subgoal.base import Usage
+from mme_vla.subgoal.gemini_prompts import VOCABULARY, gemini_system
+
+SECRET = "AIza-not-a-real-key"
+
+
+class ApiError(Exception):
+    """Looks like google-genai's."""
+
+    def __init__(self, code, message=""):
+        super().__init__(f"{code} {message}")
+        self.code = code
+
+
+def response(text, *, finish="STOP", blocked=None):
+    return SimpleNamespace(
+        text=text,
+        usage_metadata=SimpleNamespace(prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80),
+        candidates=[SimpleNamespace(finish_reason=SimpleNamespace(name=finish))],
+        prompt_feedback=SimpleNamespace(block_reason=blocked),
+    )
+
+
+def says(subgoal):
+    return response(f'```json\n{{"description": "x",\n "subgoal": "{subgoal}"}}\n```')
+
+
+class Client:
+    """Has google-genai's interface; answers with these outcomes in turn (exceptions are raised, functions called)."""
+
+    def __init__(self, *outcomes):
+        self.outcomes, self.asked = list(outcomes), []
+        self.models = self
+
+    def generate_content(self, *, model, contents, config):
+        self.asked.append((contents, config))
+        outcome = self.outcomes.pop(0)
+        if callable(outcome):
+            outcome = outcome()
+        if isinstance(outcome, Exception):
+            raise outcome
+        return outcome
+
+
+@pytest.fixture(autouse=True)
+def secret(monkeypatch):
+    monkeypatch.setenv("GEMINI_API_KEY", SECRET)
+
+
+def predictor_of(*outcomes, **options):
+    client = Client(*outcomes)
+    return Gemini(client=client, **{"backoff": 0, "requests_per_minute": None, **options}), client
+
+
+def frames(count, first=0):
+    return np.stack([np.full((32, 32, 3), (first + t) % 256, np.uint8) for t in range(count)])
+
+
+def started(predictor, task="StopCube", video=0):
+    episode = predictor.start_episode("stop the cube", frames(video) if video else None, task)
+    episode.observe(frames(1))
+    return episode
+
+
+def play(predictor, episode, chunks):
+    """Predict, then execute 16 actions; returns the subgoals and the steps at which the model was asked."""
+    said, asked = [], []
+    for _ in range(chunks):
+        subgoal = predictor.predict([episode])[0]
+        said.append(subgoal)
+        asked += [episode.step] if subgoal.asked else []
+        episode.observe(frames(16, episode.frames_seen))
+    return said, asked
+
+
+def kinds(parts):
+    return [part["inline_data"]["mime_type"] if "inline_data" in part else "text" for part in parts]
+
+
+def test_questions_come_at_their_steps_and_late_tasks_wait():
+    predictor, _ = predictor_of(*[says("wait")] * 4)
+    assert play(predictor, started(predictor, "StopCube"), 7)[1] == [0, 48, 96]
+    predictor, _ = predictor_of(*[says("wait")] * 4)
+    assert play(predictor, started(predictor, "BinFill"), 7)[1] == [0, 96]
+
+
+def test_a_conversation_shows_all_that_happened_since():
+    predictor, client = predictor_of(says("Press <500, 250>"), says("move <1000, 0> then <1, 999>"))
+    said, _ = play(predictor, started(predictor, video=10), 4)
+    assert said[0].text == "press <128, 64>" and said[0].points == ((128, 64),)
+    assert said[3].text == "move <256, 0> then <0, 255>"
+    (first, config), (second, _) = client.asked
+    assert kinds(first[0]["parts"]) == ["video/mp4", "image/png", "text"]
+    assert "stop the cube" in first[0]["parts"][2]["text"] and "<y, x>" in config["system_instruction"]
+    assert [turn["role"] for turn in second] == ["user", "model", "user"]
+    assert kinds(second[2]["parts"]) == ["video/mp4", "text"]
+
+
+def test_few_new_frames_are_one_picture():
+    predictor, client = predictor_of(says("a"), says("b"), interval=3)
+    episode = started(predictor)
+    predictor.predict([episode])
+    episode.observe(frames(3, 1))
+    predictor.predict([episode])
+    assert kinds(client.asked[1][0][2]["parts"]) == ["image/png", "text"]
+
+
+def test_a_report_of_completion_is_no_subgoal():
+    predictor, _ = predictor_of(says("press the button"), says("the task is complete"))
+    said, _ = play(predictor, started(predictor), 4)
+    assert said[3].text == "press the button" and not said[3].problem
+
+
+@pytest.mark.parametrize(
+    ("outcome", "problem", "tries"),
+    [
+        (response("I would rather not"), "malformed", 1),
+        (response(None), "empty", 3),
+        (response(None, finish="SAFETY"), "refused", 1),
+        (response(None, blocked="OTHER"), "refused", 1),
+        (ApiError(503), "failed", 3),
+        (ApiError(400, "bad video"), "failed", 1),
+        (TimeoutError(), "failed", 3),
+    ],
+)
+def test_what_goes_wrong_is_counted_and_never_ends_the_episode(outcome, problem, tries):
+    predictor, client = predictor_of(says("press"), *[outcome] * tries, says("lift"), retries=2)
+    episode = started(predictor)
+    said, asked = play(predictor, episode, 4)
+    assert (said[3].text, said[3].problem) == ("press", problem)
+    assert predictor.usage.problems == {problem: 1} and len(client.asked) == 1 + tries
+    assert predictor.usage.retries == tries - 1
+    steps = 1 if problem != "malformed" else 3
+    said, asked = play(predictor, episode, steps)
+    assert said[-1].text == "lift" and asked == [64 if steps == 1 else 96], "asked again at once if nothing was said"
+    assert len(client.asked[-1][0]) == (3 if steps == 1 else 5), "a question without an answer leaves no turn"
+
+
+def test_frames_that_a_failed_question_did_not_show_go_with_the_next():
+    predictor, client = predictor_of(ApiError(400), says("press"))
+    episode = started(predictor)
+    play(predictor, episode, 1)
+    predictor.predict([episode])
+    assert kinds(client.asked[1][0][0]["parts"]) == ["image/png", "text", "video/mp4", "text"]
+    assert len(client.asked[1][0]) == 1, "the question that failed is not part of the conversation"
+
+
+def test_a_passing_error_is_tried_again_with_growing_pauses():
+    slept = []
+    client = Client(ApiError(429), ApiError(500), says("press"))
+    api = Api(Settings(backoff=2, requests_per_minute=None), Usage(), client, sleep=slept.append)
+    assert "press" in api.ask("s", [("user", ["q"])]).text
+    assert slept == [2, 4] and api.usage.retries == 2 and api.usage.calls == 1
+
+
+def test_a_slow_answer_is_given_up():
+    def slow():
+        time.sleep(5)
+
+    client = Client(slow, says("press"))
+    api = Api(Settings(timeout=0.05, backoff=0, requests_per_minute=None), Usage(), client)
+    began = time.monotonic()
+    assert "press" in api.ask("s", [("user", ["q"])]).text
+    assert time.monotonic() - began < 2 and api.usage.retries == 1
+
+
+def test_questions_keep_to_the_rate():
+    now, slept = [0.0], []
+
+    def sleep(seconds):
+        slept.append(seconds)
+        now[0] += seconds
+
+    api = Api(Settings(requests_per_minute=30), Usage(), Client(*[says("a")] * 3), clock=lambda: now[0], sleep=sleep)
+    for _ in range(3):
+        api.ask("s", [("user", ["q"])])
+    assert slept == [2.0, 2.0]
+
+
+@pytest.mark.parametrize("error", [ApiError(401), ApiError(404), ApiError(400, "API key not valid")])
+def test_a_key_that_is_not_accepted_ends_it_at_once(error):
+    predictor, client = predictor_of(error)
+    with pytest.raises(UserError, match="GEMINI_API_KEY"):
+        predictor.predict([started(predictor)])
+    assert len(client.asked) == 1
+
+
+def test_the_key_stands_in_no_log_and_no_message(caplog, tmp_path):
+    leak = f"https://host/v1?key={SECRET}"
+    predictor, _ = predictor_of(*[ApiError(500, leak)] * 2, says("a"), retries=1, cache=str(tmp_path))
+    episode = started(predictor)
+    with caplog.at_level(logging.DEBUG):
+        assert predictor.predict([episode])[0].problem == "failed"
+        predictor.predict([episode])
+    with pytest.raises(UserError) as caught:
+        predictor_of(ApiError(403, leak))[0].api.ask("s", [("user", ["q"])])
+    kept = "".join(path.read_text() for path in tmp_path.rglob("*.json"))
+    assert caplog.text and kept and all(SECRET not in text for text in (caplog.text, str(caught.value), kept))
+    assert "***" in caplog.text
+
+
+def test_answers_are_kept_on_disk_and_cost_nothing_the_second_time(tmp_path):
+    first, _ = predictor_of(says("press"), says("lift"), cache=str(tmp_path))
+    said, _ = play(first, started(first), 4)
+    again, client = predictor_of(cache=str(tmp_path))
+    assert [s.text for s in play(again, started(again), 4)[0]] == [s.text for s in said]
+    assert client.asked == [] and again.usage.cached == 2 and again.usage.cost == 0
+    other, client = predictor_of(says("x"), cache=str(tmp_path), model="gemini-2.5-flash")
+    other.predict([started(other)])
+    assert len(client.asked) == 1, "another model's answers are others"
+
+
+def test_tokens_and_cost_are_counted_thoughts_included():
+    predictor, _ = predictor_of(says("a"), input_price=2.0, output_price=10.0)
+    predictor.predict([started(predictor)])
+    usage = predictor.usage.to_dict()
+    assert (usage["calls"], usage["input_tokens"], usage["output_tokens"]) == (1, 1000, 100)
+    assert usage["cost"] == pytest.approx(1000 * 2e-6 + 100 * 1e-5)
+    assert json.dumps(usage)
+
+
+def test_episodes_are_asked_side_by_side():
+    def slow():
+        time.sleep(0.2)
+        return says("a")
+
+    predictor, _ = predictor_of(*[slow] * 4)
+    began = time.monotonic()
+    assert [s.text for s in predictor.predict([started(predictor) for _ in range(4)])] == ["a"] * 4
+    assert time.monotonic() - began < 0.6 and predictor.usage.calls == 4
+
+
+def test_without_key_or_package_it_says_what_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "google.genai", None)
+    monkeypatch.setitem(sys.modules, "google", None)
+    with pytest.raises(UserError, match="extra `gemini`"):
+        Gemini()
+    monkeypatch.delenv("GEMINI_API_KEY")
+    with pytest.raises(UserError, match="environment variable GEMINI_API_KEY"):
+        Gemini()
+
+
+def test_refusals_carry_their_reason():
+    with pytest.raises(ApiFailure, match="SAFETY"):
+        Api(Settings(requests_per_minute=None), Usage(), Client(response(None, finish="SAFETY"))).ask(
+            "s", [("user", ["q"])]
+        )
+
+
+@pytest.mark.parametrize("task", [*VOCABULARY, ""])
+def test_every_task_has_its_subgoals_in_the_prompt(task):
+    simple, grounded = gemini_system(task, "simple"), gemini_system(task, "grounded")
+    assert "<y, x>" not in simple and "@" not in simple + grounded
+    assert ("<y, x>" in grounded) is (task not in ("PatternLock", "RouteStick"))
+    for template in VOCABULARY.get(task, ()):
+        assert template.replace("@", "") in simple
