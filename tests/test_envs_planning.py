@@ -89,7 +89,9 @@ def test_the_jacobian_is_the_derivative_of_the_pose(arms: dict[bool, Arm]) -> No
             continue
         np.testing.assert_allclose(twist / (2 * step), jacobian[:, i], atol=1e-3)
     point = np.append(arm.forward_in_base(q).p, 1)
-    moved = (arm.forward_in_base(q + step * np.eye(7)[3]).p - arm.forward_in_base(q - step * np.eye(7)[3]).p) / (2 * step)
+    moved = (arm.forward_in_base(q + step * np.eye(7)[3]).p - arm.forward_in_base(q - step * np.eye(7)[3]).p) / (
+        2 * step
+    )
     linear = jacobian[:3, 3] + np.cross(jacobian[3:, 3], point[:3])
     np.testing.assert_allclose(moved, linear, atol=1e-3)
 

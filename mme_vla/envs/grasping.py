@@ -1,7 +1,6 @@
 """How the gripper takes hold of a thing: from above, across its narrower side."""
 
 import numpy as np
-import sapien
 from mani_skill.utils.geometry.trimesh_utils import get_component_mesh
 from sapien import physx
 from scipy.spatial.transform import Rotation

@@ -57,9 +57,7 @@ class RobotControl:
         """Joint angles [7] where the first approach of a stick task ended; None before."""
         return self.env.stored_qpos
 
-    def move_to(
-        self, pose: sapien.Pose, gripper: float | None = None, until: Callable[[], bool] | None = None
-    ) -> None:
+    def move_to(self, pose: sapien.Pose, gripper: float | None = None, until: Callable[[], bool] | None = None) -> None:
         """Move the tool to a pose: straight if possible, else by a detour.
 
         Args:
@@ -135,7 +133,8 @@ class RobotControl:
             if plan is None:
                 plan = plan_free(self.arm, self.env.qpos, pose, velocity, acceleration, seed=seed)
         if plan is None:
-            raise PlanningError(f"No way to {np.round(pose.p, 4).tolist()}, orientation {np.round(pose.q, 4).tolist()}.")
+            place, turn = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
+            raise PlanningError(f"No way to {place}, orientation {turn} (wxyz): out of the arm's reach or blocked.")
         return plan
 
     def _move_gripper(self, command: float) -> None:
