@@ -44,7 +44,8 @@ class EpisodeVideo:
     def finish(self, outcome: str, goal: str) -> Path | None:
         """Close the video under its name; None if this outcome is not kept."""
         if self._draft is None or self._kept not in ("all", "success" if outcome == "success" else "failure"):
-            return self.discard()
+            self.discard()
+            return None
         self._close(self._stream.encode(None))
         target = self._path(outcome, goal)
         self._draft.replace(target)
