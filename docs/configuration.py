@@ -13,6 +13,7 @@ COMMANDS = {
     "cache": "python -m mme_vla.data.cache",
     "inspect": "python -m mme_vla.inspect",
     "serve": "python -m mme_vla.serve",
+    "evaluate": "python -m mme_vla.evaluate",
     "subgoal_build": "python -m mme_vla.subgoal.build",
     "subgoal_train": "python -m mme_vla.subgoal.train",
 }

@@ -83,7 +83,7 @@ def make_scripted_env(
 
 def make_far_env(**options: Any) -> ScriptedEnv:
     """Episodes that end by success somewhere on the way, or time out."""
-    return make_scripted_env(**{"travel": 381.0, **options})
+    return make_scripted_env(**options, travel=11.09 * options["max_steps"])
 
 
 def make_slow_env(**options: Any) -> ScriptedEnv:

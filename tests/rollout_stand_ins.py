@@ -18,9 +18,15 @@ from mme_vla.evaluation.rollout_env import ChunkEnv, make_rollout_env
 from mme_vla.evaluation.rollout_run import Evaluation, evaluate
 from mme_vla.evaluation.rollout_settings import RolloutSettings
 from mme_vla.policy import MMEPolicy
+from mme_vla.testing import SMALL_VISION, small_policy
 
-FACTS = RunFacts("tiny", "untrained", 42, max_steps=40)
+FACTS = RunFacts("tiny", "untrained", 42, max_steps=24)
 JOBS = [Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for episode in range(3)]
+
+
+def quick_policy(name: str, patch_size: int = 16, **overrides: Any) -> MMEPolicy:
+    """A policy that sees little, and so answers at once; 8 is the largest patch that every memory can be built on."""
+    return small_policy(name, backbone={"vision": {**SMALL_VISION, "patch_size": patch_size}}, **overrides)
 
 
 class InlineEnvs:
@@ -57,7 +63,7 @@ def roll(
 ) -> list[EpisodeRecord]:
     """Records of a rollout in this process."""
     records: list[EpisodeRecord] = []
-    chosen = RolloutSettings(**{"max_steps": 40, "flow_steps": 2, **settings})
+    chosen = RolloutSettings(**{"flow_steps": 2, **settings})
     Rollout(policy, envs, FACTS, chosen, records.append, subgoals).run(jobs)
     return records
 
@@ -66,7 +72,7 @@ def whole_run(
     policy: MMEPolicy, folder: Path, base: Any = make_slow_env, jobs: Sequence[Job] = JOBS, **settings: Any
 ) -> Evaluation:
     """These episodes in two worker processes."""
-    chosen = RolloutSettings(**{"max_steps": 40, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
+    chosen = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
     return evaluate(policy, jobs, folder, FACTS, chosen, base=base, shown=False)
 
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 from rollout_scripted_env import VIDEO, make_far_env
-from rollout_stand_ins import JOBS, InlineEnvs, roll
+from rollout_stand_ins import JOBS, InlineEnvs, quick_policy, roll
 
 from mme_vla.envs.vector_jobs import Job
 from mme_vla.evaluation.rollout_episode import RunningEpisode, episode_seed
 from mme_vla.policy import MMEPolicy
 from mme_vla.subgoal import build_predictor
-from mme_vla.testing import cached_history, small_policy
+from mme_vla.testing import cached_history
 
 UNMASK = Job("VideoUnmask", "test", 0)
 MEMORIES = ["framesamp_modul", "tokendrop_expert", "ttt_modul"]
@@ -37,7 +37,7 @@ class Watched:
 
 @pytest.fixture(scope="module")
 def plain() -> MMEPolicy:
-    return small_policy("pi05")
+    return quick_policy("pi05")
 
 
 def test_sixteen_of_twenty_actions_are_executed_and_then_the_policy_is_asked_again(plain, monkeypatch):
@@ -87,7 +87,7 @@ def test_the_current_view_and_state_are_those_after_the_last_action(plain, monke
 @pytest.mark.parametrize("name", MEMORIES)
 @pytest.mark.parametrize("encode_chunk", [3, 32])
 def test_memory_holds_at_every_inference_what_training_would_select(name, encode_chunk, monkeypatch):
-    policy = small_policy(name, policy={"history_dtype": "float32"})
+    policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
     watched = Watched(policy, monkeypatch, lambda e: (e.frames_seen, e.history.exec_start, e.recall()))
     envs = InlineEnvs()
     roll(policy, [UNMASK], envs, encode_chunk=encode_chunk)
@@ -102,7 +102,7 @@ def test_memory_holds_at_every_inference_what_training_would_select(name, encode
 
 
 def test_conditioning_frames_are_marked_and_the_current_one_is_not(monkeypatch):
-    policy, calls = small_policy("framesamp_context"), []
+    policy, calls = quick_policy("framesamp_context"), []
     monkeypatch.setattr(
         "mme_vla.episode.Episode._take", lambda self, front, demo, executed: calls.append((len(front), int(demo.sum())))
     )
@@ -117,7 +117,7 @@ def test_conditioning_frames_are_marked_and_the_current_one_is_not(monkeypatch):
 
 
 def test_past_actions_in_the_prompt_are_those_executed(monkeypatch):
-    policy = small_policy("pi05_past_actions")
+    policy = quick_policy("pi05_past_actions")
     watched, envs = Watched(policy, monkeypatch, lambda e: (e.prompt[0], e.state.clone())), InlineEnvs()
     roll(policy, [UNMASK], envs)
     done = np.stack(envs.made[UNMASK].actions).astype(np.float32)
@@ -131,7 +131,7 @@ def test_past_actions_in_the_prompt_are_those_executed(monkeypatch):
     ("groundsg", ["push at <0, 9>", "push at <16, 9>", "push at <32, 9>"]),
 ])  # fmt: skip
 def test_the_oracles_subgoal_is_that_of_the_current_frame(model, texts, monkeypatch):
-    policy = small_policy(model)
+    policy = quick_policy(model)
     watched = Watched(policy, monkeypatch, lambda e: (e.subgoal, e.prompt[0]))
     oracle = build_predictor({"name": "oracle", "kind": policy.config["subgoal_text"]["kind"].split("_")[0]})
     roll(policy, [UNMASK], InlineEnvs(), subgoals=oracle)
@@ -141,7 +141,7 @@ def test_the_oracles_subgoal_is_that_of_the_current_frame(model, texts, monkeypa
 
 
 def test_without_a_subgoal_the_prompt_is_the_plain_one(monkeypatch):
-    policy = small_policy("simplesg")
+    policy = quick_policy("simplesg")
     watched = Watched(policy, monkeypatch, lambda e: e.prompt[0])
     roll(policy, [UNMASK], InlineEnvs())
     assert torch.equal(watched.seen[0], policy.processor.prompt("pick up the red cube", subgoal=None)[0])
@@ -156,10 +156,10 @@ def test_whoever_is_ready_travels_in_one_batch(plain, monkeypatch):
 
 
 def test_one_at_a_time_results_are_equal_to_the_last_bit_in_any_order():
-    policy = small_policy("tokendrop_expert")
+    policy = quick_policy("tokendrop_expert", 8)
 
     def digests(jobs, workers):
-        records = roll(policy, jobs, InlineEnvs(workers, base=make_far_env), max_batch=1)
+        records = roll(policy, jobs, InlineEnvs(workers, base=make_far_env, max_steps=24), max_batch=1)
         return {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records}
 
     forward = digests(JOBS, 1)
