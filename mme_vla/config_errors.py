@@ -35,6 +35,8 @@ class ConfigTree:
         """Say what was misspelt, with the near names; Hydra's own words where nothing was."""
         if isinstance(error, MissingConfigException) and error.missing_cfg_file:
             group, _, name = error.missing_cfg_file.rpartition("/")
+            if group == "hydra/launcher":
+                return f"The launcher {name!r} is not installed; run: pip install 'mme-vla[sweep]'"
             options = error.options or [n for n in self.loader.get_group_options(group) if not n.startswith("_")]
             return f"Unknown {group or 'config'} {name!r}. {did_you_mean(name, options)}"
         for choice in self.choices:

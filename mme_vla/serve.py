@@ -6,18 +6,14 @@ import os
 import signal
 import sys
 import warnings
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config import cli
-from mme_vla.errors import UserError
+from mme_vla.loading import load_policy
 
 if TYPE_CHECKING:
-    import torch
-
-    from mme_vla.policy import MMEPolicy
     from mme_vla.serving.server import PolicyServer
 
 # Threads that wait asleep leave the event loop its core; it counts only when set before PyTorch is imported.
@@ -40,48 +36,13 @@ def main(cfg: DictConfig) -> None:
     assert isinstance(config, dict)
     settings = ServeSettings.from_dict({str(key): value for key, value in config.items()})
     _log_to_terminal()
-    policy, name = load(cfg)
+    policy, name, _ = load_policy(cfg, "serve", logger)
     server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
     if not settings.local_only and settings.api_key is None:
         logger.warning("host=%s without api_key: whoever reaches this port can use it", settings.host)
     if server.metadata["subgoal"] is not None:
         logger.info("reads the key %r of each request; without it, the goal alone", server.metadata["subgoal"])
     asyncio.run(run(server))
-
-
-def load(cfg: DictConfig) -> "tuple[MMEPolicy, str]":
-    """The policy to serve, on its device, and what to call it.
-
-    Raises:
-        UserError: neither a checkpoint nor a model is named, or both.
-    """
-    from mme_vla.build import build_from_config
-    from mme_vla.policy import MMEPolicy
-    from mme_vla.training.checkpoint import resolve_checkpoint
-
-    device = _device(cfg.device)
-    named = _named_groups()
-    if cfg.checkpoint is not None:
-        if named:
-            raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
-        source = Path(str(cfg.checkpoint)).expanduser()
-        where = str(resolve_checkpoint(source)) if source.exists() else str(cfg.checkpoint)
-        policy = MMEPolicy.from_pretrained(where, device=device, dtype=cfg.dtype, revision=cfg.revision)
-        name = str(policy.config.get("name", "policy"))
-        logger.info("%s from %s, on %s", name, where, device)
-        return policy, name
-    if not any(word.startswith("model=") for word in named):
-        raise UserError(
-            "Name what to serve: checkpoint=<folder>, or model=<model> for fresh weights to try a client out."
-        )
-    from mme_vla.testing import unit_stats
-
-    if cfg.dtype != "float32":
-        raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
-    policy = build_from_config(cfg).to(device)
-    policy.require_processor().stats = unit_stats()
-    logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try a client out", cfg.name)
-    return policy, str(cfg.name)
 
 
 async def run(server: "PolicyServer") -> None:
@@ -108,29 +69,6 @@ async def run(server: "PolicyServer") -> None:
         logger.warning("stopped at once; requests were cut off")
         os._exit(1)  # the policy's thread cannot be interrupted
     logger.info("stopped · %s", server.stats.line())
-
-
-def _device(name: str) -> "torch.device":
-    import torch
-
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise UserError(f"device={name!r} is not a device; choose auto, cpu, cuda or cuda:<number>.") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"device={name}: PyTorch sees no GPU here; use device=cpu.")
-    return device
-
-
-def _named_groups() -> list[str]:
-    """Words of the command line that choose a model."""
-    from hydra.core.hydra_config import HydraConfig
-
-    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    groups = ("model", "backbone", "memory", "integration", "processor")
-    return [word for word in given if word.lstrip("+").split("=")[0].split(".")[0] in groups]
 
 
 def _log_to_terminal() -> None:

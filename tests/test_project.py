@@ -15,7 +15,7 @@ PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
-    "play", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy", "saving",
+    "play", "loading", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy", "saving",
     "episode", "subgoal", "finetune", "card", "processing", "integration", "memory", "backbone",
     "config", "config_errors", "hub", "pretrained", "naming", "types", "registry", "errors",
 ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import logging
 import os
 import signal
 import socket
@@ -16,9 +17,10 @@ from serving_fakes import Served, acted_directly, challenge, course, serving_pol
 
 from mme_vla.config import compose
 from mme_vla.errors import UserError
-from mme_vla.serve import load
+from mme_vla.loading import load_policy
 from mme_vla.serving import Client, Limits, pack, unpack
 
+LOGGER = logging.getLogger(__name__)
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}
 
 
@@ -197,7 +199,7 @@ def test_the_command_serves_and_stops_when_told(tmp_path):
 def test_the_command_says_what_it_needs():
     for words, said in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
         with pytest.raises(UserError, match=said):
-            load(compose("serve", words))
+            load_policy(compose("serve", words), "serve", LOGGER)
     command = [sys.executable, "-m", "mme_vla.serve", "checkpoint=x", "model=pi05"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
     assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
@@ -205,7 +207,7 @@ def test_the_command_says_what_it_needs():
 
 def test_the_command_loads_a_checkpoint(policy, tmp_path):
     policy.save_pretrained(tmp_path)
-    loaded, name = load(compose("serve", [f"checkpoint={tmp_path}"]))
+    loaded, name, _ = load_policy(compose("serve", [f"checkpoint={tmp_path}"]), "serve", LOGGER)
     assert name == "tokendrop_expert"
     parts = course(rounds=0)
     np.testing.assert_array_equal(acted_directly(loaded, parts)[0], acted_directly(policy, parts)[0])

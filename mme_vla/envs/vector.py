@@ -29,6 +29,7 @@ from mme_vla.errors import UserError
 
 _CLOSING_SECONDS = 5.0
 _STARTING_SECONDS = 120.0
+_NEXT_PIECE_SECONDS = 0.02
 
 
 @dataclass
@@ -215,7 +216,9 @@ class VecEnv:
     def _poll(self, index: int, state: _Worker) -> Reply | None:
         """Take what a worker has sent; its reply if that is complete."""
         try:
-            while state.connection.poll():
+            # A long video comes in many pieces, each sent when the last was taken: a caller that looks in rarely would
+            # hold it up, so the next one is waited for.
+            while state.connection.poll(_NEXT_PIECE_SECONDS if state.arrays else 0):
                 kind, *content = protocol.receive(state.connection)
                 if kind == protocol.PIECE:
                     state.arrays += protocol.read(state.block, content[0])

@@ -36,11 +36,16 @@ class EpisodeKey(NamedTuple):
 
 @dataclass(frozen=True)
 class Seconds:
-    """Where an episode's wall time went."""
+    """Where an episode's wall time went.
+
+    sim: building and stepping the environment, without its pictures. render: those (0 where they cannot be told apart).
+    policy: the episode's share of the policy's batches. total: from its beginning to its end, waiting included.
+    """
 
     sim: float = 0.0
     policy: float = 0.0
     total: float = 0.0
+    render: float = 0.0
 
 
 @dataclass(frozen=True)

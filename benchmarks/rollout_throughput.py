@@ -1,0 +1,98 @@
+"""Episodes a minute: one environment and no batches, against several workers that share one batching policy.
+
+    python benchmarks/rollout_throughput.py [--model framesamp_modul] [--workers 2] [--steps 64] [--no-render]
+
+Both do the same episodes with the same noise, one after the other in one run, on workers that are warm: the first
+episode of every worker, which imports the simulator, is not timed. The policy is tiny and untrained; its episodes run
+until the step limit, so that the work is the same whatever it does.
+"""
+
+import argparse
+import time
+from dataclasses import dataclass
+
+from timing import machine
+
+from mme_vla.envs.vector import VecEnv
+from mme_vla.envs.vector_jobs import Job
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout import Rollout, RunFacts
+from mme_vla.evaluation.rollout_env import make_rollout_env
+from mme_vla.evaluation.rollout_settings import RolloutSettings
+from mme_vla.policy import MMEPolicy
+from mme_vla.testing import small_policy
+
+TASKS = ("PickXtimes", "StopCube", "BinFill", "SwingXtimes")  # none with a video: all steps are the policy's
+
+
+@dataclass
+class Measured:
+    """One contestant: its records, its wall time and the mean size of its batches."""
+
+    name: str
+    records: list[EpisodeRecord]
+    wall_s: float
+    mean_batch: float
+
+    def row(self) -> list[str]:
+        sim, render, policy = (
+            sum(getattr(r.seconds, part) for r in self.records) for part in ("sim", "render", "policy")
+        )
+        steps = sum(record.steps for record in self.records)
+        return [
+            self.name,
+            f"{60 * len(self.records) / self.wall_s:.2f}",
+            f"{steps / self.wall_s:.1f}",
+            f"{sim:.1f} s",
+            f"{render:.1f} s",
+            f"{policy:.1f} s",
+            f"{100 * policy / (sim + render):.0f} %",
+            f"{self.mean_batch:.1f}",
+            f"{self.wall_s:.1f} s",
+        ]
+
+
+def measure(
+    policy: MMEPolicy, name: str, jobs: list[Job], workers: int, max_batch: int, args: argparse.Namespace
+) -> Measured:
+    """Run these episodes on warm workers."""
+    settings = RolloutSettings(max_steps=args.steps, workers=workers, max_batch=max_batch, render=not args.no_render)
+    options = {"max_steps": args.steps, "render": not args.no_render}
+    facts = RunFacts(args.model, "untrained", settings.seed, max_steps=args.steps)
+    records: list[EpisodeRecord] = []
+    with VecEnv([], workers, make_rollout_env, options) as envs:
+        short = [Job("StopCube", "test", 40 + worker) for worker in range(workers)]
+        Rollout(policy, envs, facts, settings, lambda record: None).run(short)
+        rollout = Rollout(policy, envs, facts, settings, records.append)
+        begun = time.perf_counter()
+        rollout.run(jobs)
+        wall = time.perf_counter() - begun
+    return Measured(name, records, wall, rollout.workload.mean_batch)
+
+
+def main() -> None:
+    """Measure and print a Markdown table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", default="framesamp_modul")
+    parser.add_argument("--workers", type=int, default=2, help="of the batched contestant")
+    parser.add_argument("--steps", type=int, default=64, help="step limit of an episode")
+    parser.add_argument("--episodes", type=int, default=1, help="of each of the four tasks")
+    parser.add_argument("--no-render", action="store_true", help="black pictures: the simulation alone")
+    args = parser.parse_args()
+    policy = small_policy(args.model)
+    jobs = [Job(task, "test", episode) for episode in range(args.episodes) for task in TASKS]
+    print(f"{args.model}, tiny · {len(jobs)} episodes of at most {args.steps + 1} steps · {machine()}\n")
+    print("| | episodes/min | steps/s | simulation | rendering | policy | policy over both | batch | wall |")
+    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    results = [
+        measure(policy, "1 environment, unbatched", jobs, 1, 1, args),
+        measure(policy, f"{args.workers} workers, batched", jobs, args.workers, 16, args),
+    ]
+    for result in results:
+        print("| " + " | ".join(result.row()) + " |")
+    same = [{(r.key, r.outcome, r.steps) for r in result.records} for result in results]
+    print(f"\nsame outcomes and steps: {same[0] == same[1]}; gain {results[0].wall_s / results[1].wall_s:.2f}x")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,158 @@
+"""`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark (configs/evaluate.yaml)."""
+
+import logging
+import os
+import signal
+import sys
+import threading
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.config import cli
+from mme_vla.loading import find_device, load_policy, words_of
+
+if TYPE_CHECKING:
+    import torch
+
+    from mme_vla.evaluation.rollout_run import Evaluation
+    from mme_vla.policy import MMEPolicy
+    from mme_vla.subgoal import SubgoalPredictor
+
+# Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+logger = logging.getLogger("mme_vla.evaluate")
+
+
+@cli("evaluate")
+def main(cfg: DictConfig) -> None:
+    """Run the episodes that have no result yet.
+
+    Raises:
+        UserError: anything in the settings, the checkpoint or the machine that cannot work.
+    """
+    from mme_vla.envs.make import require_simulator
+    from mme_vla.evaluation.rollout_plan import choose_episodes, choose_shard
+    from mme_vla.evaluation.rollout_run import RunFacts, checkpoint_label, default_output, evaluate, memory_budget
+    from mme_vla.evaluation.rollout_settings import RolloutSettings
+
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    plain = {str(key): value for key, value in config.items()}
+    settings = RolloutSettings.from_config(plain)
+    jobs = choose_episodes(plain["tasks"], plain["episodes"], settings.split)
+    shard = choose_shard(plain["shard"])
+    if settings.env == "mme_vla":
+        require_simulator()
+    _log_to_terminal()
+    device = choose_device(str(cfg.device))
+    policy, name, source = load_policy(cfg, "evaluate", logger, device)
+    subgoals = choose_subgoals(policy, plain["subgoal"])
+    facts = RunFacts(
+        name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
+        None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
+    )  # fmt: skip
+    if not settings.render:
+        logger.warning("render=false: the policy sees black pictures; only the time of the simulation means anything")
+    output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
+    logger.info("%d episodes into %s%s", len(jobs), output, f", of which shard {shard.index}/{shard.count}"
+                if shard.count > 1 else "")  # fmt: skip
+    notes = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
+    _end_on_sigterm()
+    try:
+        done = evaluate(
+            policy, jobs, output, facts, settings, subgoals=subgoals, shard=shard, source=source, notes=notes
+        )
+    except KeyboardInterrupt:
+        logger.warning("stopped; what is finished is recorded, and the same command goes on from there")
+        raise SystemExit(130) from None
+    finally:
+        if subgoals is not None:
+            subgoals.close()
+    report(done, output)
+
+
+def choose_device(name: str) -> "torch.device":
+    """The configured device; under torchrun `auto` gives every process of a machine a GPU of its own."""
+    import torch
+
+    device = find_device(name)
+    if name == "auto" and device.type == "cuda" and "LOCAL_RANK" in os.environ:
+        device = torch.device("cuda", int(os.environ["LOCAL_RANK"]) % torch.cuda.device_count())
+    return device
+
+
+def choose_subgoals(policy: "MMEPolicy", section: dict[str, Any] | None) -> "SubgoalPredictor | None":
+    """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
+
+    Raises:
+        UserError: an unknown predictor or option, or a policy that reads no subgoal, or another kind.
+    """
+    from mme_vla.evaluation.rollout_run import check_subgoals
+    from mme_vla.serving.session import subgoal_kind
+    from mme_vla.subgoal import build_predictor
+
+    if section is None:
+        if policy.require_processor().prompt_format.reads_subgoal:
+            logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
+        return None
+    kind = subgoal_kind(policy)
+    if kind is not None and not words_of("subgoal.kind"):
+        section = {**section, "kind": kind.removesuffix("_subgoal")}
+    predictor = build_predictor(section)
+    check_subgoals(policy, predictor)
+    return predictor
+
+
+def report(done: "Evaluation", output: Path) -> None:
+    """Say how it went, task by task, and where the table comes from."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from mme_vla.evaluation.records import count_outcomes
+
+    tasks = list(dict.fromkeys(record.task for record in done.records))
+    table = Table("task", *("episodes", "success", "fail", "timeout", "error", "success rate"))
+    rows = [(task, [r for r in done.records if r.task == task]) for task in tasks]
+    for task, records in [*rows, *([("all", done.records)] if len(rows) > 1 else [])]:
+        counts = count_outcomes(records)
+        outcomes = [str(counts[name]) for name in ("success", "fail", "timeout", "error")]
+        table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %")
+    console = Console(soft_wrap=True, highlight=False)
+    if rows:
+        console.print(table)
+    work = done.workload
+    if work.batches:
+        logger.info(
+            "%d chunks in batches of %.1f on average; the policy was busy for %.0f of %.0f s",
+            work.chunks, work.mean_batch, work.policy_s, work.wall_s,
+        )  # fmt: skip
+    if any(record.outcome == "error" for record in done.records):
+        logger.warning("some episodes ended in an error: the same command tries them again")
+    logger.info("python -m mme_vla.results %s", output)
+
+
+def _end_on_sigterm() -> None:
+    """A cluster's SIGTERM ends the run as Ctrl-C does: at once, since every finished episode is on disk."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, interrupt)
+
+
+def _log_to_terminal() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logger.setLevel(logging.INFO)
+    logger.handlers = [handler]
+    logger.propagate = False
+    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
+
+
+if __name__ == "__main__":
+    main()

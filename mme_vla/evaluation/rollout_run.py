@@ -1,0 +1,174 @@
+"""A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode at once."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mme_vla.envs.make import make_env
+from mme_vla.envs.vector import VecEnv
+from mme_vla.envs.vector_jobs import Job
+from mme_vla.errors import UserError
+from mme_vla.evaluation.record_log import RecordLog, find_records, read_records
+from mme_vla.evaluation.records import EpisodeRecord, finished, merge
+from mme_vla.evaluation.rollout import Rollout, RunFacts, Workload
+from mme_vla.evaluation.rollout_env import make_rollout_env
+from mme_vla.evaluation.rollout_plan import Shard, take_share
+from mme_vla.evaluation.rollout_progress import RolloutProgress
+from mme_vla.evaluation.rollout_settings import RolloutSettings
+from mme_vla.evaluation.run_file import claim_run, fingerprint
+from mme_vla.policy import MMEPolicy
+from mme_vla.serving.session import subgoal_kind
+from mme_vla.subgoal import SubgoalPredictor
+
+USUAL_BUDGET = 512
+VIDEOS = "videos"
+
+
+class Evaluation(NamedTuple):
+    """What came of a run: the records of this shard's episodes, old and new, and what the policy did this time."""
+
+    records: list[EpisodeRecord]
+    workload: Workload
+
+
+def evaluate(
+    policy: MMEPolicy,
+    jobs: Sequence[Job],
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    subgoals: SubgoalPredictor | None = None,
+    shard: Shard | None = None,
+    source: str | None = None,
+    base: Callable[..., Any] = make_env,
+    notes: dict[str, Any] | None = None,
+    shown: bool = True,
+) -> Evaluation:
+    """Run every episode that `output` has no result of yet.
+
+    Args:
+        policy: in eval mode, on its device, with statistics.
+        jobs: the episodes of all shards.
+        output: the run's folder; one that holds a part of the same run is gone on with.
+        facts: what the records say of the policy.
+        subgoals: who says the subgoal, where the policy reads one.
+        source: where the weights are from; part of what makes a run the same.
+        base: makes an environment with the benchmark's interface; importable by name.
+        notes: kept in `run.json` and never compared.
+
+    Raises:
+        UserError: `output` holds another run, or the environments cannot be built.
+    """
+    policy.require_processor().require_stats()
+    check_subgoals(policy, subgoals)
+    claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
+    shard = shard or Shard()
+    mine = take_share(jobs, shard)
+    with RecordLog(output / shard.file) as log:
+        done = _done(output, mine)
+        missing = [job for job in mine if (job.task, job.episode) not in finished(done)]
+        kept = [record for record in done if record.outcome != "error"]
+        with RolloutProgress(len(mine), kept, shown) as progress:
+            if kept:
+                progress.say(f"{output} holds {len(kept)} of {len(mine)} episodes: going on with the others")
+            workload = _run(policy, missing, output, facts, settings, subgoals, base, log, progress)
+    return Evaluation(_done(output, mine), workload)
+
+
+def _run(
+    policy: MMEPolicy,
+    jobs: list[Job],
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    subgoals: SubgoalPredictor | None,
+    base: Callable[..., Any],
+    log: RecordLog,
+    progress: RolloutProgress,
+) -> Workload:
+    if not jobs:
+        return Workload()
+    options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps}
+    if base is make_env:
+        options |= {"env": settings.env, "render": settings.render}
+    if settings.video != "none":
+        options["videos"] = (str(output / VIDEOS), settings.video)
+    workers = settings.worker_count(len(jobs))
+    with VecEnv([], workers, make_rollout_env, options, settings.timeout_s) as envs:
+        rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, progress)
+        rollout.run(jobs)
+    return rollout.workload
+
+
+def run_settings(
+    policy: MMEPolicy,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    subgoals: SubgoalPredictor | None = None,
+    source: str | None = None,
+) -> dict[str, Any]:
+    """What decides the outcomes, as `run.json` keeps it.
+
+    How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
+    batches may change the last bits of an action.
+    """
+    kept = ("seed", "split", "env", "max_steps", "execute", "flow_steps", "render")
+    dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
+    return {
+        "model": facts.model,
+        "checkpoint": facts.checkpoint,
+        # Its end alone: machines that share a run may have the folder at different places.
+        "source": None if source is None else "/".join(Path(source).parts[-4:]),
+        "policy": fingerprint(dict(policy.config)),
+        "dtype": dtype,
+        "subgoal": None if subgoals is None else {"name": facts.subgoal, "kind": subgoals.kind},
+        **{name: getattr(settings, name) for name in kept},
+    }
+
+
+def check_subgoals(policy: MMEPolicy, subgoals: SubgoalPredictor | None) -> None:
+    """Refuse a predictor that says what this policy was not trained to read.
+
+    Raises:
+        UserError: the policy reads no subgoal, or another kind.
+    """
+    if subgoals is None:
+        return
+    if not policy.require_processor().prompt_format.reads_subgoal:
+        raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
+    kind = subgoal_kind(policy)
+    if kind is not None and kind != f"{subgoals.kind}_subgoal":
+        wanted = kind.removesuffix("_subgoal")
+        raise UserError(f"The policy was trained with {wanted} subgoals: set subgoal.kind={wanted}.")
+
+
+def checkpoint_label(source: str | None) -> int | str:
+    """What records call a checkpoint: its step where its name ends in one, else its name."""
+    if source is None:
+        return "untrained"
+    name = Path(source).name
+    step = re.search(r"(?:^|[_-])(\d+)$", name)
+    return int(step[1]) if step else name
+
+
+def memory_budget(policy: MMEPolicy) -> int | None:
+    """Memory tokens, where they are not the usual 512."""
+    budget = None if policy.memory is None else policy.memory.budget
+    return None if budget == USUAL_BUDGET else budget
+
+
+def default_output(facts: RunFacts) -> Path:
+    """A folder that the same command finds again: `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`."""
+    name = facts.model if facts.memory_budget is None else f"{facts.model}-{facts.memory_budget}"
+    run = f"seed{facts.model_seed}" + (f"-{facts.subgoal}" if facts.subgoal else "")
+    run += "" if facts.split == "test" else f"-{facts.split}"
+    return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
+
+
+def _done(output: Path, mine: Sequence[Job]) -> list[EpisodeRecord]:
+    """What the folder has of these episodes, whoever wrote it."""
+    wanted = {(job.task, job.split, job.episode) for job in mine}
+    found = [record for path in find_records([output]) for record in read_records(path)]
+    return [r for r in merge(found, "first") if (r.task, r.split, r.episode) in wanted]
