@@ -15,8 +15,8 @@ PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
-    "play", "loading", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy", "saving",
-    "episode", "subgoal", "finetune", "card", "processing", "integration", "memory", "backbone",
+    "play", "loading", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy",
+    "saving", "episode", "subgoal", "finetune", "card", "processing", "integration", "memory", "backbone",
     "config", "config_errors", "hub", "pretrained", "naming", "types", "registry", "errors",
 ]  # fmt: skip
 
