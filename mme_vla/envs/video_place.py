@@ -9,7 +9,7 @@ from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.draws import Draws
 from mme_vla.envs.motions import Swap
-from mme_vla.envs.objects import H, Cube, Disc, build_button, build_cube, build_disc
+from mme_vla.envs.objects import Cube, Disc, H, build_button, build_cube, build_disc
 from mme_vla.envs.placement import Avoid, Region, SceneError, draw_button, draw_cube, draw_disc
 from mme_vla.envs.predicates import StaticFor, any_picked_up, dropped, dropped_onto, picked_up, pressed, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
