@@ -10,6 +10,7 @@ from mme_vla.envs.objects import H, Peg
 from mme_vla.envs.robot_control import CLOSE, OPEN, RobotControl
 from mme_vla.envs.things import Thing
 
+PegEnd = Literal["head", "tail"]
 BEHIND = 0.05
 """Where a push begins: how far behind the cube, metres."""
 HOOK_BACK, HOOK_ASIDE, HOOK_STOP = 0.1, 0.1, 0.03
@@ -61,7 +62,7 @@ class PegPrimitives(RobotControl):
         self.announce(end, OPEN)
         self.open()
 
-    def grasp_peg(self, peg: Peg, end: Thing | Literal["head", "tail"], turn: bool = False) -> None:
+    def grasp_peg(self, peg: Peg, end: Thing | PegEnd, turn: bool = False) -> None:
         """Grasp a peg by one of its ends and lift it.
 
         Args:
@@ -77,7 +78,7 @@ class PegPrimitives(RobotControl):
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), CLOSE)
         self.close()
 
-    def insert_peg(self, peg: Peg, held: Thing | Literal["head", "tail"], side: int, box: Thing) -> None:
+    def insert_peg(self, peg: Peg, held: Thing | PegEnd, side: int, box: Thing) -> None:
         """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator does.
 
         Held by its tail and inserted from the right, the peg stops short of the hole, now and then too short;
@@ -110,7 +111,7 @@ class PegPrimitives(RobotControl):
         self.move_to(station(outward * INSERT_NEAR))
         self.move_to(station(-INSERT_PAST), CLOSE)
 
-    def insert_peg_fully(self, peg: Peg, held: Thing | Literal["head", "tail"], side: int, box: Thing) -> None:
+    def insert_peg_fully(self, peg: Peg, held: Thing | PegEnd, side: int, box: Thing) -> None:
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
@@ -134,7 +135,7 @@ class PegPrimitives(RobotControl):
             self.move_to(station(INSERT_NEAR))
         self.move_to(station(0.0), CLOSE)
 
-    def drag_peg(self, peg: Peg, end: Literal["head", "tail"], way: np.ndarray, turn: bool = False) -> None:
+    def drag_peg(self, peg: Peg, end: PegEnd, way: np.ndarray, turn: bool = False) -> None:
         """Take a peg by one tip and draw it over the table, hardly lifted, along `way` [2] in metres."""
         self.open()
         grasp = _peg_grasp(getattr(peg, end), turn, outward=TIP if end == "head" else -TIP)
@@ -150,7 +151,11 @@ class PegPrimitives(RobotControl):
         here = self.env.tcp_pose
         self.move_to(self.at([*here.p[:2], PEG_ON_TABLE], here.q), OPEN)
         self.open()
-        self.move_to(self.at([*self.env.tcp_pose.p[:2], ABOVE_PEG], here.q))
+        self.withdraw()
+
+    def withdraw(self) -> None:
+        """Move the tool straight up."""
+        self.move_to(self.at([*self.env.tcp_pose.p[:2], ABOVE_PEG]))
 
 
 def _peg_grasp(end: Thing, turn: bool, outward: float = 0.0) -> sapien.Pose:

@@ -21,6 +21,8 @@ OPEN, CLOSE = 1.0, -1.0
 GRIPPER_STEPS = 6
 """Control steps that opening or closing takes."""
 FREE_TRIES = 3
+LONG_DETOUR = 200
+"""Steps from which on a sampled motion is thought too long, and tried again."""
 HOME = (0.0, 0.0, 0.2)
 LIMITS = {False: (0.9, 0.9), True: (0.3, 0.9)}
 """Joint velocity and acceleration limits, rad/s and rad/s², of the gripper robot and of the stick robot (`stick`)."""
@@ -63,20 +65,17 @@ class RobotControl:
         Args:
             pose: of the tool centre point in the world.
             gripper: announce the pose as a waypoint with this gripper command; None announces nothing.
-            until: asked after each step; the motion ends when it is true.
 
         Raises:
             PlanningError: neither a screw motion nor sampling found a way; nothing has moved.
         """
         self.announce(pose, gripper)
-        self.follow(self._plan(pose), until)
+        self.follow(self._plan(pose))
 
-    def follow(self, targets: Iterable[np.ndarray], until: Callable[[], bool] | None = None) -> None:
+    def follow(self, targets: Iterable[np.ndarray]) -> None:
         """Perform one control step for each row of joint targets [7]."""
         for joints in targets:
             self._command(joints)
-            if until is not None and until():
-                return
 
     def announce(self, pose: sapien.Pose, gripper: float | None) -> None:
         """Report a waypoint; the stick's are always closed."""
@@ -130,9 +129,14 @@ class RobotControl:
         velocity, acceleration = LIMITS[self.env.stick]
         # The screw planner has no randomness: what fails once fails always.
         plan = plan_screw(self.arm, self.env.qpos, pose, velocity, acceleration)
+        if plan is not None:
+            return plan
         for seed in range(FREE_TRIES):
-            if plan is None:
-                plan = plan_free(self.arm, self.env.qpos, pose, velocity, acceleration, seed=seed)
+            detour = plan_free(self.arm, self.env.qpos, pose, velocity, acceleration, seed=seed)
+            if detour is not None and (plan is None or len(detour) < len(plan)):
+                plan = detour
+            if plan is not None and len(plan) <= LONG_DETOUR:
+                break
         if plan is None:
             place, turn = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
             raise PlanningError(f"No way to {place}, orientation {turn} (wxyz): out of the arm's reach or blocked.")

@@ -16,7 +16,9 @@ from mme_vla.envs.objects.shapes import at
 from mme_vla.envs.objects.solids import APERTURE_COLOUR, APERTURE_Z
 from mme_vla.envs.placement import SceneError
 from mme_vla.envs.predicates import StaticFor, any_picked_up, reset_reached
+from mme_vla.envs.primitives_peg import PegEnd
 from mme_vla.envs.robot_control import PlanningError
+from mme_vla.envs.robots import ROBOT_BASE
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.things import Thing
@@ -27,14 +29,14 @@ if TYPE_CHECKING:
 PEGS, PEG_LENGTH, PEG_RADIUS = 3, 0.05, 0.01
 FROM_BOX, FROM_PEG = 0.06, 0.075
 TRIES = 256
+ENDS: tuple[PegEnd, PegEnd] = ("head", "tail")
 LIFTED_Z = 0.1
 INSERTED = 0.05
-SUCCESS_DELAY = 3  # steps from the insertion to success
 SHOWN_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
 """How far from the box and from other pegs the hand has room around a peg, metres."""
-WORKSPACE = (0.22, 0.3)  # how far from the table's middle in x and y
+WORKSPACE = (0.4, 0.72)  # nearest and farthest from the robot's base that a peg is moved to, metres
 MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 
@@ -66,12 +68,11 @@ class InsertPeg(MemoryTask):
         for peg in self.pegs:
             places.append(self._draw_place(draws, (x, y), places))
             peg.set_home(at(places[-1], 0, math.radians(-45 + 90 * draws.uniform())))
-        self.end = ("head", "tail")[draws.integer(0, 2)]
+        self.end: PegEnd = ENDS[draws.integer(0, 2)]
         self.side = (-1, 1)[draws.integer(0, 2)]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         self.mark = Mark(self._red_disc, below, SHOWN_STEPS)
-        self._inserted_at: int | None = None
         self._helpful = 0
 
     def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
@@ -82,7 +83,7 @@ class InsertPeg(MemoryTask):
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
     def after_step(self, k: int) -> None:
-        self.mark.update(k, touched=False)
+        self.mark.update(k, touched=self._inserted(self.end, self.side))
         if self.reset_in_progress:
             for peg in self.pegs:
                 peg.displace(peg.initial_pose)
@@ -108,19 +109,6 @@ class InsertPeg(MemoryTask):
         box = self.box.position
         nearer = np.linalg.norm(free.position - box) < np.linalg.norm(grasped.position - box)
         return self._inside(free) and bool(nearer) and (self.tcp_pose.p[1] - box[1]) * side < 0
-
-    def _shown_inserted(self) -> bool:
-        """The video's insertion has happened; the box shows it."""
-        if not self._inserted(self.end, self.side):
-            return False
-        self.mark.update(self.steps_done, touched=True)
-        return True
-
-    def _inserted_for_good(self) -> bool:
-        """The execution's insertion counts a few steps later."""
-        if self._inserted_at is None and self._shown_inserted():
-            self._inserted_at = self.steps_done
-        return self._inserted_at is not None and self.steps_done >= self._inserted_at + SUCCESS_DELAY
 
     # Sub-tasks ----------------------------------------------------------------------------------------------------
 
@@ -149,7 +137,7 @@ class InsertPeg(MemoryTask):
 
         def wrong_insertion() -> bool:
             wrong = self._inserted(wrong_end, 1) or self._inserted(wrong_end, -1)
-            return wrong or self._inserted(self.end, -self.side)
+            return wrong or self._inserted(self.end, -self.side) or any_picked_up(self, others)
 
         return [
             SubTask(
@@ -164,7 +152,7 @@ class InsertPeg(MemoryTask):
             ),
             SubTask(
                 f"Insert the peg from the {side} side{of_box}",
-                done=self._shown_inserted if video else self._inserted_for_good,
+                done=lambda: self._inserted(self.end, self.side),
                 run=self._demonstrate_insertion,
                 grounded=f"Insert the peg from the {side} side{of_box} at <>",
                 failed=None if video else wrong_insertion,
@@ -178,8 +166,8 @@ class InsertPeg(MemoryTask):
 
     def _demonstrate_grasp(self, demo: "Demonstrator") -> None:
         """Grasp as the benchmark does; where the box is in the hand's way, move the peg by its other end first."""
-        other = "tail" if self.end == "head" else "head"
-        plans = [None, (other, False), (other, True), (self.end, True)]
+        other: PegEnd = "tail" if self.end == "head" else "head"
+        plans: list[tuple[PegEnd, bool] | None] = [None, (other, False), (other, True), (self.end, True)]
         # What helped in the video is likely to help again.
         for drag in plans[self._helpful :]:
             if drag is not None:
@@ -189,6 +177,7 @@ class InsertPeg(MemoryTask):
             if self._lifted(self.end):
                 self._helpful = plans.index(drag)
                 return
+        raise PlanningError(f"{self.peg.name} cannot be grasped by its {self.end}: the box is in the way.")
 
     def _way_out(self) -> np.ndarray:
         """The shortest way [2] that takes the peg to an open place."""
@@ -196,28 +185,31 @@ class InsertPeg(MemoryTask):
         others = [peg.position[:2] for peg in self.pegs[1:]]
 
         def is_open(place: np.ndarray) -> bool:
-            far = np.linalg.norm(place - self.box.position[:2]) > OPEN_FROM_BOX
-            return bool(far and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others))
+            near, far = WORKSPACE
+            reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < far
+            apart = np.linalg.norm(place - self.box.position[:2]) > OPEN_FROM_BOX
+            return bool(reached and apart and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others))
 
         angles, lengths = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(0.04, 0.4, 0.02)
         ways = [length * np.array([np.cos(angle), np.sin(angle)]) for length in lengths for angle in angles]
         away = middle - self.box.position[:2]
-        ways = [way for way in ways if way @ away >= 0 and (np.abs(middle + way) < WORKSPACE).all()]
-        return next((way for way in ways if is_open(middle + way)), 0.1 * away / np.linalg.norm(away))
+        open_ways = (way for way in ways if way @ away >= 0 and is_open(middle + way))
+        return next(open_ways, 0.1 * away / np.linalg.norm(away))
 
     def _demonstrate_insertion(self, demo: "Demonstrator") -> None:
         """Insert as the benchmark does; where that is out of reach or falls short, from another grasp, and fully."""
+        held, _ = self.ends(self.end)
         with suppress(PlanningError):
             demo.insert_peg(self.peg, self.end, self.side, self.box)
-        if self._inserted(self.end, self.side):
-            return
-        with suppress(PlanningError):
-            demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
-        for turn in (True, False):
-            if not self._inserted(self.end, self.side):
-                demo.lay_down_peg()
-                demo.grasp_peg(self.peg, self.end, turn)
-                demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
+        for turn in (None, True, False):
+            if self._inserted(self.end, self.side):
+                return
+            with suppress(PlanningError):
+                if turn is not None:
+                    demo.lay_down_peg() if self.is_grasping(held) else demo.withdraw()
+                    demo.grasp_peg(self.peg, self.end, turn)
+                if self.is_grasping(held):
+                    demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
 
     # Choices ------------------------------------------------------------------------------------------------------
 
@@ -238,7 +230,7 @@ class InsertPeg(MemoryTask):
     def _insert(self, demo: "Demonstrator", side: int) -> None:
         """Insert whichever peg the gripper is at, by whichever end it holds."""
         tcp = self.tcp_pose.p
-        ends = [(peg, end) for peg in self.pegs for end in ("head", "tail")]
+        ends = [(peg, end) for peg in self.pegs for end in ENDS]
         peg, end = min(ends, key=lambda e: float(np.linalg.norm(getattr(*e).position - tcp)))
         demo.insert_peg(peg, end, side, self.box)
 

@@ -3,6 +3,7 @@
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
 import sapien
 
 from mme_vla.envs.base import MemoryTask
@@ -25,7 +26,7 @@ CUBE_FROM_TARGET = 5 * H
 CUBE_GAP = 0.005
 TRIES = 128
 HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
-MORE_HOLDS = 5  # where the arm did not come to rest at once
+MORE_TRIES = 2  # where the cube did not stay on the target
 
 type Point = tuple[float, float]
 
@@ -67,7 +68,7 @@ class MoveCube(MemoryTask):
         assert xy is not None
         return xy
 
-    def _draw_cube(self, draws: Draws, goal: Point, avoid: list) -> tuple[Point, float]:
+    def _draw_cube(self, draws: Draws, goal: Point, avoid: list) -> tuple[np.ndarray, float]:
         """A place near a point that is not near the goal."""
         for _ in range(TRIES):
             centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
@@ -89,7 +90,7 @@ class MoveCube(MemoryTask):
     def subtasks(self) -> list[SubTask]:
         steps = HOLD_STEPS[self.manner]
         between = [
-            SubTask("static", StaticFor(self, steps), self._rest, video=True),
+            SubTask("static", StaticFor(self, steps), lambda demo: demo.hold(steps), video=True),
             SubTask(
                 NO_RECORD,
                 done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
@@ -100,12 +101,20 @@ class MoveCube(MemoryTask):
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
         return [*moves(video=True), *between, *moves(video=False)]
 
-    def _rest(self, demo: "Demonstrator") -> None:
-        resting = self.progress.current
-        demo.hold(HOLD_STEPS[self.manner])
-        for _ in range(MORE_HOLDS):
-            if self.progress.current is resting:
-                demo.open()
+    def _demonstrate_hook(self, demo: "Demonstrator") -> None:
+        demo.hook(self.cube, self.target, self._side())
+        for _ in range(MORE_TRIES):
+            if not self._pushed():
+                demo.withdraw()
+                demo.grasp_peg(self.peg, "tail")
+                demo.hook(self.cube, self.target, self._side())
+
+    def _demonstrate_push(self, demo: "Demonstrator") -> None:
+        demo.push(self.cube, self.target)
+        for _ in range(MORE_TRIES):
+            if not self._pushed():
+                demo.withdraw()
+                demo.push(self.cube, self.target)
 
     def _on_target(self) -> bool:
         return pushed_onto(self.cube, self.target)
@@ -134,7 +143,7 @@ class MoveCube(MemoryTask):
             SubTask(
                 "Hook the cube to the target with the peg",
                 done=self._pushed,
-                run=lambda demo: demo.hook(self.cube, self.target, self._side()),
+                run=self._demonstrate_hook,
                 grounded="Hook the cube at <> to the target at <> with the peg",
                 targets=[self.cube, self.target],
                 choice="b",
@@ -151,7 +160,7 @@ class MoveCube(MemoryTask):
             SubTask(
                 "Close the gripper and push the cube to the target",
                 done=self._pushed,
-                run=lambda demo: demo.push(self.cube, self.target),
+                run=self._demonstrate_push,
                 grounded="Close the gripper and push the cube at <> to the target at <>",
                 failed=lambda: self._holds_cube() or self._holds_peg(),
                 targets=[self.cube, self.target],

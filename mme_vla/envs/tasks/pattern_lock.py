@@ -110,10 +110,10 @@ class PatternLock(MemoryTask):
         )
 
     def choices(self) -> list[Choice]:
-        return [
-            Choice(letter, f"move {word}", lambda demo, _, word=word: self._go(demo, word))
-            for letter, word in zip("abcdefgh", DIRECTIONS, strict=True)
-        ]
+        return [self._choice(letter, word) for letter, word in zip("abcdefgh", DIRECTIONS, strict=True)]
+
+    def _choice(self, letter: str, word: str) -> Choice:
+        return Choice(letter, f"move {word}", lambda demo, _: self._go(demo, word))
 
     def _go(self, demo: "Demonstrator", word: str) -> None:
         tcp = self.tcp_pose.p

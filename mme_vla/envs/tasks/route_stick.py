@@ -1,7 +1,7 @@
 """RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same route."""
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -24,7 +24,10 @@ MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
 VISIT, VISIT_HEIGHT = 0.03, 0.15
 MARK_RADIUS, MARK_STEPS = 0.02004, 40
 HOME_STEPS = 200
-SIDES = (("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"))
+Turn = Literal["clockwise", "counterclockwise"]
+SIDES: tuple[tuple[str, Turn], ...] = (
+    ("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"),
+)  # fmt: skip
 
 
 @register_task
@@ -43,7 +46,8 @@ class RouteStick(MemoryTask):
             for i, xy in enumerate(places)
         ]
         for i in range(1, PLACES, 2):
-            self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, draws.uniforms(3).tolist()))
+            red, green, blue = draws.uniforms(3).tolist()
+            self.add(build_obstacle(self, f"obstacle_{i // 2}", places[i], angle, (red, green, blue)))
         self.discs = self.all_discs[::2]
         self._draw_route(draws)
         self._marks = [build_mark(self, f"mark_{i}", MARK_RADIUS, MARK_RADIUS) for i in range(5)]
@@ -59,7 +63,7 @@ class RouteStick(MemoryTask):
                 nearby.remove(route[-2])
             route.append(nearby[draws.integer(0, len(nearby))])
         self.route = [self.discs[i] for i in route]
-        self.turns = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+        self.turns: list[Turn] = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
 
     def start_episode(self, draws: Draws) -> None:
         self.marks = [Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)]
@@ -80,7 +84,7 @@ class RouteStick(MemoryTask):
         self._way.append(np.asarray(self.tcp_pose.p[:2], np.float64))
         return False
 
-    def _turned(self, previous: Disc, goal: Disc) -> str:
+    def _turned(self, previous: Disc, goal: Disc) -> Turn:
         """How the tool went around what lies between two discs: on which side of the chord it was on average."""
         way = np.mean(self._way, axis=0) - previous.position[:2]
         chord = goal.position[:2] - previous.position[:2]
@@ -100,7 +104,7 @@ class RouteStick(MemoryTask):
         legs = zip(self.route, self.route[1:], self.turns, strict=False)
         return [self._move(previous, goal, turn, video) for previous, goal, turn in legs]
 
-    def _move(self, previous: Disc, goal: Disc, turn: str, video: bool) -> SubTask:
+    def _move(self, previous: Disc, goal: Disc, turn: Turn, video: bool) -> SubTask:
         others = [disc for disc in self.all_discs if disc is not previous and disc is not goal]
         side = "left" if goal.position[1] > previous.position[1] else "right"
 
@@ -121,16 +125,16 @@ class RouteStick(MemoryTask):
         )
 
     @staticmethod
-    def _text(side: str, turn: str) -> str:
+    def _text(side: str, turn: Turn) -> str:
         return f"move to the nearest {side} target by circling around the stick {turn}"
 
     def choices(self) -> list[Choice]:
-        return [
-            Choice(letter, self._text(*side), lambda demo, _, side=side: self._go(demo, *side))
-            for letter, side in zip("abcd", SIDES, strict=True)
-        ]
+        return [self._choice(letter, side, turn) for letter, (side, turn) in zip("abcd", SIDES, strict=True)]
 
-    def _go(self, demo: "Demonstrator", side: str, turn: str) -> None:
+    def _choice(self, letter: str, side: str, turn: Turn) -> Choice:
+        return Choice(letter, self._text(side, turn), lambda demo, _: self._go(demo, side, turn))
+
+    def _go(self, demo: "Demonstrator", side: str, turn: Turn) -> None:
         tcp = self.tcp_pose.p
         here = min(range(len(self.discs)), key=lambda i: distance_xy(self.discs[i].position, tcp))
         there = here + (1 if side == "left" else -1)
