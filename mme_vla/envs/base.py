@@ -136,7 +136,7 @@ class MemoryTask(BaseEnv):
         self.things.append(thing)
         return thing
 
-    def _load_agent(self, options: dict) -> None:  # type: ignore[override]
+    def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, sapien.Pose(ROBOT_BASE))
 
     def _load_scene(self, options: dict) -> None:
@@ -174,7 +174,7 @@ class MemoryTask(BaseEnv):
 
     # A step -------------------------------------------------------------------------------------------------------
 
-    def step(self, action: Any) -> tuple:  # type: ignore[override]
+    def step(self, action: Any) -> tuple:
         result = super().step(action)
         self.after_step(self.steps_done)
         return result

@@ -66,7 +66,7 @@ class MoveCube(MemoryTask):
     def _draw_goal(self, draws: Draws, half: float) -> Point:
         xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
         assert xy is not None
-        return xy
+        return float(xy[0]), float(xy[1])
 
     def _draw_cube(self, draws: Draws, goal: Point, avoid: list) -> tuple[np.ndarray, float]:
         """A place near a point that is not near the goal."""
