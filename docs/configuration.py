@@ -14,6 +14,9 @@ COMMANDS = {
     "inspect": "python -m mme_vla.inspect",
     "serve": "python -m mme_vla.serve",
     "evaluate": "python -m mme_vla.evaluate",
+    "record": "python -m mme_vla.envs.record",
+    "show": "python -m mme_vla.envs.show",
+    "play": "python -m mme_vla.play",
     "subgoal_build": "python -m mme_vla.subgoal.build",
     "subgoal_train": "python -m mme_vla.subgoal.train",
 }

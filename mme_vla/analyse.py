@@ -103,14 +103,15 @@ def selection(args: argparse.Namespace) -> None:
     """Write what a memory remembers along an episode as an mp4, and its last picture as PNG."""
     from mme_vla.config import compose
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.evaluation.analyses.selection import selection_sheets, write_video
+    from mme_vla.data.previews import write_film
+    from mme_vla.evaluation.analyses.selection import selection_sheets
     from mme_vla.inspect import build_memory
 
     source = EpisodeSource(args.dataset)
     memory = build_memory(compose("inspect", [f"memory={args.memory}", *args.set]))
     sheets = [sheet for _, sheet in selection_sheets(source, args.episode, memory, args.memory, args.every)]
     path = args.output or Path("outputs/analyse") / f"{source.name}_episode{args.episode}_{args.memory}.mp4"
-    write_video(sheets, path, args.fps)
+    write_film(sheets, path, args.fps)
     sheets[-1].save(path.with_suffix(".png"))
     print(f"wrote {path} ({len(sheets)} pictures) and {path.with_suffix('.png')}")
 

@@ -3,6 +3,9 @@
 import os
 from pathlib import Path
 
+# Tests are run side by side (`pytest -n auto`): one thread each, as many tests as there are cores.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent

@@ -80,20 +80,13 @@ def test_inverse_kinematics_tries_other_starts_within_the_limits(arms: dict[bool
 
 
 def test_the_jacobian_is_the_derivative_of_the_pose(arms: dict[bool, Arm]) -> None:
-    arm, q, step = arms[False], np.array([0.1, 0.3, -0.2, -1.9, 0.1, 2.1, 0.6]), 1e-3
+    arm, q, step = arms[False], np.array([0.1, 0.3, -0.2, -1.9, 0.1, 2.1, 0.6]), 5e-3
     jacobian = arm.jacobian(q)
-    for i in range(7):
-        ahead, behind = (arm.forward_in_base(q + s * step * np.eye(7)[i]).to_transformation_matrix() for s in (1, -1))
+    for i, nudge in enumerate(step * np.eye(7)):
+        ahead, behind = (arm.forward_in_base(q + s * nudge).to_transformation_matrix() for s in (1, -1))
         twist = twist_of(ahead.astype(float) @ np.linalg.inv(behind.astype(float)))
-        if np.linalg.norm(twist[3:]) == 0:  # so small a turn counts as none: compare the linear part of a larger one
-            continue
+        assert twist is not None and np.linalg.norm(twist[3:]) > 0
         np.testing.assert_allclose(twist / (2 * step), jacobian[:, i], atol=1e-3)
-    point = np.append(arm.forward_in_base(q).p, 1)
-    moved = (arm.forward_in_base(q + step * np.eye(7)[3]).p - arm.forward_in_base(q - step * np.eye(7)[3]).p) / (
-        2 * step
-    )
-    linear = jacobian[:3, 3] + np.cross(jacobian[3:, 3], point[:3])
-    np.testing.assert_allclose(moved, linear, atol=1e-3)
 
 
 @pytest.mark.parametrize(("task", "episode", "motions"), MOTIONS)

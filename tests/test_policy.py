@@ -7,19 +7,19 @@ import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy import MMEPolicy
-from mme_vla.testing import MODELS, NEURAL, random_batch, random_history, small_policy
+from mme_vla.testing import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
 
 TOLERANCE = 2e-5
 
 
 @pytest.fixture(params=MODELS)
 def policy(request):
-    return small_policy(request.param)
+    return small_policy(request.param, backbone={"vision": SMALL_VISION})
 
 
 @pytest.fixture(params=NEURAL)
 def remembering(request):
-    return small_policy(request.param)
+    return small_policy(request.param, backbone={"vision": SMALL_VISION})
 
 
 @torch.no_grad()

@@ -6,7 +6,7 @@ import torch
 
 from mme_vla import UserError
 from mme_vla.memory.base import stack_history
-from mme_vla.testing import NEURAL, cached_history, moving_frames, online_history, small_policy
+from mme_vla.testing import NEURAL, SMALL_VISION, cached_history, moving_frames, online_history, small_policy
 from mme_vla.types import Batch
 
 FRAMES = 90
@@ -14,7 +14,7 @@ FRAMES = 90
 
 @pytest.fixture(params=NEURAL, scope="module")
 def policy(request):
-    return small_policy(request.param, policy={"history_dtype": "float32"})
+    return small_policy(request.param, policy={"history_dtype": "float32"}, backbone={"vision": SMALL_VISION})
 
 
 @pytest.fixture(scope="module")

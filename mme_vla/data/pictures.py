@@ -34,12 +34,12 @@ def contact_sheet(
     top = 2 * MARGIN + LABEL + TIMELINE + 2 * LABEL
     sheet = Image.new("RGB", (width, top + rows * (TILE + LABEL + GAP) + MARGIN), "white")
     draw = ImageDraw.Draw(sheet)
-    draw.text((MARGIN, MARGIN), _fitted(title, width - 2 * MARGIN, 17), INK, _font(17))
+    draw.text((MARGIN, MARGIN), fitted(title, width - 2 * MARGIN, 17), INK, font(17))
     _timeline(draw, counts, grid**2, exec_start, step, (MARGIN, 2 * MARGIN + LABEL, width - MARGIN, TIMELINE))
     hidden = len(remembered) - len(shown)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
     note += f" {hidden} more frames are remembered in part." if hidden else ""
-    draw.text((MARGIN, top - LABEL - 4), note, FAINT, _font(13))
+    draw.text((MARGIN, top - LABEL - 4), note, FAINT, font(13))
     for place, frame in enumerate(tiles):
         x = MARGIN + (place % columns) * (TILE + GAP)
         y = top + (place // columns) * (TILE + LABEL + GAP)
@@ -52,7 +52,7 @@ def contact_sheet(
             label = f"{frame} {kind} {len(patches)}/{grid**2}"
         sheet.paste(tile, (x, y))
         draw.rectangle((x - 2, y - 2, x + TILE + 1, y + TILE + 1), outline=colour, width=2)
-        draw.text((x, y + TILE + 3), label, INK, _font(13))
+        draw.text((x, y + TILE + 3), label, INK, font(13))
     return sheet
 
 
@@ -98,23 +98,23 @@ def _timeline(
     draw.line((left, bottom, right, bottom), fill=INK)
     phases = {0: "0 · conditioning video", exec_start: f"{exec_start} · execution", step: str(step)}
     for frame, text in phases.items():
-        x = min(left + frame * scale, right - draw.textlength(text, _font(13)))
-        draw.text((x, bottom + 3), text, INK, _font(13))
+        x = min(left + frame * scale, right - draw.textlength(text, font(13)))
+        draw.text((x, bottom + 3), text, INK, font(13))
 
 
 def _thumbnail(frame: np.ndarray) -> Image.Image:
     return Image.fromarray(frame).resize((TILE, TILE), Image.Resampling.LANCZOS)
 
 
-def _font(size: int) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
+def font(size: int) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
     return ImageFont.load_default(size)
 
 
-def _fitted(text: str, width: int, size: int) -> str:
+def fitted(text: str, width: int, size: int) -> str:
     """The text, cut with an ellipsis where it is too long for `width` pixels."""
-    font = _font(size)
-    if font.getlength(text) <= width:
+    face = font(size)
+    if face.getlength(text) <= width:
         return text
-    while text and font.getlength(text + "…") > width:
+    while text and face.getlength(text + "…") > width:
         text = text[:-1]
     return text.rstrip() + "…"

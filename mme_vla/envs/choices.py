@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ class Choice:
 
     label: str
     action: str
-    run: Callable[["Demonstrator", "Thing | None"], None]
+    run: Callable[["Demonstrator", Any], None]
     """Gets the object the point chose, or None where the option needs no point."""
     candidates: Callable[[], Sequence["Thing"]] | None = None
     """Objects a point may choose among; an option with candidates needs a point."""

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import H, Container, Cube, build_container, build_hidden_cube
+from mme_vla.envs.objects import Container, Cube, H, build_container, build_hidden_cube
 from mme_vla.envs.placement import Avoid, Region, draw_container
 from mme_vla.envs.predicates import container_picked_up, container_put_down
 from mme_vla.envs.subtasks import SubTask

@@ -111,15 +111,19 @@ class RoboMMEEnv(gymnasium.Env):
 
         Args:
             seed: without effect on the scene, which the environment's own seed fixes.
-            options: none are known.
+            options: `{"video": False}` leaves the conditioning video out, for measuring and debugging: its sub-tasks
+                then remain to be done.
 
         Returns:
             Observation lists (conditioning video, then the present frame) and the info of the present frame.
 
         Raises:
-            UserError: the environment is closed.
+            UserError: the environment is closed, or an option is not known.
         """
         task = self._open_task()
+        options = {"video": True} | (options or {})
+        if len(options) > 1:
+            raise UserError(f"Unknown reset options {sorted(options.keys() - {'video'})}; there is only 'video'.")
         super().reset(seed=seed)
         # Leftovers of an episode, in the solver and in what the script added, go only with the scene.
         self._muted = True
@@ -131,7 +135,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._grounding.clear()
         self._observer.start()
         for subtask in task.progress.subtasks:
-            if subtask.video:
+            if subtask.video and options["video"]:
                 self._demonstrate(subtask)
         run.in_video = False
         self._step_control(task.start_action)
@@ -207,8 +211,9 @@ class RoboMMEEnv(gymnasium.Env):
     def _step_control(self, action: np.ndarray) -> None:
         task, run = self._open_task(), self._require_run()
         run.count += not run.in_video
-        # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to.
-        run.shown = task.progress.shown
+        # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to; in
+        # the video, by the one that is being demonstrated.
+        run.shown = task.progress.demonstrated if run.in_video else task.progress.shown
         run.last_action = np.asarray(action, np.float32)
         _, _, terminated, _, _ = task.step(run.last_action)
         run.terminated = terminated.reshape(-1)[0].clone()

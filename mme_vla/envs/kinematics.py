@@ -53,7 +53,7 @@ class Arm:
         return self._model.get_link_pose(self._wrist)
 
     def jacobian(self, qpos: np.ndarray) -> np.ndarray:
-        """Spatial Jacobian [6, 7] in the base frame: linear velocity of the point at the base's origin, then angular."""
+        """Spatial Jacobian [6, 7] in the base frame: linear velocity of the point at its origin, then angular."""
         self._model.compute_full_jacobian(self._padded(qpos))
         return np.asarray(self._model.get_link_jacobian(self._tcp, False))[:, :ARM_JOINTS]
 
@@ -65,8 +65,8 @@ class Arm:
     def ik(self, pose: sapien.Pose, qpos: np.ndarray) -> np.ndarray | None:
         """Joint angles that bring the tool centre point to a pose, by damped closed-loop iteration.
 
-        The iteration starts at the given joints, and only if that does not converge within the limits at up to 19 random
-        configurations, always the same ones. Angles are wrapped into the limits where a full turn allows it.
+        The iteration starts at the given joints, and, where that does not converge within the limits, at up to 19
+        random configurations, always the same ones. Angles are wrapped into the limits where a full turn allows it.
 
         Args:
             pose: target in the world.

@@ -26,6 +26,7 @@ def make_env(
     *,
     seed: int | None = None,
     difficulty: str | None = None,
+    recovery: str | None = None,
     max_steps: int = 1300,
     render: bool = True,
     env: str = "mme_vla",
@@ -40,6 +41,8 @@ def make_env(
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
+        recovery: `z` or `xy`: draw what recovery demonstrations draw in addition, as train episodes 0-5 were recorded
+            (it changes the order of BinFill's colours); by default nothing, as in the official evaluation.
         max_steps: control steps until the status becomes `timeout`.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         env: `mme_vla`, or `official` for the installed package `robomme`.
@@ -57,13 +60,13 @@ def make_env(
     if env == "official":
         from mme_vla.envs.official import make_official_env
 
-        if seed is not None or not render:
-            raise UserError('env="official" takes episodes of a split and always renders: leave out seed and render.')
+        if seed is not None or recovery is not None or not render:
+            raise UserError('env="official" takes episodes of a split and renders: leave out seed, recovery, render.')
         return make_official_env(task, split, episode, action_space, max_steps, include)
     if seed is None:
         spec = metadata.episode(task, split, episode)
         seed, difficulty = spec.seed, spec.difficulty
-    return _make_own(task, action_space, seed, difficulty, max_steps, render, include)
+    return _make_own(task, action_space, seed, difficulty, recovery, max_steps, render, include)
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
@@ -123,6 +126,7 @@ def _make_own(
     space: str,
     seed: int,
     difficulty: str | None,
+    recovery: str | None,
     max_steps: int,
     render: bool,
     options: dict[str, Any],
@@ -139,5 +143,5 @@ def _make_own(
     require_simulator()
     from mme_vla.envs.interface import RoboMMEEnv
 
-    built = make_task(task, render=render, obs_mode=obs_mode, seed=seed, difficulty=difficulty)
+    built = make_task(task, render=render, obs_mode=obs_mode, seed=seed, difficulty=difficulty, recovery=recovery)
     return RoboMMEEnv(built, space, max_steps, include, render)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import sapien
 
-from mme_vla.envs.grasping import DOWNWARD_Q, failing_offset, grasp_orientation
+from mme_vla.envs.grasping import DOWNWARD_Q, failing_offset, grasp_orientation, turned
 from mme_vla.envs.objects import Button
 from mme_vla.envs.robot_control import CLOSE, OPEN, RobotControl
 from mme_vla.envs.things import Thing
@@ -14,6 +14,8 @@ ABOVE, ABOVE_CONTAINER, ABOVE_BOARD = 0.15, 0.2, 0.2
 """Heights of the tool before and after a grasp or a release, metres."""
 HANDLE = 0.01
 """How far above a container's origin its handle is grasped, metres."""
+LIFTED = 0.02
+"""How far a thing has risen at least when it was grasped, metres."""
 MISS, MISS_CONTAINER = 0.04, 0.035
 """How far a grasp that is to fail misses, metres."""
 
@@ -51,7 +53,7 @@ class GripperPrimitives(RobotControl):
         here = self.env.tcp_pose
         self.move_to(self.at([*here.p[:2], release_z], here.q), OPEN)
         self.open()
-        self.move_to(self.at([*here.p[:2], ABOVE], here.q))
+        self.move_to(self.at([*self.env.tcp_pose.p[:2], ABOVE], here.q))
 
     def drop_into_bin(self, board: Thing) -> None:
         """Let what is held fall into the hole of a board, and withdraw."""
@@ -65,18 +67,20 @@ class GripperPrimitives(RobotControl):
         """Carry what is held over a target, the tool at height `z` in metres."""
         self.move_to(self._over(target, z, self.env.tcp_pose.q), CLOSE)
 
-    def press(self, button: Button, hold: bool = True) -> None:
+    def press(self, button: Button, hold: bool = True, close: bool = True) -> None:
         """Press a button with closed fingers and let it go.
 
         Args:
             button: which one.
             hold: first move above it; without, the tool is there already.
+            close: close the fingers first; without, they are closed already and time is short.
         """
         above = self._over(button, ABOVE, DOWNWARD_Q)
         if hold:
             self.move_to(above, OPEN)
-        self.announce(above, CLOSE)
-        self.close()
+        if close:
+            self.announce(above, CLOSE)
+            self.close()
         self.move_to(self._over(button, button.base_z, DOWNWARD_Q), CLOSE)
         self.move_to(above, CLOSE)
 
@@ -91,6 +95,15 @@ class GripperPrimitives(RobotControl):
         if mode is not None:
             self._fail_grasp(thing, above, depth, failing_offset(mode, miss, self.env.seed))
         grasp = self._grasp_pose(thing, depth)
+        rest = thing.position[2]
+        self._grasp_at(grasp, thing, above)
+        if thing.position[2] - rest < LIFTED:
+            # A finger was in something's way: once more, across the other sides.
+            self.open()
+            grasp = self._grasp_pose(thing, depth)
+            self._grasp_at(sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi / 2)), thing, above)
+
+    def _grasp_at(self, grasp: sapien.Pose, thing: Thing, above: float) -> None:
         self.move_to(self.at([*grasp.p[:2], above], grasp.q), OPEN)
         self.open()
         self.move_to(grasp, CLOSE)
@@ -111,7 +124,7 @@ class GripperPrimitives(RobotControl):
 
     def _grasp_pose(self, thing: Thing, depth: float) -> sapien.Pose:
         closing = self.env.tcp_pose.to_transformation_matrix()[:3, 1]
-        return sapien.Pose(thing.position + [0, 0, depth], grasp_orientation(thing, closing))
+        return sapien.Pose(thing.position + np.array([0, 0, depth]), grasp_orientation(thing, closing))
 
     @staticmethod
     def _over(target: Thing, z: float, q: np.ndarray | Sequence[float]) -> sapien.Pose:

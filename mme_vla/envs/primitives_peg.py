@@ -1,6 +1,5 @@
 """What a cube or a peg is shown to suffer: pushing, hooking, grasping by one end, inserting."""
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -15,9 +14,12 @@ BEHIND = 0.05
 """Where a push begins: how far behind the cube, metres."""
 HOOK_BACK, HOOK_ASIDE, HOOK_STOP = 0.1, 0.1, 0.03
 """Where a hook begins behind and beside the cube, and how far before the goal it ends, metres."""
-ABOVE_PEG = 0.2
+ABOVE_PEG, ABOVE_DRAG, PEG_DRAGGED, PEG_ON_TABLE = 0.2, 0.12, 0.04, 0.015
+"""Heights of the tool over a peg, likewise before it drags one, while it does, and where it lets one go, metres."""
+TIP = 0.012
+"""From the middle of a peg's end to where it is taken to be dragged, metres."""
 INSERT_FAR, INSERT_NEAR, INSERT_PAST, INSERT_RAISED = 0.2, 0.15, 0.05, 0.15
-"""Stations of an insertion along the hole, seen from where the end is in the middle of the box, and the first's height."""
+"""Stations of an insertion, along the hole from where the end is in the box's middle, and the first one's height."""
 
 
 class PegPrimitives(RobotControl):
@@ -50,56 +52,112 @@ class PegPrimitives(RobotControl):
         way, z = _direction(cube, goal), cube.position[2]
         lateral = side * np.array([-way[1], way[0]])
         q, aside = pointing_down(lateral), HOOK_ASIDE * lateral
-        self.move_to(self.at([*(cube.position[:2] - HOOK_BACK * way - aside), z], q))
+        start = self.at([*(cube.position[:2] - HOOK_BACK * way - aside), z], q)
+        self.move_to(start, CLOSE)
+        self.move_to(start)
         self.close()
         end = self.at([*(goal.position[:2] - HOOK_STOP * way - aside), z], q)
         self.move_to(end, CLOSE)
         self.announce(end, OPEN)
         self.open()
 
-    def grasp_peg(self, peg: Peg, end: Thing | Literal["head", "tail"]) -> None:
-        """Grasp a peg by one of its ends, `peg.head` or `peg.tail` (or its name), and lift it."""
-        half: Thing = getattr(peg, end) if isinstance(end, str) else end
+    def grasp_peg(self, peg: Peg, end: Thing | Literal["head", "tail"], turn: bool = False) -> None:
+        """Grasp a peg by one of its ends and lift it.
+
+        Args:
+            peg: the peg.
+            end: `peg.head` or `peg.tail`, or its name.
+            turn: hold the hand the other way round.
+        """
         self.open()
-        grasp = sapien.Pose(half.position, turned(half.pose.q, "x", np.pi))
+        grasp = _peg_grasp(getattr(peg, end) if isinstance(end, str) else end, turn)
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), OPEN)
         self.move_to(grasp, CLOSE)
         self.close()
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), CLOSE)
         self.close()
 
-    def insert_peg(
-        self,
-        peg: Peg,
-        held: Thing | Literal["head", "tail"],
-        side: int,
-        box: Thing,
-        until: Callable[[], bool] | None = None,
-    ) -> None:
-        """Put the free end of a held peg into the hole of a box.
+    def insert_peg(self, peg: Peg, held: Thing | Literal["head", "tail"], side: int, box: Thing) -> None:
+        """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator does.
+
+        Held by its tail and inserted from the right, the peg stops short of the hole, now and then too short;
+        `insert_peg_fully` makes up for that.
 
         Args:
             peg: the peg.
             held: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
-            until: asked after each step of the last motion, which ends when it is true.
         """
-        head_first = (held if isinstance(held, str) else held.name) in ("tail", peg.tail.name)
+        head_first = held in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
-        grip = free.pose.inv() * self.env.tcp_pose
-        # Unturned, a peg that goes in head first comes from the hole's negative end, which is on the right.
+        outward = -1 if head_first else 1
+        turn = head_first != (side > 0)
+
+        def station(along: float, raised: float = 0.0) -> sapien.Pose:
+            # The peg may slip: how it is held is looked at before every motion.
+            grip = free.pose.inv() * self.env.tcp_pose
+            inserted = box.pose * grip
+            if turn:
+                # The tool is turned where it is, which puts the peg's other end into the box ...
+                inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
+                # ... and only in this case is that made up for.
+                along += grip.p[0] if head_first and along < 0 else 0.0
+            return inserted * sapien.Pose([along, 0, -raised])
+
+        self.move_to(station(outward * INSERT_FAR, INSERT_RAISED), CLOSE)
+        self.move_to(station(outward * INSERT_FAR), CLOSE)
+        self.move_to(station(outward * INSERT_NEAR))
+        self.move_to(station(-INSERT_PAST), CLOSE)
+
+    def insert_peg_fully(self, peg: Peg, held: Thing | Literal["head", "tail"], side: int, box: Thing) -> None:
+        """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
+
+        Args:
+            peg: the peg.
+            held: the end that is held; the other one goes in.
+            side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
+            box: its hole runs along its x axis, which points to the left.
+        """
+        head_first = held in ("tail", peg.tail)
+        free = peg.head if head_first else peg.tail
         hole = box.pose if head_first == (side > 0) else sapien.Pose(box.pose.p, turned(box.pose.q, "z", np.pi))
-        inserted = hole * grip
         outward = -1 if head_first else 1
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
-            return inserted * sapien.Pose([outward * along, 0, -raised])
+            return hole * sapien.Pose([outward * along, 0, raised]) * free.pose.inv() * self.env.tcp_pose
 
-        self.move_to(station(INSERT_FAR, INSERT_RAISED), CLOSE)
-        self.move_to(station(INSERT_FAR), CLOSE)
-        self.move_to(station(INSERT_NEAR))
-        self.move_to(station(-INSERT_PAST), CLOSE, until)
+        inside = np.linalg.norm(free.position - box.position) < INSERT_NEAR
+        if not inside:
+            self.move_to(station(INSERT_FAR, INSERT_RAISED), CLOSE)
+            self.move_to(station(INSERT_FAR), CLOSE)
+            self.move_to(station(INSERT_NEAR))
+        self.move_to(station(0.0), CLOSE)
+
+    def drag_peg(self, peg: Peg, end: Literal["head", "tail"], way: np.ndarray, turn: bool = False) -> None:
+        """Take a peg by one tip and draw it over the table, hardly lifted, along `way` [2] in metres."""
+        self.open()
+        grasp = _peg_grasp(getattr(peg, end), turn, outward=TIP if end == "head" else -TIP)
+        self.move_to(self.at([*grasp.p[:2], ABOVE_DRAG], grasp.q), OPEN)
+        self.move_to(grasp, CLOSE)
+        self.close()
+        self.move_to(self.at([*grasp.p[:2], PEG_DRAGGED], grasp.q), CLOSE)
+        self.move_to(self.at([*(grasp.p[:2] + way), PEG_DRAGGED], grasp.q), CLOSE)
+        self.lay_down_peg()
+
+    def lay_down_peg(self) -> None:
+        """Put a held peg on the table where the hand is."""
+        here = self.env.tcp_pose
+        self.move_to(self.at([*here.p[:2], PEG_ON_TABLE], here.q), OPEN)
+        self.open()
+        self.move_to(self.at([*self.env.tcp_pose.p[:2], ABOVE_PEG], here.q))
+
+
+def _peg_grasp(end: Thing, turn: bool, outward: float = 0.0) -> sapien.Pose:
+    """The tool's pose around one end of a peg, moved along the peg by `outward` metres."""
+    q = turned(end.pose.q, "x", np.pi)
+    along = end.pose.to_transformation_matrix()[:3, 0]
+    return sapien.Pose(end.position + outward * along, turned(q, "z", np.pi) if turn else q)
 
 
 def _direction(cube: Thing, goal: Thing) -> np.ndarray:

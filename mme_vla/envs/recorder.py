@@ -1,4 +1,4 @@
-"""One demonstration as data: every stored step of an episode with observation, action and texts, as the official files."""
+"""One demonstration as data: every stored step of an episode, with the fields of the official files."""
 
 import json
 from collections.abc import Callable
@@ -119,7 +119,7 @@ class Recorder:
         progress = self._task.progress
         # The text was set before the evaluation moved the pointer: it follows one step later.
         shown, self._shown = self._shown, progress.shown
-        planned = progress.subtasks[min(progress.planned, len(progress.subtasks) - 1)]
+        planned = progress.demonstrated
         if planned.video != self._in_video:
             if self._in_video is not None:
                 self._waypoint = None

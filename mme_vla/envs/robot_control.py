@@ -113,11 +113,12 @@ class RobotControl:
             n: steps of the command that follows the opening.
             qpos: joint angles to go to, [7]; by default those of the reset.
         """
-        self.env.reset_in_progress = True
         self.open()
         target = self.env.reset_action[:ARM_JOINTS] if qpos is None else qpos[:ARM_JOINTS]
         for _ in range(n):
             self._command(target)
+            # Only now: tasks restore their objects after each step but the first.
+            self.env.reset_in_progress = True
         self.env.reset_in_progress = False
         self.env.after_video = True
 

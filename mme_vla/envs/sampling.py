@@ -71,7 +71,7 @@ def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.
 
 
 def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]:
-    """Leave out what can be passed by in a straight line, then space the rest evenly, so that a spline stays near it."""
+    """Leave out what a straight line can skip, then space the rest evenly, so that a spline stays near it."""
     kept, i = [path[0]], 0
     while i < len(path) - 1:
         free = (j for j in range(len(path) - 1, i + 1, -1) if obstacles.clear_between(path[i], path[j]))

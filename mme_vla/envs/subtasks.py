@@ -78,6 +78,11 @@ class Progress:
         return self.subtasks[min(self.index, len(self.subtasks) - 1)]
 
     @property
+    def demonstrated(self) -> SubTask:
+        """The sub-task the demonstrator is at; at the end the last one."""
+        return self.subtasks[min(self.planned, len(self.subtasks) - 1)]
+
+    @property
     def succeeded(self) -> bool:
         """Whether every sub-task is done."""
         return self.index >= len(self.subtasks)

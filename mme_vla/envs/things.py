@@ -44,6 +44,10 @@ class Thing:
             self.entity.set_linear_velocity(np.zeros((1, 3), np.float32))
             self.entity.set_angular_velocity(np.zeros((1, 3), np.float32))
 
+    def displace(self, pose: sapien.Pose) -> None:
+        """Teleport the object in the midst of its motion: it keeps its velocity."""
+        self.entity.set_pose(pose)
+
     def move_away(self) -> None:
         """Take the object out of the scene, keeping its orientation."""
         self.move_to(sapien.Pose(AWAY, self.pose.q))

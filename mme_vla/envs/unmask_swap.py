@@ -6,8 +6,8 @@ from mme_vla.envs.anchors import ANCHOR_HALF, Point, swaps_in_turn
 from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.containers import add_hidden_cubes
 from mme_vla.envs.draws import Draws
-from mme_vla.envs.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide
-from mme_vla.envs.objects import H, Container, build_container
+from mme_vla.envs.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
+from mme_vla.envs.objects import Container, H, build_container
 from mme_vla.envs.placement import Avoid, Region, SceneError, draw_container
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
@@ -55,7 +55,7 @@ class UnmaskSwap(MemoryTask):
         return list(zip(self.colours, self.over_cubes, strict=True))[: self.pick_count]
 
     def start_episode(self, draws: Draws) -> None:
-        self.motions = [
+        self.motions: list[Cover | Swap | Hide] = [
             Cover(self.containers),
             *swaps_in_turn(self.initiators, self.containers, COVER_STEPS),
             Hide(list(zip(self.cubes, self.over_cubes, strict=True)), COVER_STEPS, self.swapped_after),

@@ -9,7 +9,7 @@ from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.draws import Draws
 from mme_vla.envs.motions import Swap
-from mme_vla.envs.objects import H, Cube, Disc, build_button, build_cube, build_disc
+from mme_vla.envs.objects import Cube, Disc, H, build_button, build_cube, build_disc
 from mme_vla.envs.placement import Avoid, Region, SceneError, draw_button, draw_cube, draw_disc
 from mme_vla.envs.predicates import StaticFor, any_picked_up, dropped, dropped_onto, picked_up, pressed, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
@@ -75,13 +75,19 @@ class VideoPlace(MemoryTask):
 
     def start_episode(self, draws: Draws) -> None:
         self._swap: Swap | None = None
+        self._swap_due = False
 
     def before_physics(self, k: int) -> None:
-        if self._swapped and self._swap is None and self.progress.current is self._swap_stage:
+        if self._swap_due and self._swap is None:
             first, second = self._swapped
             self._swap = Swap(first, self.targets, start=k, lane=SWAP_LANE, partner=second)
         if self._swap is not None:
             self._swap.apply(k)
+
+    def failure(self) -> bool:
+        """Notes whether the swap may begin, one step after its stage is entered; the rules belong to the stages."""
+        self._swap_due = bool(self._swapped) and self.progress.current is self._swap_stage
+        return False
 
     def subtasks(self) -> list[SubTask]:
         self._swap_stage = SubTask(

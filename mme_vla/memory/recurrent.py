@@ -144,7 +144,7 @@ class RecurrentMemory(MemoryModule):
     # The window
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        """Encode a window [b, n, d_vision] of whole frames; while `reporting`, with statistics of the layer as metrics."""
+        """Encode a window [b, n, d_vision] of whole frames; while `reporting`, statistics of the layer are metrics."""
         x = self.encoder(history.features, history.positions, history.mask)
         return self.run(self._by_frame(x), self._by_frame(history.mask).all(-1))
 

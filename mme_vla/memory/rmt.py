@@ -159,8 +159,8 @@ class RMT(RecurrentMemory):
                 least 2.
             rotation: `full`, or `cosine_only`: what the released evaluation ran, because its loading dropped the
                 imaginary part of the rotary table.
-            attention_dtype: what queries, keys and values are cast to; `bfloat16` as released, `float32` faster on
-                a CPU.
+            attention_dtype: what queries, keys and values are cast to; `bfloat16` as released; `float32` takes
+                the fused kernel, which keeps no weights: less memory.
 
         Raises:
             UserError: sizes that do not fit together, or an unknown choice.

@@ -129,7 +129,7 @@ class Api:
                 if self._is_fatal(error):
                     raise UserError(
                         f"{self.settings.model} cannot be asked: {reason}. Check the key in "
-                        f"${self.settings.key_variable} and subgoal.model."
+                        f"${self.settings.key_variable} and the model's name."
                     ) from None
                 failure = ApiFailure("failed", reason)
                 if not _is_passing(error):
@@ -192,11 +192,11 @@ class Api:
 def _make_client(settings: Settings) -> Any:
     key = os.environ.get(settings.key_variable)
     if not key:
-        raise UserError(f"subgoal=gemini needs a key in the environment variable {settings.key_variable}.")
+        raise UserError(f"Gemini needs a key in the environment variable {settings.key_variable}.")
     try:
         from google import genai
     except ImportError:
-        raise UserError("subgoal=gemini needs the extra `gemini`: pip install 'mme-vla[gemini]'.") from None
+        raise UserError("Gemini needs the extra `gemini`: pip install 'mme-vla[gemini]'.") from None
     return genai.Client(api_key=key, http_options={"timeout": int(settings.timeout * 1000)})
 
 

@@ -130,6 +130,7 @@ def _encode(frames: Iterable[np.ndarray], handle: io.IOBase | object) -> int:
                 stream.height, stream.width = height, width
                 stream.pix_fmt = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
                 # One thread: the same frames always give the same file.
+                stream.codec_context.thread_count = 1
                 stream.options = {"crf": "18", "preset": "medium", "threads": "1"}
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
             count += 1

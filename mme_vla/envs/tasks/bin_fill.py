@@ -11,7 +11,7 @@ from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import number, ordinal
 from mme_vla.envs.motions import Appear
 from mme_vla.envs.objects import Cube, H, build_board, build_button, build_cube
-from mme_vla.envs.placement import Region, board_boxes, draw_button, draw_cube
+from mme_vla.envs.placement import Region, draw_button, draw_cube
 from mme_vla.envs.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task
@@ -23,6 +23,7 @@ GOAL_COLOURS = {"easy": (1, 1), "medium": (1, 2), "hard": (2, 3)}
 GOAL_CUBES = {"easy": (1, 3), "medium": (2, 4), "hard": (3, 5)}
 CUBES = {"easy": (4, 6), "medium": (8, 10), "hard": (10, 12)}
 COLOURS = ("red", "blue", "green")
+TABLE = Region((-0.1, 0.0), (0.2, 0.25))
 APPEAR_EVERY = 50
 IN_BIN = sapien.Pose((10.0, 10.0, 0.0))
 
@@ -36,18 +37,16 @@ class BinFill(MemoryTask):
     recovery_drawn_per_episode = True
 
     def build(self, draws: Draws) -> None:
-        self.streaming = draws.integer(0, 2) == 1
+        self.streaming = draws.integer(0, 2) == 0
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
-        x, y = 0.15 - 0.2 * draws.uniform(), -0.2 + 0.4 * draws.uniform()
+        x, y = -0.05 + 0.2 * draws.uniform(), -0.2 + 0.4 * draws.uniform()
         self.board = self.add(build_board(self, (x, y), math.radians(-20 + 40 * draws.uniform())))
         self._draw_counts(draws)
         wanted = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
-        obstacles = [self.button, *board_boxes(self.board)]
         for i in draws.permutation(len(wanted)):
             colour = wanted[i]
-            placed = [cube for cubes in self.cubes.values() for cube in cubes]
-            place = draw_cube(draws, Region((-0.1, 0), (0.2, 0.25)), [*obstacles, *placed], gap=H)
+            place = draw_cube(draws, TABLE, [self.button, self.board, *self.all_cubes()], gap=H)
             if place is not None:
                 cubes = self.cubes[colour]
                 cubes.append(self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, *place)))
@@ -91,11 +90,12 @@ class BinFill(MemoryTask):
 
     def _put(self) -> bool:
         """Whether a cube has just been put into the bin; it leaves the scene and is counted."""
-        for cube in self.all_cubes():
-            if self._falls_into_bin(cube):
-                self.filled[cube.colour] += 1
-                cube.move_to(IN_BIN)
-                return True
+        for colour, cubes in self.cubes.items():
+            for cube in cubes:
+                if self._falls_into_bin(cube):
+                    self.filled[colour] += 1
+                    cube.move_to(IN_BIN)
+                    return True
         return False
 
     def failure(self) -> bool:

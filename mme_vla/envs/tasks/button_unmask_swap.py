@@ -1,4 +1,4 @@
-"""ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and change places; pick up the right one."""
+"""ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up the right one."""
 
 from mme_vla.envs.anchors import shifted_anchors
 from mme_vla.envs.choices import Choice

@@ -1,6 +1,7 @@
 """MoveCube (Imitation): the video moves a cube to a target in one of three manners; move it in the same manner."""
 
 import math
+from typing import TYPE_CHECKING
 
 import sapien
 
@@ -14,6 +15,9 @@ from mme_vla.envs.predicates import StaticFor, dropped_onto, gripper_open, picke
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.tasks import register_task
 
+if TYPE_CHECKING:
+    from mme_vla.envs.demonstrator import Demonstrator
+
 MANNERS = ("hook", "push", "grasp")
 PEG_LENGTH, PEG_RADIUS = 0.1, 0.01
 TARGET_RADIUS = 0.04
@@ -21,6 +25,7 @@ CUBE_FROM_TARGET = 5 * H
 CUBE_GAP = 0.005
 TRIES = 128
 HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
+MORE_HOLDS = 5  # where the arm did not come to rest at once
 
 type Point = tuple[float, float]
 
@@ -75,18 +80,16 @@ class MoveCube(MemoryTask):
 
     def start_episode(self, draws: Draws) -> None:
         self.manner = MANNERS[draws.integer(0, 3)]
-        self._moved = False
 
     def after_step(self, k: int) -> None:
-        if self.reset_in_progress and not self._moved:
-            self._moved = True
+        if self.reset_in_progress:
             for thing, pose in self._execution_poses.items():
-                thing.move_to(pose)
+                thing.displace(pose)
 
     def subtasks(self) -> list[SubTask]:
         steps = HOLD_STEPS[self.manner]
         between = [
-            SubTask("static", StaticFor(self, steps), lambda demo: demo.hold(steps), video=True),
+            SubTask("static", StaticFor(self, steps), self._rest, video=True),
             SubTask(
                 NO_RECORD,
                 done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
@@ -96,6 +99,13 @@ class MoveCube(MemoryTask):
         ]
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
         return [*moves(video=True), *between, *moves(video=False)]
+
+    def _rest(self, demo: "Demonstrator") -> None:
+        resting = self.progress.current
+        demo.hold(HOLD_STEPS[self.manner])
+        for _ in range(MORE_HOLDS):
+            if self.progress.current is resting:
+                demo.open()
 
     def _on_target(self) -> bool:
         return pushed_onto(self.cube, self.target)
@@ -117,7 +127,7 @@ class MoveCube(MemoryTask):
                 run=lambda demo: demo.grasp_peg(self.peg, "tail"),
                 grounded="Pick up the peg at <>",
                 failed=lambda: self._holds_cube() or self._on_target(),
-                targets=[self.peg],
+                targets=[self.peg.tail],
                 choice="a",
                 video=video,
             ),

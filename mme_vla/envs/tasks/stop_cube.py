@@ -1,6 +1,7 @@
 """StopCube (Counting): a cube goes back and forth over a target; stop it there on the right visit."""
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import sapien
@@ -17,11 +18,15 @@ from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.things import distance_xy
 
+if TYPE_CHECKING:
+    from mme_vla.envs.demonstrator import Demonstrator
+
 INTERVALS = (60, 80, 120)  # steps of one pass
 PASSES = 5
 REACH = 0.3  # from the target to either end of the line
 STOPPED_AT = 0.06
 LEAD = 30  # steps before the crossing at which the demonstrator begins to press
+PRESS_STEPS = 29  # from the beginning of a press until the button is down, usually
 CHECKPOINT = 100
 
 
@@ -35,7 +40,8 @@ class StopCube(MemoryTask):
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
         xy = (draws.between(-0.1, 0.1), draws.between(-0.1, 0.1))
         self.target = self.add(build_disc(self, "target", 0.036, 0.01, "purple", xy))
-        self.cube = self.add(build_moving_cube(self, "cube", draws.uniforms(3).tolist(), xy, z=0.01))
+        red, green, blue = draws.uniforms(3).tolist()
+        self.cube = self.add(build_moving_cube(self, "cube", (red, green, blue), xy, z=0.01))
 
     def start_episode(self, draws: Draws) -> None:
         draws = Draws(self.seed)
@@ -97,12 +103,18 @@ class StopCube(MemoryTask):
         press = SubTask(
             "press the button to stop the cube on the target",
             done=lambda: self._in_time() and self._on_target(),
-            run=lambda demo: demo.press(self.button, hold=False),
+            run=self._press,
             grounded="press the button to stop the cube on the target at <>",
             targets=[self.target],
             choice="c",
         )
         return [hover, *map(self._wait, self.checkpoints()), press]
+
+    def _press(self, demo: "Demonstrator") -> None:
+        """Press; if the wait before it ended so late that the cube would have passed, without closing the fingers."""
+        crossing = self.deadline - self.interval // 2
+        tolerated = self.interval // 15  # steps that the cube takes over half the target
+        demo.press(self.button, hold=False, close=self.steps_done + PRESS_STEPS <= crossing + tolerated)
 
     def _wait(self, until: int) -> SubTask:
         return SubTask(
@@ -120,7 +132,7 @@ class StopCube(MemoryTask):
         return [
             Choice("a", "move to the top of the button to prepare", lambda demo, _: demo.hover(self.button)),
             Choice("b", "remain static", lambda demo, _: demo.hold_until(self._next_checkpoint())),
-            Choice("c", "press button to stop the cube", lambda demo, _: demo.press(self.button, hold=False)),
+            Choice("c", "press button to stop the cube", lambda demo, _: self._press(demo)),
         ]
 
     def goals(self) -> list[str]:

@@ -63,13 +63,19 @@ class VideoRepick(MemoryTask):
 
     def start_episode(self, draws: Draws) -> None:
         self.swaps: list[Swap] = []
+        self._swaps_due = False
         self._entered: dict[str, int] = {}
 
     def before_physics(self, k: int) -> None:
-        if self.initiators and not self.swaps and self.progress.current is self._swap_stage:
+        if self._swaps_due and not self.swaps:
             self.swaps = swaps_in_turn(self.initiators, self.cubes, start=k)
         for swap in self.swaps:
             swap.apply(k)
+
+    def failure(self) -> bool:
+        """Notes whether the swaps may begin, one step after their stage is entered; the rules belong to the stages."""
+        self._swaps_due = self._swap_stage is not None and self.progress.current is self._swap_stage
+        return False
 
     def _pressed_early(self, kind: str) -> bool:
         waited = self.steps_done - self._entered.setdefault(kind, self.steps_done)

@@ -1,8 +1,6 @@
 """What a memory remembers along an episode, as a video: the contact sheet of every few steps."""
 
-from collections.abc import Iterator, Sequence
-from fractions import Fraction
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 from PIL import Image
@@ -44,20 +42,3 @@ def selection_sheets(
         selected = memory.select(history, step)
         title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
         yield step, contact_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)
-
-
-def write_video(pictures: Sequence[Image.Image], path: Path, fps: int = 4) -> None:
-    """Write pictures of any sizes as an H.264 mp4, each at the top left of a white frame that holds the largest."""
-    import av
-
-    width, height = (-(-max(picture.size[axis] for picture in pictures) // 2) * 2 for axis in (0, 1))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=Fraction(fps))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "23"}
-        for picture in pictures:
-            canvas = Image.new("RGB", (width, height), "white")
-            canvas.paste(picture)
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(canvas), format="rgb24")))
-        container.mux(stream.encode())

@@ -1,0 +1,146 @@
+"""`python -m mme_vla.play task=… episodes=…`: play the tasks yourself, or let a model play (configs/play.yaml)."""
+
+import logging
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.config import cli
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.play.run import Identity, PlayRun, choose_episodes, make_session
+
+log = logging.getLogger("mme_vla.play")
+HUMAN = "human"
+# What decides no outcome, and may differ when a run is resumed.
+INDIFFERENT = ("cache", "device", "requests_per_minute", "timeout", "retries", "backoff", "input_price", "output_price",
+               "key_variable")  # fmt: skip
+
+
+@cli("play")
+def main(cfg: DictConfig) -> None:
+    """Play the episodes that are not played yet, on the page or by a model, and compare with the paper.
+
+    Raises:
+        UserError: anything in the settings that cannot work, before an episode begins.
+    """
+    from mme_vla.envs.make import ENVS
+    from mme_vla.play import build_player
+    from mme_vla.play.web import require_page
+
+    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    _log_to_terminal()
+    player: dict[str, Any] = config["player"]
+    wanted = choose_episodes(config["task"], config["episodes"], config["split"])
+    for name in ("max_steps", "max_choices"):
+        if isinstance(config[name], bool) or not isinstance(config[name], int) or config[name] < 1:
+            raise UserError(f"{name}={config[name]!r}; expected a positive integer.")
+    if config["env"] not in ENVS:
+        raise UserError(f"Unknown environment {config['env']!r}. {did_you_mean(str(config['env']), ENVS)}")
+    names = ("split", "env", "max_steps", "max_choices")
+    settings = {name: config[name] for name in names}
+    settings["player"] = {key: value for key, value in player.items() if key not in INDIFFERENT}
+    human = player["name"] == HUMAN
+    built = None if human else build_player(player)
+    if human:
+        require_page()
+    looks = built is None or built.looks
+    if config["env"] == "mme_vla":
+        _check_simulator(looks)
+    name, who = (HUMAN, str(player["participant"])) if built is None else (built.model, 0)
+    identity = Identity(name, who, player.get("seed", 0), config["max_steps"], settings)
+    limits = {limit: config[limit] for limit in ("max_steps", "max_choices")}
+    make = partial(make_session, env=config["env"], **limits, pictures=looks)
+    folder = Path(str(config["output"])).expanduser()
+    try:
+        with PlayRun(folder, wanted, identity, make, config["retry_errors"]) as run:
+            if built is None:
+                _on_the_page(run, str(who), str(config["host"]), config["port"])
+            else:
+                _by_itself(run, built)
+            print_summary(run)
+    finally:
+        if built is not None:
+            built.close()
+
+
+def _on_the_page(run: PlayRun, participant: str, host: str, port: int) -> None:
+    from mme_vla.play.desk import Desk
+    from mme_vla.play.web import serve
+
+    serve(Desk(run, participant), host, port)
+
+
+def _by_itself(run: PlayRun, player: Any) -> None:
+    from mme_vla.play.players import play
+
+    todo = list(run.todo)
+    log.info("%d episodes to play, %d played before", len(todo), len(run.wanted) - len(todo))
+    for number, which in enumerate(todo, 1):
+        session = run.make(which)
+        try:
+            play(session, player)
+        finally:
+            session.close()
+        record = run.save(session, **player.notes())
+        log.info("%d/%d %s", number, len(todo), line(record))
+
+
+def line(record: EpisodeRecord) -> str:
+    """One episode in one line."""
+    choices = " ".join(
+        decision["choice"] + ("" if decision["point"] is None else "({:.0f},{:.0f})".format(*decision["point"]))
+        for decision in record.extra["decisions"]
+    )
+    reason = record.error or record.extra.get("ended_by", "")
+    took = f"{record.steps} steps, {record.seconds.total:.0f} s"
+    return f"{record.task} {record.episode}: {record.outcome} · {choices or 'no choice'} · {took}" + (
+        f" · {reason}" if reason else ""
+    )
+
+
+def print_summary(run: PlayRun) -> None:
+    """Print the success rates beside the paper's oracle-planner table."""
+    from rich.console import Console
+    from rich.table import Table
+
+    rows = run.summary()
+    if not rows:
+        return
+    methods = list(rows[0][3])
+    table = Table("task", "episodes", run.identity.model, *(f"{method} (paper)" for method in methods))
+    for task, successes, count, paper in rows:
+        table.add_row(task, str(count), f"{100 * successes / count:.1f}", *(f"{paper[m]:.0f}" for m in methods))
+    rates = [100 * successes / count for _, successes, count, _ in rows]
+    if len(rows) > 1:
+        means = [sum(paper[m] for *_, paper in rows) / len(rows) for m in methods]
+        table.add_section()
+        table.add_row("mean of tasks", str(sum(count for _, _, count, _ in rows)), f"{sum(rates) / len(rates):.2f}",
+                      *(f"{mean:.2f}" for mean in means))  # fmt: skip
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    console.print(table)
+    console.print(f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _check_simulator(looks: bool) -> None:
+    from mme_vla.envs.make import require_simulator
+    from mme_vla.envs.rendering_check import render_backend
+
+    require_simulator()
+    if looks:
+        render_backend()
+
+
+def _log_to_terminal() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
+    log.setLevel(logging.INFO)
+    log.handlers = [handler]
+    log.propagate = False
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,298 @@
+// The page: shows what the server says, lets a person watch, point and choose.
+
+import { Film } from "./film.js";
+
+const SIDE = 256;
+const $ = (id) => document.getElementById(id);
+const film = new Film($("picture"), showFrame);
+let state = { phase: "loading", options: [], reveals: [], decisions: [] };
+let fetched = 0; // clips whose frames are here
+let chosen = null; // the option selected
+let point = null; // [row, column]
+let fetching = false;
+let sending = false;
+let focused = ""; // the outcome that has had the focus
+
+// The server -----------------------------------------------------------------------------------------------------
+
+async function ask(path, message) {
+  const options = message === undefined ? {} : {
+    method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message),
+  };
+  const answer = await fetch(path, options);
+  const content = await answer.json();
+  if (!answer.ok && answer.status !== 409) throw new Error(content.error);
+  return answer.ok ? content : (complain(content.error), ask("state"));
+}
+
+async function poll() {
+  try {
+    take(await ask("state"));
+    if ($("error").dataset.lost) complain("");
+  } catch {
+    complain("The server does not answer. Is it still running?", true);
+  }
+  setTimeout(poll, ["loading", "moving"].includes(state.phase) ? 300 : 2000);
+}
+
+function take(next) {
+  if (sending) return; // an answer from before the choice
+  const other = next.session !== state.session;
+  state = { options: [], reveals: [], decisions: [], ...next };
+  if (other) {
+    film.clear();
+    fetched = 0;
+    deselect();
+  }
+  fetchClips();
+  render();
+}
+
+async function fetchClips() {
+  if (fetching) return;
+  fetching = true;
+  const session = state.session;
+  try {
+    while (session === state.session && fetched < state.reveals.length) {
+      const number = fetched;
+      if (!(await film.fetch(session, number, () => session === state.session))) break;
+      fetched += 1;
+      const { start, count } = state.reveals[number];
+      if (count) film.play(Math.max(start - 1, 0), start + count - 1);
+    }
+  } catch {
+    complain("The frames could not be fetched; trying again.", true);
+  }
+  fetching = false;
+  render();
+}
+
+async function send() {
+  if (!ready() || !chosen || (chosen.needs_point && !point)) return;
+  const message = { session: state.session, decision: state.decisions.length, choice: chosen.label, point };
+  complain("");
+  await post("choose", message, deselect);
+}
+
+async function post(path, message, done = () => {}) {
+  sending = true;
+  try {
+    const next = await ask(path, message);
+    sending = false;
+    done();
+    take(next);
+  } catch (error) {
+    complain(error.message || "The server does not answer.");
+  }
+  sending = false;
+}
+
+// What is seen -----------------------------------------------------------------------------------------------------
+
+const ready = () => state.phase === "choosing" && fetched === state.reveals.length && film.last >= 0;
+
+function render() {
+  const { phase } = state;
+  const over = ["ended", "finished", "broken"].includes(phase);
+  $("where").textContent = state.task ? `${state.task} · episode ${state.episode} (${state.split})` : "";
+  $("score").textContent = `${state.played ?? 0} of ${state.total ?? 0} played · ${state.successes ?? 0} solved`;
+  $("goal").textContent = state.goal ?? "…";
+  $("question").hidden = over;
+  $("outcome").hidden = !over;
+  if (over) showOutcome();
+  const waits = phase === "loading" || phase === "moving" || (phase === "choosing" && !ready());
+  $("veil").hidden = !waits;
+  const words = { loading: "Setting the scene and the video up", moving: "The planner carries it out" };
+  $("veil-text").textContent = `${words[phase] ?? "Fetching the clip"} … ${Math.round(state.for_s ?? 0)} s`;
+  renderOptions();
+  renderClips();
+  showFrame();
+}
+
+function renderOptions() {
+  const box = $("options");
+  const key = JSON.stringify(state.options);
+  if (box.dataset.key !== key) {
+    box.dataset.key = key;
+    box.replaceChildren(...state.options.map((option) => {
+      const button = element("button", { type: "button", className: "option" });
+      button.dataset.label = option.label;
+      button.append(element("kbd", { textContent: option.label }), element("span", { textContent: option.action }));
+      if (option.needs_point) button.append(element("em", { textContent: "point" }));
+      button.addEventListener("click", () => select(option));
+      return button;
+    }));
+  }
+  for (const button of box.children) {
+    button.disabled = !ready();
+    button.setAttribute("aria-pressed", String(chosen?.label === button.dataset.label));
+  }
+  $("do").disabled = !ready() || !chosen || (chosen.needs_point && !point);
+  const pointing = ready() && chosen?.needs_point;
+  $("frame").classList.toggle("pointing", Boolean(pointing));
+  $("hint").textContent = !ready() ? "" : !chosen ? "Watch the clip, then choose."
+    : pointing && !point ? "Click the object in the picture (or move the point with the arrow keys)."
+    : pointing ? `Point: row ${point[0]}, column ${point[1]}.` : "";
+}
+
+function renderClips() {
+  const known = state.reveals.slice(0, fetched);
+  const key = JSON.stringify([state.session, known.map((clip) => clip.count), state.decisions.length]);
+  if ($("clips").dataset.key === key) return;
+  $("clips").dataset.key = key;
+  const buttons = known.map((clip, number) => {
+    const choice = state.decisions[number - 1];
+    const text = choice ? `${number} · ${choice.choice}` : clip.title;
+    const button = element("button", { type: "button", textContent: text, title: clip.title, disabled: !clip.count });
+    button.style.flexGrow = Math.max(clip.count, 1);
+    if (!number && state.video) button.classList.add("video");
+    button.addEventListener("click", () => film.play(clip.start, clip.start + clip.count - 1));
+    return button;
+  });
+  $("clips").replaceChildren(...buttons);
+  $("history").replaceChildren(...state.decisions.map((decision, number) => {
+    const clip = state.reveals[number + 1];
+    const place = decision.point ? ` at row ${decision.point[0]}, column ${decision.point[1]}` : "";
+    const moved = clip && !clip.count ? " (nothing moved)" : "";
+    const item = element("li");
+    const button = element("button", { type: "button", className: "link", disabled: !clip?.count });
+    button.append(element("kbd", { textContent: decision.choice }), ` ${decision.action}${place}${moved}`);
+    button.addEventListener("click", () => film.play(clip.start, clip.start + clip.count - 1));
+    item.append(button);
+    return item;
+  }));
+}
+
+function showFrame() {
+  const { at, last, playing } = film;
+  $("seek").max = Math.max(last, 0);
+  $("seek").value = at;
+  $("seek").disabled = last < 0;
+  $("place").textContent = last < 0 ? "" : `${at + 1} / ${last + 1}`;
+  $("toggle").textContent = playing ? "Pause" : "Play";
+  const inVideo = last >= 0 && at < (state.video ?? 0);
+  $("frame").classList.toggle("video", inVideo);
+  $("badge").textContent = last < 0 ? "" : inVideo ? "Conditioning video" : at === last ? "Present" : "Execution";
+  const marker = $("marker");
+  marker.hidden = !(chosen?.needs_point && point && at === last);
+  if (point) {
+    marker.style.top = `${((point[0] + 0.5) / SIDE) * 100}%`;
+    marker.style.left = `${((point[1] + 0.5) / SIDE) * 100}%`;
+  }
+}
+
+function showOutcome() {
+  const titles = { success: "Solved", fail: "Failed", timeout: "Out of time", error: "The planner could not do that" };
+  const { phase, status } = state;
+  const box = $("outcome");
+  box.className = `card ${phase === "ended" ? status : phase}`;
+  const choices = `${state.decisions.length} ${state.decisions.length === 1 ? "choice" : "choices"}, ${state.steps} steps`;
+  if (phase === "ended") {
+    $("outcome-title").textContent = titles[status] ?? status;
+    $("outcome-text").textContent = state.problem ? `${choices}. ${state.problem}` : `${choices}.`;
+    $("next").innerHTML = state.played < state.total ? "Next episode <kbd>Enter</kbd>" : "Finish <kbd>Enter</kbd>";
+  } else if (phase === "broken") {
+    $("outcome-title").textContent = "The episode could not be played";
+    $("outcome-text").textContent = state.error;
+    $("next").textContent = "Try again";
+  } else {
+    $("outcome-title").textContent = "All episodes are played. Thank you!";
+    $("outcome-text").textContent = (state.summary ?? [])
+      .map((row) => `${row.task}: ${row.successes} of ${row.episodes} solved (people in the paper: ${row.human} %)`).join("; ");
+  }
+  $("next").hidden = phase === "finished";
+  const key = `${state.session} ${phase}`;
+  if (focused !== key) $("outcome-title").focus();
+  focused = key;
+}
+
+function complain(text, lost = false) {
+  $("error").textContent = text;
+  $("error").hidden = !text;
+  if (lost) $("error").dataset.lost = "1";
+  else delete $("error").dataset.lost;
+}
+
+function element(name, properties = {}) {
+  return Object.assign(document.createElement(name), properties);
+}
+
+// What the person does ---------------------------------------------------------------------------------------------
+
+function select(option) {
+  if (!ready() || chosen?.label === option.label) return;
+  chosen = option;
+  point = null;
+  if (option.needs_point) {
+    showPresent();
+    $("picture").focus();
+  }
+  render();
+}
+
+const deselect = () => { chosen = point = null; render(); };
+
+function showPresent() {
+  film.pause();
+  film.seek(film.last);
+}
+
+function setPoint(row, column) {
+  const within = (value) => Math.max(0, Math.min(SIDE - 1, Math.floor(value)));
+  point = [within(row), within(column)];
+  render();
+}
+
+function toggle() {
+  if (film.playing) film.pause();
+  else if (film.at < film.last) film.play(film.at, film.last);
+  else replay();
+}
+
+function replay() {
+  const clip = state.reveals.findLast((one) => one.start <= film.at && one.count);
+  if (clip) film.play(clip.start, clip.start + clip.count - 1);
+}
+
+$("picture").addEventListener("click", (event) => {
+  if (!ready() || !chosen?.needs_point) return;
+  if (film.at !== film.last) return showPresent(); // what was clicked is not what is there now
+  const box = $("picture").getBoundingClientRect();
+  setPoint(((event.clientY - box.top) / box.height) * SIDE, ((event.clientX - box.left) / box.width) * SIDE);
+});
+$("seek").addEventListener("input", () => { film.pause(); film.seek(Number($("seek").value)); });
+$("toggle").addEventListener("click", toggle);
+$("replay").addEventListener("click", replay);
+$("present").addEventListener("click", showPresent);
+$("speed").addEventListener("change", () => { film.speed = Number($("speed").value); });
+$("do").addEventListener("click", send);
+$("next").addEventListener("click", () => { complain(""); post("next", {}); });
+
+document.addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.altKey || event.metaKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
+  const onOption = event.target.classList?.contains("option");
+  const onButton = event.target.tagName === "BUTTON" && !onOption;
+  const arrows = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
+  const option = state.options.find((one) => one.label === event.key.toLowerCase());
+  if (arrows[event.key]) {
+    const [down, right] = arrows[event.key];
+    const far = event.shiftKey ? 10 : 1;
+    if (ready() && chosen?.needs_point && film.at === film.last) {
+      const [row, column] = point ?? [SIDE / 2, SIDE / 2];
+      setPoint(row + down * far, column + right * far);
+    } else if (right) {
+      film.pause();
+      film.seek(film.at + right * far);
+    } else return;
+  } else if (event.key === "Enter" && !onButton) {
+    if (["ended", "broken"].includes(state.phase)) $("next").click();
+    else if (onOption && event.target.dataset.label !== chosen?.label) return;
+    else send();
+  } else if (event.key === " " && !onButton) toggle();
+  else if (event.key === "Escape") deselect();
+  else if (option && !event.repeat) select(option);
+  else return;
+  event.preventDefault();
+});
+
+poll();

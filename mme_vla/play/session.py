@@ -1,0 +1,295 @@
+"""One episode as a sequence of choices: what has been shown, what can be chosen, what was chosen, how it ended.
+
+Execution videos are revealed one after the other, the next high-level action is chosen from a fixed set, with a pixel
+where it needs one, and an oracle planner carries it out (paper, "Oracle Planner and Human Study"). People, models and
+scripts play through the same object.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
+
+SIDE = 256  # of the front picture, in pixels
+ONGOING = "ongoing"
+UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)
+"""Stands for the frames of an environment that does not render."""
+MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
+
+
+@dataclass(frozen=True)
+class EpisodeId:
+    """Which episode of the benchmark, with the environment's seed and difficulty."""
+
+    task: str
+    split: str
+    episode: int
+    seed: int
+    difficulty: str
+
+
+@dataclass(frozen=True)
+class Option:
+    """One action that can be chosen. label: its lower-case letter. needs_point: a pixel must come with it."""
+
+    label: str
+    action: str
+    needs_point: bool
+
+
+@dataclass(frozen=True)
+class Reveal:
+    """The frames that came to light at once.
+
+    title: what they show. frames: [256, 256, 3] uint8 each, maybe none. start: place of the first in the episode.
+    """
+
+    title: str
+    frames: Sequence[np.ndarray]
+    start: int
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One choice and what came of it.
+
+    choice: letter. action: its text. point: pixel [y, x] of the front picture, None where it needs none.
+    frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
+    seconds: from the moment the frames were there to the choice. note: whatever the player adds.
+    """
+
+    choice: str
+    action: str
+    point: tuple[float, float] | None
+    frames: tuple[int, int]
+    status: str
+    seconds: float
+    note: Mapping[str, Any] = field(default_factory=dict)
+
+
+class ChoiceSession:
+    """Plays one episode in the action space `multi_choice`.
+
+    Args:
+        env: with `reset` and `step` of `mme_vla.envs` (or the official package's), in that action space.
+        episode: which one it is.
+        pictures: whether the player looks at them; without, the environment need not render, and frames are black.
+        max_choices: choices after which the episode counts as timed out; a choice may move nothing at all, so the
+            environment's own limit on steps might never be reached.
+        clock: seconds that only grow.
+
+    Example:
+        >>> session = ChoiceSession(env, episode)  # doctest: +SKIP
+        >>> session.start()  # doctest: +SKIP
+        >>> while not session.over:  # doctest: +SKIP
+        ...     session.choose({"choice": "a", "point": [113, 158]})
+        >>> session.record("human")  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        env: Any,
+        episode: EpisodeId,
+        max_choices: int = MAX_CHOICES,
+        pictures: bool = True,
+        clock: Callable[[], float] = time.perf_counter,
+    ) -> None:
+        if isinstance(max_choices, bool) or not isinstance(max_choices, int) or max_choices < 1:
+            raise UserError(f"max_choices is {max_choices!r}; expected a positive integer.")
+        self.env, self.episode, self.max_choices, self.pictures = env, episode, max_choices, pictures
+        self.goal, self.status, self.error = "", "not started", ""
+        self.ended_by = ""
+        """What ended the episode where it was not the environment: `max_choices`, or a player's reason."""
+        self.options: tuple[Option, ...] = ()
+        self.reveals: list[Reveal] = []
+        self.decisions: list[Decision] = []
+        self._clock, self._shown_at = clock, 0.0
+        self._begun = clock()
+        self._simulated = self._thought = 0.0
+
+    # Playing ------------------------------------------------------------------------------------------------------
+
+    def start(self) -> Reveal:
+        """Reset the environment, which shows the conditioning video, if any, and then the present frame.
+
+        Raises:
+            UserError: it was started before, or the environment shows no pictures or no options.
+        """
+        if self.reveals:
+            raise UserError("This session has begun; make a new one for another episode.")
+        started = self._clock()
+        observation, info = self.env.reset()
+        self._simulated += self._clock() - started
+        frames = self._frames(observation)
+        if not frames:
+            raise UserError("The environment shows no pictures: make it with render=True.")
+        if "available_multi_choices" not in info:
+            raise UserError('The environment offers no options: make it with action_space="multi_choice".')
+        title = "Conditioning video" if len(frames) > 1 else "The scene"
+        self._take(frames, info, title)
+        return self.reveals[0]
+
+    def choose(self, action: Mapping[str, Any], note: Mapping[str, Any] | None = None) -> Reveal:
+        """Carry out an option.
+
+        Args:
+            action: {"choice": letter, "point": [y, x]}; the point is read only where the option needs one.
+            note: what to keep with the decision.
+
+        Returns:
+            The frames of the motion; none where nothing moved, or the environment could not do it.
+
+        Raises:
+            UserError: the episode is not under way, no such option, or a point is missing or outside of the picture.
+                Nothing has happened then, and another choice can be made.
+        """
+        option, point = self.check(action)
+        self._thought += (thought := self._clock() - self._shown_at)
+        started = self._clock()
+        wanted = {"choice": option.label, "point": [] if point is None else list(point)}
+        observation, _, _, _, info = self.env.step(wanted)
+        self._simulated += self._clock() - started
+        frames = self._frames(observation or {})
+        first = self.frames_shown
+        self.error = str(info.get("error_message", ""))
+        self._take(frames, info, option.action)
+        span = (first, first + len(frames))
+        self.decisions.append(
+            Decision(option.label, option.action, point, span, self.status, round(thought, 3), dict(note or {}))
+        )
+        if not self.over and len(self.decisions) >= self.max_choices:
+            self.give_up("timeout", "max_choices")
+        return self.reveals[-1]
+
+    def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
+        """The option and point that an action means.
+
+        Raises:
+            UserError: as `choose`.
+        """
+        if self.status != ONGOING:
+            raise UserError(f"No choice can be made: the episode is over ({self.status})." if self.reveals
+                            else "No choice can be made before start().")  # fmt: skip
+        if not isinstance(action, Mapping) or not isinstance(action.get("choice"), str):
+            raise UserError(f'{action!r} is no choice; expected {{"choice": "a", "point": [y, x]}}.')
+        label = action["choice"].strip().lower()
+        options = {option.label: option for option in self.options}
+        if label not in options:
+            raise UserError(f"There is no option {action['choice']!r}. {did_you_mean(label, options)}")
+        option = options[label]
+        return option, checked_point(action.get("point"), option) if option.needs_point else None
+
+    def give_up(self, outcome: str, reason: str) -> None:
+        """End the episode without the environment.
+
+        Args:
+            outcome: what it counts as. reason: why, kept in the record.
+
+        Raises:
+            UserError: no such outcome, or the episode is over.
+        """
+        if outcome not in OUTCOMES:
+            raise UserError(f"Unknown outcome {outcome!r}. {did_you_mean(outcome, OUTCOMES)}")
+        if self.over:
+            raise UserError(f"The episode is over already ({self.status}).")
+        self.status, self.ended_by = outcome, reason
+        if outcome == "error":
+            self.error = reason
+
+    # What there is to see -----------------------------------------------------------------------------------------
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.status in OUTCOMES
+
+    @property
+    def frames_shown(self) -> int:
+        """Frames revealed so far."""
+        return sum(len(reveal.frames) for reveal in self.reveals)
+
+    @property
+    def frame(self) -> np.ndarray:
+        """The present front picture [256, 256, 3]: points are pixels of it.
+
+        Raises:
+            UserError: the session was not started.
+        """
+        if not self.reveals:
+            raise UserError("There is no picture before start().")
+        return next(reveal.frames[-1] for reveal in reversed(self.reveals) if len(reveal.frames))
+
+    @property
+    def steps(self) -> int:
+        """Control steps executed: one for each frame after those of the reset."""
+        return sum(len(reveal.frames) for reveal in self.reveals[1:])
+
+    def record(
+        self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
+    ) -> EpisodeRecord:
+        """The episode as evaluation keeps it, its decisions in `extra`.
+
+        Raises:
+            UserError: it is not over.
+        """
+        if not self.over:
+            raise UserError(f"The episode is not over ({self.status}); there is nothing to record yet.")
+        which = self.episode
+        ended = {"ended_by": self.ended_by} if self.ended_by else {}
+        return EpisodeRecord(
+            model=model, checkpoint=checkpoint, model_seed=model_seed, max_steps=max_steps, action_space="multi_choice",
+            task=which.task, episode=which.episode, seed=which.seed, difficulty=which.difficulty, split=which.split,
+            outcome=self.status, steps=self.steps, error=self.error or None,
+            seconds=Seconds(round(self._simulated, 3), round(self._thought, 3), round(self._clock() - self._begun, 3)),
+            extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},
+        )  # fmt: skip
+
+    def close(self) -> None:
+        """Free the environment."""
+        self.env.close()
+
+    def _frames(self, observation: Mapping[str, Any]) -> list[np.ndarray]:
+        if self.pictures:
+            return list(observation.get("front_rgb_list", ()))
+        return [UNSEEN] * max((len(values) for values in observation.values()), default=0)
+
+    def _take(self, frames: list[np.ndarray], info: Mapping[str, Any], title: str) -> None:
+        self.reveals.append(Reveal(title, frames, self.frames_shown))
+        self.status = str(info["status"])
+        if info.get("task_goal"):
+            goal = info["task_goal"]
+            self.goal = goal if isinstance(goal, str) else str(goal[0])
+        if "available_multi_choices" in info:
+            self.options = tuple(
+                Option(str(option["label"]).lower(), str(option["action"]), bool(option["need_parameter"]))
+                for option in info["available_multi_choices"]
+            )
+        self._shown_at = self._clock()
+
+
+def checked_point(point: Any, option: Option) -> tuple[float, float]:
+    """A pixel (row, column) of the front picture.
+
+    Raises:
+        UserError: it is missing, malformed or outside.
+    """
+    what = f"Option {option.label!r} ({option.action})"
+    if point is None or (isinstance(point, Sequence) and not len(point)):
+        raise UserError(f"{what} needs a point: the pixel [row, column] of the object meant.")
+    try:
+        values = np.asarray(point, np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (2,) or not np.isfinite(values).all():
+        raise UserError(f"{what} needs two numbers as its point, a pixel's row and column; got {point!r}.")
+    y, x = (float(value) for value in values)
+    if not (0 <= y < SIDE and 0 <= x < SIDE):
+        raise UserError(
+            f"The point ({y:g}, {x:g}) lies outside of the picture: rows and columns go from 0 to {SIDE - 1}."
+        )
+    return y, x

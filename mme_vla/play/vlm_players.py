@@ -1,0 +1,178 @@
+"""Vision-language models that play: Qwen3-VL on this machine, and a foundation model behind Google's API."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.play import prompts
+from mme_vla.play.players import PLAYERS, NoChoiceError, Player
+from mme_vla.play.session import ChoiceSession
+from mme_vla.subgoal.api import Api, ApiFailure, Settings
+from mme_vla.subgoal.base import Usage
+from mme_vla.subgoal.media import Clip, sample_video
+from mme_vla.subgoal.parsing import MalformedAnswer
+from mme_vla.subgoal.vlm import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
+
+
+class ModelPlayer(Player):
+    """A model that is asked for each choice, and asked again where its answer cannot be used.
+
+    Args:
+        model: its name.
+        tries: answers that may be unusable in a row; then the episode counts as failed.
+    """
+
+    def __init__(self, model: str, tries: int = 3) -> None:
+        if isinstance(tries, bool) or not isinstance(tries, int) or tries < 1:
+            raise UserError(f"player.tries={tries!r} must be a positive number of answers.")
+        self.model, self.tries = model, tries
+        self.usage = Usage()
+        self._before = Usage()
+
+    def start(self, session: ChoiceSession) -> None:
+        """See `Player`."""
+        self._before = replace(self.usage, problems=self.usage.problems.copy())
+
+    def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
+        """See `Player`."""
+        answers: list[str] = []
+        complaint = ""
+        for _ in range(self.tries):
+            answer = self.ask(session, complaint)
+            answers.append(answer)
+            try:
+                action = prompts.parse_choice(answer, session.options)
+            except MalformedAnswer as error:
+                self.usage.problems["malformed" if answer.strip() else "empty"] += 1
+                complaint = prompts.complaint(str(error))
+            else:
+                return action, {"answers": answers}
+        raise NoChoiceError("fail", f"{self.tries} answers in a row could not be used; the last one: {answers[-1]!r}")
+
+    def ask(self, session: ChoiceSession, complaint: str) -> str:
+        """The model's answer to the present question, word for word.
+
+        Args:
+            complaint: why its last answer to the same question could not be used; empty the first time.
+
+        Raises:
+            NoChoiceError: there is no answer to be had.
+        """
+        raise NotImplementedError
+
+    def notes(self) -> dict[str, Any]:
+        """Calls, tokens, cost and unusable answers of the episode."""
+        now, before = self.usage, self._before
+        used = {name: getattr(now, name) - getattr(before, name) for name in vars(now)}
+        used |= {name: round(used[name], 6) for name in ("seconds", "cost")}
+        return {"usage": {**used, "problems": dict(used["problems"])}}
+
+
+@PLAYERS.register("qwenvl")
+class QwenPlayer(ModelPlayer):
+    """Reads the whole episode anew at each decision: a clip for each motion, and the present picture.
+
+    Args:
+        model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
+        tries: answers that may be unusable in a row. max_new_tokens: longest answer.
+        clip_frames: most frames of a clip that the model looks at.
+        device, dtype: where and how it runs. vlm: a model that is loaded already, instead of all these.
+    """
+
+    def __init__(
+        self,
+        model: str = "Qwen/Qwen3-VL-4B-Instruct",
+        adapter: str | None = None,
+        tries: int = 3,
+        max_new_tokens: int = 512,
+        clip_frames: int = 16,
+        device: str = "auto",
+        dtype: str = "bfloat16",
+        vlm: VLM | None = None,
+    ) -> None:
+        super().__init__(model if adapter is None else f"{model}+{adapter}", tries)
+        if clip_frames < 2 or clip_frames % 2:
+            raise UserError(f"player.clip_frames={clip_frames} must be even and at least 2: frames are read in pairs.")
+        self.max_new_tokens, self.clip_frames = max_new_tokens, clip_frames
+        self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=1)
+        # The processor would shrink the frames of a clip that has more of them than the subgoal predictors look at.
+        area = TOKEN_SIDE**2
+        most = clip_frames * VIDEO_TOKENS * area
+        self.vlm.processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": most}
+
+    def ask(self, session: ChoiceSession, complaint: str) -> str:
+        """See `ModelPlayer`."""
+        started = time.perf_counter()
+        (answer,) = self.vlm.generate([self.question(session, complaint)], self.max_new_tokens)
+        self.usage.seconds += time.perf_counter() - started
+        self.usage.calls += 1
+        self.usage.input_tokens += answer.input_tokens
+        self.usage.output_tokens += answer.output_tokens
+        return answer.text
+
+    def question(self, session: ChoiceSession, complaint: str = "") -> Question:
+        """What is asked now."""
+        first, *motions = session.reveals
+        shown: list[tuple[str, list[np.ndarray]]] = []
+        if len(first.frames) > 1:
+            shown.append(("The video that comes before you act", list(first.frames[:-1])))
+        for reveal, decision in zip(motions, session.decisions, strict=True):
+            shown.append((f"You chose {prompts.said(decision)}", list(reveal.frames)))
+        clips = [(title, bool(frames)) for title, frames in shown]
+        user = prompts.whole_question(session.goal, session.options, clips, complaint)
+        return Question(prompts.SYSTEM, user, [session.frame], [self._clip(frames) for _, frames in shown if frames])
+
+    def _clip(self, frames: list[np.ndarray]) -> Clip:
+        indices = sample_video(len(frames), most=self.clip_frames)
+        return Clip(np.stack([frames[i] for i in indices]), indices, len(frames))
+
+
+@PLAYERS.register("gemini")
+class GeminiPlayer(ModelPlayer):
+    """One conversation an episode: each turn brings the frames since the last decision.
+
+    Args:
+        tries: answers that may be unusable in a row.
+        client: an object with google-genai's `client.models.generate_content`; None makes one.
+        settings: keys of `mme_vla.subgoal.api.Settings`.
+    """
+
+    def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
+        asked = Settings(**settings)
+        super().__init__(asked.model, tries)
+        self.api = Api(asked, self.usage, client)
+        self._turns: list[tuple[str, list[Any]]] = []
+
+    def start(self, session: ChoiceSession) -> None:
+        """See `Player`."""
+        super().start(session)
+        self._turns = []
+
+    def ask(self, session: ChoiceSession, complaint: str) -> str:
+        """See `ModelPlayer`."""
+        turn = ("user", [complaint] if complaint else self._news(session))
+        try:
+            reply = self.api.ask(prompts.SYSTEM, [*self._turns, turn])
+        except ApiFailure as failure:
+            self.usage.problems[failure.problem] += 1
+            # A refusal is the model's answer, and counts; a network that fails is nobody's (`retry_errors` repeats it).
+            outcome = "error" if failure.problem == "failed" else "fail"
+            raise NoChoiceError(outcome, f"no answer ({failure.problem}): {failure}") from None
+        self._turns += [turn, ("model", [reply.text])]
+        return reply.text
+
+    def _news(self, session: ChoiceSession) -> list[Any]:
+        if not session.decisions:
+            frames = session.reveals[0].frames[:-1]
+            text = prompts.opening(session.goal, session.options, bool(len(frames)))
+        else:
+            frames = session.reveals[-1].frames
+            text = prompts.following(session.decisions[-1], session.options, bool(len(frames)))
+        return [*_clip(frames), session.frame, text]
+
+
+def _clip(frames: Any) -> list[np.ndarray]:
+    return [np.stack(list(frames))] if len(frames) else []

@@ -1,0 +1,211 @@
+"""The page in a browser: a few routes around a `Desk`."""
+
+import asyncio
+import ipaddress
+import json
+import logging
+import socket
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from importlib.resources import files
+from importlib.util import find_spec
+from typing import Any
+
+from mme_vla.errors import UserError
+from mme_vla.play.desk import Desk, StaleError
+
+log = logging.getLogger("mme_vla.play")
+PAGE = {"": "index.html", "play.css": "play.css", "play.js": "play.js", "film.js": "film.js", "icon.svg": "icon.svg"}
+KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+MOST = 4096  # bytes of a request's body
+HEADERS = (
+    (b"content-security-policy", b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+                                 b"connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cache-control", b"no-store"),
+)  # fmt: skip
+
+
+def require_page() -> None:
+    """Refuse to go on without the packages the page needs.
+
+    Raises:
+        UserError: the extra `play` is not installed.
+    """
+    if find_spec("starlette") is None or find_spec("uvicorn") is None:
+        raise UserError("The page needs the extra `play`: pip install 'mme-vla[play]'.")
+
+
+def make_app(desk: Desk, local: bool = True) -> Any:
+    """The ASGI application; the desk begins when it starts.
+
+    Args:
+        local: answer only requests that name this machine as their host, so that no foreign page a browser has open can
+            reach the desk under a name of its own.
+
+    Raises:
+        UserError: the extra `play` is not installed.
+    """
+    require_page()
+    from starlette.applications import Starlette
+    from starlette.requests import Request
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
+
+    def refuse(status: int, reason: str) -> Response:
+        return JSONResponse({"error": reason}, status)
+
+    async def page(request: Request) -> Response:
+        name = PAGE.get(request.path_params.get("name", ""))
+        if name is None:
+            return refuse(404, "There is nothing here.")
+        content = files("mme_vla.play").joinpath("page", name).read_bytes()
+        return Response(content, media_type=KINDS[name.rpartition(".")[2]])
+
+    async def state(_: Request) -> Response:
+        return JSONResponse(desk.state())
+
+    async def frames(request: Request) -> Response:
+        wanted = request.path_params
+        try:
+            packed = await asyncio.to_thread(desk.frames, wanted["session"], wanted["number"])
+        except StaleError as error:
+            return refuse(404, str(error))
+        return Response(packed, media_type="application/octet-stream")
+
+    async def body(request: Request) -> Any:
+        # A foreign page cannot send this kind without being asked first, and it is not answered then.
+        if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
+            raise UserError("Send JSON, as application/json.")
+        content = bytearray()
+        async for piece in request.stream():
+            content += piece
+            if len(content) > MOST:
+                raise UserError(f"The request is longer than {MOST} bytes.")
+        try:
+            found = json.loads(bytes(content) or b"{}")
+        except ValueError:
+            raise UserError("The request is not JSON.") from None
+        if not isinstance(found, dict):
+            raise UserError("The request is no JSON object.")
+        return found
+
+    async def choose(request: Request) -> Response:
+        try:
+            desk.choose(await body(request))
+        except StaleError as error:
+            return refuse(409, str(error))
+        except UserError as error:
+            return refuse(400, str(error))
+        return JSONResponse(desk.state())
+
+    async def proceed(request: Request) -> Response:
+        try:
+            await body(request)
+        except UserError as error:
+            return refuse(400, str(error))
+        desk.proceed()
+        return JSONResponse(desk.state())
+
+    @asynccontextmanager
+    async def lifespan(_: Any) -> AsyncIterator[None]:
+        desk.begin()
+        yield
+        await asyncio.to_thread(desk.close)
+
+    routes = [
+        Route("/state", state),
+        Route("/frames/{session}/{number:int}", frames),
+        Route("/choose", choose, methods=["POST"]),
+        Route("/next", proceed, methods=["POST"]),
+        Route("/", page),
+        Route("/{name}", page),
+    ]
+    return _guarded(Starlette(routes=routes, lifespan=lifespan), local)
+
+
+def _guarded(app: Any, local: bool) -> Any:
+    """Refuse foreign host names, and add the headers that keep the page to itself."""
+
+    async def guarded(scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            return await app(scope, receive, send)
+
+        async def sealed(message: Any) -> None:
+            if message["type"] == "http.response.start":
+                message = {**message, "headers": [*message["headers"], *HEADERS]}
+            await send(message)
+
+        if local and not is_local(_host_of(scope)):
+            await sealed({"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]})
+            return await sealed({"type": "http.response.body", "body": b"This page is for this machine only.\n"})
+        return await app(scope, receive, sealed)
+
+    return guarded
+
+
+def _host_of(scope: Any) -> str:
+    named = next((value for name, value in scope["headers"] if name == b"host"), b"").decode("latin-1")
+    if named.startswith("["):
+        return named[1:].partition("]")[0]
+    return named.partition(":")[0]
+
+
+def is_local(host: str) -> bool:
+    """Whether a host name or address is this machine's own loopback."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def listen(host: str, port: int) -> socket.socket:
+    """A socket bound to this address.
+
+    Raises:
+        UserError: no such address, or the port is taken or not allowed.
+    """
+    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
+        raise UserError(f"port={port!r} is no port; choose 0 (any free one) to 65535.")
+    bound = None
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        bound = socket.socket(family, kind, protocol)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        bound.listen()
+    except OSError as error:
+        if bound is not None:
+            bound.close()
+        raise UserError(f"Cannot listen at {host}, port {port} ({error.strerror}); choose others.") from None
+    return bound
+
+
+def make_server(desk: Desk, local: bool = True) -> Any:
+    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or `should_exit`.
+
+    Raises:
+        UserError: the extra `play` is not installed.
+    """
+    app = make_app(desk, local)
+    import uvicorn
+
+    return uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False, ws="none", lifespan="on",
+                                         timeout_graceful_shutdown=5))  # fmt: skip
+
+
+def serve(desk: Desk, host: str, port: int) -> None:
+    """Serve the page until Ctrl-C.
+
+    Raises:
+        UserError: as `listen` and `make_server`.
+    """
+    server = make_server(desk, is_local(host))
+    with listen(host, port) as bound:
+        shown = f"[{host}]" if ":" in host else host
+        if not is_local(host):
+            log.warning("host=%s: whoever reaches this port can play", host)
+        log.info("open http://%s:%d in a browser; Ctrl-C ends", shown, bound.getsockname()[1])
+        with suppress(KeyboardInterrupt):  # uvicorn raises it again when all is closed
+            server.run(sockets=[bound])
