@@ -1,6 +1,7 @@
 """`python -m mme_vla.evaluate checkpoint=… tasks=all`: run a policy on the benchmark (configs/evaluate.yaml)."""
 
 import logging
+import multiprocessing
 import os
 import signal
 import sys
@@ -62,6 +63,7 @@ def main(cfg: DictConfig) -> None:
                 if shard.count > 1 else "")  # fmt: skip
     notes = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
     _end_on_sigterm()
+    _spawn_as_usual()
     try:
         done = evaluate(
             policy, jobs, output, facts, settings, subgoals=subgoals, shard=shard, source=source, notes=notes
@@ -143,6 +145,12 @@ def _end_on_sigterm() -> None:
 
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, interrupt)
+
+
+def _spawn_as_usual() -> None:
+    """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
+    if multiprocessing.get_start_method() == "loky":
+        multiprocessing.set_start_method("spawn", force=True)
 
 
 def _log_to_terminal() -> None:
