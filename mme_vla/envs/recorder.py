@@ -1,4 +1,4 @@
-"""One demonstration as data: every stored step of an episode with observation, action and texts, as the official files."""
+"""One demonstration as data: every stored step with observation, action and texts, as in the official files."""
 
 import json
 from collections.abc import Callable
