@@ -111,7 +111,7 @@ class PegPrimitives(RobotControl):
         self.move_to(station(outward * INSERT_NEAR))
         self.move_to(station(-INSERT_PAST), CLOSE)
 
-    def insert_peg_fully(self, peg: Peg, held: Thing | PegEnd, side: int, box: Thing) -> None:
+    def insert_peg_fully(self, peg: Peg, held: Thing | PegEnd, side: int, box: Thing, begun: bool = False) -> None:
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
@@ -119,6 +119,7 @@ class PegPrimitives(RobotControl):
             held: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
+            begun: the peg is in the hole already, and only has to go on.
         """
         head_first = held in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
@@ -128,11 +129,10 @@ class PegPrimitives(RobotControl):
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
             return hole * sapien.Pose([outward * along, 0, raised]) * free.pose.inv() * self.env.tcp_pose
 
-        inside = np.linalg.norm(free.position - box.position) < INSERT_NEAR
-        if not inside:
+        if not begun:
             self.move_to(station(INSERT_FAR, INSERT_RAISED), CLOSE)
-            self.move_to(station(INSERT_FAR), CLOSE)
-            self.move_to(station(INSERT_NEAR))
+            for distance in (INSERT_FAR, INSERT_NEAR, INSERT_NEAR):
+                self.move_to(station(distance), CLOSE)
         self.move_to(station(0.0), CLOSE)
 
     def drag_peg(self, peg: Peg, end: PegEnd, way: np.ndarray, turn: bool = False) -> None:
@@ -143,13 +143,14 @@ class PegPrimitives(RobotControl):
         self.move_to(grasp, CLOSE)
         self.close()
         self.move_to(self.at([*grasp.p[:2], PEG_DRAGGED], grasp.q), CLOSE)
-        self.move_to(self.at([*(grasp.p[:2] + way), PEG_DRAGGED], grasp.q), CLOSE)
-        self.lay_down_peg()
+        self.lay_down_peg(way)
 
-    def lay_down_peg(self) -> None:
-        """Put a held peg on the table where the hand is."""
+    def lay_down_peg(self, way: np.ndarray) -> None:
+        """Carry a held peg along `way` [2] in metres, put it on the table, and let go."""
         here = self.env.tcp_pose
-        self.move_to(self.at([*here.p[:2], PEG_ON_TABLE], here.q), OPEN)
+        place = here.p[:2] + way
+        self.move_to(self.at([*place, here.p[2]], here.q), CLOSE)
+        self.move_to(self.at([*place, PEG_ON_TABLE], here.q), OPEN)
         self.open()
         self.withdraw()
 

@@ -59,7 +59,7 @@ class RobotControl:
         """Joint angles [7] where the first approach of a stick task ended; None before."""
         return self.env.stored_qpos
 
-    def move_to(self, pose: sapien.Pose, gripper: float | None = None, until: Callable[[], bool] | None = None) -> None:
+    def move_to(self, pose: sapien.Pose, gripper: float | None = None) -> None:
         """Move the tool to a pose: straight if possible, else by a detour.
 
         Args:

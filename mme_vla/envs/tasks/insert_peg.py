@@ -1,6 +1,7 @@
 """InsertPeg (Imitation): the video grasps one end of a peg and inserts it from one side; do the same with that peg."""
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
@@ -164,6 +165,8 @@ class InsertPeg(MemoryTask):
 
     # Demonstration ------------------------------------------------------------------------------------------------
 
+    # Where the benchmark's demonstrator fails, other motions follow; where it does not, there are none.
+
     def _demonstrate_grasp(self, demo: "Demonstrator") -> None:
         """Grasp as the benchmark does; where the box is in the hand's way, move the peg by its other end first."""
         other: PegEnd = "tail" if self.end == "head" else "head"
@@ -197,19 +200,27 @@ class InsertPeg(MemoryTask):
         return next(open_ways, 0.1 * away / np.linalg.norm(away))
 
     def _demonstrate_insertion(self, demo: "Demonstrator") -> None:
-        """Insert as the benchmark does; where that is out of reach or falls short, from another grasp, and fully."""
-        held, _ = self.ends(self.end)
-        with suppress(PlanningError):
-            demo.insert_peg(self.peg, self.end, self.side, self.box)
-        for turn in (None, True, False):
-            if self._inserted(self.end, self.side):
-                return
-            with suppress(PlanningError):
-                if turn is not None:
-                    demo.lay_down_peg() if self.is_grasping(held) else demo.withdraw()
-                    demo.grasp_peg(self.peg, self.end, turn)
-                if self.is_grasping(held):
-                    demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
+        """Insert as the benchmark does; where that fails, push on, begin anew, and at last from another grasp."""
+        task = (self.peg, self.end, self.side, self.box)
+        tries: list[Callable[[], None]] = [
+            lambda: demo.insert_peg(*task),
+            lambda: demo.insert_peg_fully(*task, begun=True),
+            lambda: demo.insert_peg_fully(*task),
+            lambda: self._insert_anew(demo, turn=True),
+            lambda: self._insert_anew(demo, turn=False),
+        ]
+        for attempt in tries:
+            if not self._inserted(self.end, self.side):
+                with suppress(PlanningError):
+                    attempt()
+
+    def _insert_anew(self, demo: "Demonstrator", turn: bool) -> None:
+        demo.withdraw()
+        if any(self.is_grasping(end) for end in self.ends(self.end)):
+            demo.lay_down_peg(self._way_out())
+        demo.grasp_peg(self.peg, self.end, turn)
+        if self._lifted(self.end):
+            demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
 
     # Choices ------------------------------------------------------------------------------------------------------
 

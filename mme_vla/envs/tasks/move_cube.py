@@ -28,8 +28,6 @@ TRIES = 128
 HOLD_STEPS = {"hook": 30, "push": 60, "grasp": 60}
 MORE_TRIES = 2  # where the cube did not stay on the target
 
-type Point = tuple[float, float]
-
 
 @register_task
 class MoveCube(MemoryTask):
@@ -63,12 +61,12 @@ class MoveCube(MemoryTask):
         x, y = -0.05 + 0.1 * draws.uniform(), side - 0.05 + 0.1 * draws.uniform()
         return x, y, math.radians(-45 + 90 * draws.uniform())
 
-    def _draw_goal(self, draws: Draws, half: float) -> Point:
+    def _draw_goal(self, draws: Draws, half: float) -> np.ndarray:
         xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
         assert xy is not None
         return float(xy[0]), float(xy[1])
 
-    def _draw_cube(self, draws: Draws, goal: Point, avoid: list) -> tuple[np.ndarray, float]:
+    def _draw_cube(self, draws: Draws, goal: np.ndarray, avoid: list) -> tuple[np.ndarray, float]:
         """A place near a point that is not near the goal."""
         for _ in range(TRIES):
             centre = (-0.1 + 0.2 * draws.uniform(), -0.1 + 0.2 * draws.uniform())
