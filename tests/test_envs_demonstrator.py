@@ -287,7 +287,7 @@ def test_a_peg_is_inserted_from_the_side_that_was_asked_for(held: str, side: int
         env.add(build_aperture_box(env, (0.0, 0.0), np.pi / 2))
         env.add(build_peg(env, "peg", 0.05, 0.01, (1, 0, 0), (0, 1, 0), (-0.15, -0.15 * side), 0.4 * side))
 
-    env, log, demonstrator = scene(fill)
+    env, _, demonstrator = scene(fill)
     peg, box = things(env)["peg"], things(env)["box"]
     demonstrator.grasp_peg(peg, held)
     demonstrator.insert_peg_fully(peg, held, side, box)
