@@ -64,7 +64,7 @@ class MoveCube(MemoryTask):
     def _draw_goal(self, draws: Draws, half: float) -> np.ndarray:
         xy = draw_disc(draws, Region((0, 0), half), TARGET_RADIUS, [], gap=0)
         assert xy is not None
-        return float(xy[0]), float(xy[1])
+        return xy
 
     def _draw_cube(self, draws: Draws, goal: np.ndarray, avoid: list) -> tuple[np.ndarray, float]:
         """A place near a point that is not near the goal."""
