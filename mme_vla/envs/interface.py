@@ -211,9 +211,11 @@ class RoboMMEEnv(gymnasium.Env):
     def _step_control(self, action: np.ndarray) -> None:
         task, run = self._open_task(), self._require_run()
         run.count += not run.in_video
-        # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to; in
-        # the video, by the one that is being demonstrated.
-        run.shown = task.progress.demonstrated if run.in_video else task.progress.shown
+        # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to. The
+        # video shows what is being demonstrated where either of the two has no words.
+        run.shown, demonstrated = task.progress.shown, task.progress.demonstrated
+        if run.in_video and NO_RECORD in (run.shown.text, demonstrated.text):
+            run.shown = demonstrated
         run.last_action = np.asarray(action, np.float32)
         _, _, terminated, _, _ = task.step(run.last_action)
         run.terminated = terminated.reshape(-1)[0].clone()

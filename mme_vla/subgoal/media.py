@@ -129,7 +129,7 @@ def _encode(frames: Iterable[np.ndarray], handle: io.IOBase | object) -> int:
                 stream = container.add_stream("libx264", rate=FPS)
                 stream.height, stream.width = height, width
                 stream.pix_fmt = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
-                # One thread: the same frames always give the same file.
+                # One thread: the file does not depend on how threads were scheduled.
                 stream.codec_context.thread_count = 1
                 stream.options = {"crf": "18", "preset": "medium", "threads": "1"}
             container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
