@@ -3,12 +3,13 @@
     python benchmarks/env_speed.py [TASK ...] [--steps 40] [--workers 1 2]
 
 Each task and PickCube take turns in one process, so that both see the same machine; the ratio is what counts. Then
-episodes in worker processes.
+where the time of a step goes, and episodes in worker processes.
 """
 
 import argparse
 import time
 from collections.abc import Callable
+from typing import Any
 
 import gymnasium
 import mani_skill.envs  # noqa: F401  (registers PickCube-v1)
@@ -38,12 +39,36 @@ def pick_cube() -> Callable[[], object]:
     return lambda: env.step(HOLD)
 
 
-def own(task: str) -> tuple[Callable[[], object], Callable[[], None]]:
-    """One step of a task's environment, and how to close it; no conditioning video is run first."""
-    env = make_env(task, seed=0, difficulty="hard", max_steps=100_000)
+def own(task: str) -> tuple[Any, Callable[[], object]]:
+    """A task's environment, and one step of it; no conditioning video is run first."""
+    env = make_env(task, seed=1, difficulty="hard", max_steps=100_000)
     env.reset(options={"video": False})
     action = HOLD[:7] if env.action_space.shape == (7,) else HOLD
-    return lambda: env.step(action), env.close
+    return env, lambda: env.step(action)
+
+
+class Parts:
+    """Times the parts of an environment's step: what the simulator does, and what is left to us."""
+
+    def __init__(self, env: Any) -> None:
+        self.seconds = {"physics": 0.0, "rendering": 0.0, "copies of pictures": 0.0}
+        scene = env.task.scene
+        scene.step = self._timed("physics", scene.step)
+        scene.update_render = self._timed("rendering", scene.update_render)
+        for sensor in scene.sensors.values():
+            sensor.capture = self._timed("rendering", sensor.capture)
+            # What was drawn is waited for where it is read, so that most of the drawing's time is spent here.
+            sensor.get_obs = self._timed("copies of pictures", sensor.get_obs)
+
+    def _timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            begun = time.perf_counter()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self.seconds[part] += time.perf_counter() - begun
+
+        return timed
 
 
 def rate(step: Callable[[], object], steps: int) -> float:
@@ -65,14 +90,28 @@ def main() -> None:
     rate(reference, 5)
     print("| task | steps/s | PickCube-v1, same run | ratio |\n|---|---:|---:|---:|")
     for task in args.tasks:
-        step, close = own(task)
+        env, step = own(task)
         rate(step, 3)
         pairs = [(rate(step, args.steps), rate(reference, args.steps)) for _ in range(args.rounds)]
         ours, theirs = (float(np.median(values)) for values in zip(*pairs, strict=True))
-        close()
+        env.close()
         print(f"| {task} | {ours:.2f} | {theirs:.2f} | {np.median([a / b for a, b in pairs]):.2f} |", flush=True)
+    where(args.tasks[0], args.steps)
     for workers in args.workers:
         print(f"{workers} workers: {workers_rate(workers, args.steps):.2f} steps/s together", flush=True)
+
+
+def where(task: str, steps: int) -> None:
+    """Print where the time of a step goes."""
+    env, step = own(task)
+    rate(step, 3)
+    parts = Parts(env)
+    total = 1000 / rate(step, steps)
+    milliseconds = {name: 1000 * seconds / steps for name, seconds in parts.seconds.items()}
+    milliseconds["all else"] = total - sum(milliseconds.values())
+    env.close()
+    shares = ", ".join(f"{name} {value:.1f} ms ({100 * value / total:.0f} %)" for name, value in milliseconds.items())
+    print(f"\na step of {task}: {total:.1f} ms: {shares}", flush=True)
 
 
 def workers_rate(workers: int, steps: int) -> float:

@@ -12,7 +12,8 @@ The first three run a policy over recorded episodes: --checkpoint FOLDER, or --m
 import argparse
 import csv
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
+    from mme_vla.evaluation.analyses.rerun_log import RerunLog
     from mme_vla.policy import MMEPolicy
 
 BUDGETS = (64, 128, 256, 512, 1024)
@@ -39,8 +41,15 @@ def attention(args: argparse.Namespace) -> None:
     from mme_vla.evaluation.analyses.replay import replay_all
 
     policy, source, name = _subject(args)
-    with AttentionWatch(policy) as watch:
-        chunks = replay_all(policy, source, args.episodes, args.stride, args.most)
+    with AttentionWatch(policy) as watch, _rerun(args) as log:
+
+        def draw(episode: int, step: int) -> None:
+            if log is not None:
+                log.views(source, episode, step)
+                for part, mean, _ in watch.lap().table():
+                    log.number(f"attention/{part}", mean)
+
+        chunks = replay_all(policy, source, args.episodes, args.stride, args.most, draw)
     mass = watch.result()
     known = _paper("attention_allocation", name)
     rows = []
@@ -58,8 +67,16 @@ def modulation(args: argparse.Namespace) -> None:
     from mme_vla.evaluation.analyses.replay import replay_all
 
     policy, source, name = _subject(args)
-    with ModulationWatch(policy) as watch:
-        chunks = replay_all(policy, source, args.episodes, args.stride, args.most)
+    with ModulationWatch(policy) as watch, _rerun(args) as log:
+
+        def draw(episode: int, step: int) -> None:
+            if log is not None:
+                log.views(source, episode, step)
+                for part, (mean, std) in watch.lap().overall.items():
+                    log.number(f"modulation/{part}_mean", mean)
+                    log.number(f"modulation/{part}_deviation", std)
+
+        chunks = replay_all(policy, source, args.episodes, args.stride, args.most, draw)
     stats = watch.result()
     layers = [
         [str(i), *(f"{mean[i]:.4f} ± {std[i]:.4f}" for mean, std in (stats.scale, stats.bias))]
@@ -90,6 +107,13 @@ def recurrence(args: argparse.Namespace) -> None:
         for curves in found:
             for i, frame in enumerate(curves.frames):
                 writer.writerow([curves.episode, frame, *(f"{values[i]:.6g}" for values in curves.curves.values())])
+    with _rerun(args) as log:
+        if log is not None:
+            for curves in found:
+                for i, frame in enumerate(curves.frames.tolist()):
+                    log.views(source, curves.episode, frame)
+                    for key, values in curves.curves.items():
+                        log.number(f"recurrence/{key}", values[i])
     rows = [
         [str(c.episode), key, f"{values[0]:.4f}", f"{values[-1]:.4f}", f"{values.mean():.4f}"]
         for c in found
@@ -109,7 +133,13 @@ def selection(args: argparse.Namespace) -> None:
 
     source = EpisodeSource(args.dataset)
     memory = build_memory(compose("inspect", [f"memory={args.memory}", *args.set]))
-    sheets = [sheet for _, sheet in selection_sheets(source, args.episode, memory, args.memory, args.every)]
+    sheets = []
+    with _rerun(args) as log:
+        for step, sheet in selection_sheets(source, args.episode, memory, args.memory, args.every):
+            sheets.append(sheet)
+            if log is not None:
+                log.views(source, args.episode, step)
+                log.picture("remembered", sheet)
     path = args.output or Path("outputs/analyse") / f"{source.name}_episode{args.episode}_{args.memory}.mp4"
     write_film(sheets, path, args.fps)
     sheets[-1].save(path.with_suffix(".png"))
@@ -149,6 +179,19 @@ def cost(args: argparse.Namespace) -> None:
         write_costs(costs, args.output)
         print(f"wrote {args.output}")
     return None
+
+
+@contextmanager
+def _rerun(args: argparse.Namespace) -> "Iterator[RerunLog | None]":
+    """The Rerun file that was asked for, if one was."""
+    if args.rerun is None:
+        yield None
+        return
+    from mme_vla.evaluation.analyses.rerun_log import RerunLog
+
+    with RerunLog(args.rerun) as log:
+        yield log
+    print(f"wrote {args.rerun}: rerun {args.rerun}")
 
 
 def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]":
@@ -205,6 +248,8 @@ def _parser() -> argparse.ArgumentParser:
         made = commands.add_parser(run.__name__, help=run.__doc__, description=run.__doc__)
         made.set_defaults(run=run)
         made.add_argument("--output", type=Path, help=output)
+        if run is not cost:
+            made.add_argument("--rerun", type=Path, help="also for the Rerun viewer, step by step (.rrd; extra viz)")
         return made
 
     for run, output in ((attention, "JSON"), (modulation, "JSON"), (recurrence, "SVG, with a CSV beside it")):

@@ -6,7 +6,9 @@ work starts, and come back as one `UserError` with the near names.
 
 import functools
 import importlib
+import logging
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import zip_longest
@@ -152,6 +154,16 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         return  # nothing of this tree is composed
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
+
+
+def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
+    """Let a command's logger, and warnings, speak on standard error; `clock` puts the time of day before each line."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
+    logger.setLevel(logging.INFO)
+    logger.handlers = [handler]
+    logger.propagate = False
+    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
 
 
 @contextmanager

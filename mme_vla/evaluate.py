@@ -6,13 +6,13 @@ import os
 import signal
 import sys
 import threading
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config import cli
+from mme_vla.config import cli, log_to_terminal
+from mme_vla.errors import UserError, did_you_mean
 from mme_vla.loading import find_device, load_policy, words_of
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 logger = logging.getLogger("mme_vla.evaluate")
+SUBGOAL_MODES = ("inline", "background")
 
 
 @cli("evaluate")
@@ -48,10 +49,10 @@ def main(cfg: DictConfig) -> None:
     shard = choose_shard(plain["shard"])
     if settings.env == "mme_vla":
         require_simulator()
-    _log_to_terminal()
+    log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
-    subgoals = choose_subgoals(policy, plain["subgoal"])
+    subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]))
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
         None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
@@ -87,16 +88,23 @@ def choose_device(name: str) -> "torch.device":
     return device
 
 
-def choose_subgoals(policy: "MMEPolicy", section: dict[str, Any] | None) -> "SubgoalPredictor | None":
+def choose_subgoals(
+    policy: "MMEPolicy", section: dict[str, Any] | None, mode: str = "inline"
+) -> "SubgoalPredictor | None":
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
 
+    Args:
+        section: the section `subgoal` of the configuration. mode: `inline`, or `background`.
+
     Raises:
-        UserError: an unknown predictor or option, or a policy that reads no subgoal, or another kind.
+        UserError: an unknown predictor, option or mode, or a policy that reads no subgoal, or another kind.
     """
     from mme_vla.evaluation.rollout_run import check_subgoals
     from mme_vla.serving.session import subgoal_kind
-    from mme_vla.subgoal import build_predictor
+    from mme_vla.subgoal import BackgroundPredictor, build_predictor
 
+    if mode not in SUBGOAL_MODES:
+        raise UserError(f"subgoal_mode={mode!r}. {did_you_mean(mode, SUBGOAL_MODES)}")
     if section is None:
         if policy.require_processor().prompt_format.reads_subgoal:
             logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
@@ -106,7 +114,7 @@ def choose_subgoals(policy: "MMEPolicy", section: dict[str, Any] | None) -> "Sub
         section = {**section, "kind": kind.removesuffix("_subgoal")}
     predictor = build_predictor(section)
     check_subgoals(policy, predictor)
-    return predictor
+    return BackgroundPredictor(predictor) if predictor is not None and mode == "background" else predictor
 
 
 def report(done: "Evaluation", output: Path) -> None:
@@ -115,15 +123,21 @@ def report(done: "Evaluation", output: Path) -> None:
     from rich.table import Table
 
     from mme_vla.evaluation.records import count_outcomes
+    from mme_vla.evaluation.subgoal_score import total_score
 
     tasks = list(dict.fromkeys(record.task for record in done.records))
-    table = Table("task", *("episodes", "success", "fail", "timeout", "error", "success rate"))
+    scored = total_score(done.records) is not None
+    judged = ("right subgoals", "points off by") if scored else ()
+    table = Table("task", *("episodes", "success", "fail", "timeout", "error", "success rate"), *judged)
     rows = [(task, [r for r in done.records if r.task == task]) for task in tasks]
     for task, records in [*rows, *([("all", done.records)] if len(rows) > 1 else [])]:
         counts = count_outcomes(records)
         outcomes = [str(counts[name]) for name in ("success", "fail", "timeout", "error")]
-        table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %")
-    console = Console(soft_wrap=True, highlight=False)
+        score = total_score(records)
+        cells = (score.show() if score else ("", "")) if scored else ()
+        table.add_row(task, str(len(records)), *outcomes, f"{100 * counts['success'] / len(records):.1f} %", *cells)
+    # Piped into a file there is no terminal to fit: as wide as the table is.
+    console = Console(width=None if sys.stdout.isatty() else 160, soft_wrap=True, highlight=False)
     if rows:
         console.print(table)
     work = done.workload
@@ -151,15 +165,6 @@ def _spawn_as_usual() -> None:
     """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
     if multiprocessing.get_start_method() == "loky":
         multiprocessing.set_start_method("spawn", force=True)
-
-
-def _log_to_terminal() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(message)s"))
-    logger.setLevel(logging.INFO)
-    logger.handlers = [handler]
-    logger.propagate = False
-    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
 
 
 if __name__ == "__main__":

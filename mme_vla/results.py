@@ -16,6 +16,7 @@ from mme_vla.evaluation.compare import Comparison, compare_all
 from mme_vla.evaluation.demo import demo_records
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.scopes import Protocol
+from mme_vla.evaluation.subgoal_score import subgoal_table
 from mme_vla.evaluation.tables import (
     Table,
     comparison_table,
@@ -88,7 +89,8 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         texts[args.latex] = "\n".join(to_latex(table) for table in _tables(results, comparisons))
     if args.markdown:
         boards = [table for method in results.methods for table in leaderboard(method, results)]
-        parts = ["## Results\n", *map(to_markdown, [overview(results), *boards])]
+        subgoals = [table for method in results.methods if (table := subgoal_table(method, results))]
+        parts = ["## Results\n", *map(to_markdown, [overview(results), *boards, *subgoals])]
         if comparisons:
             parts.append(to_markdown(comparison_table(comparisons)))
         parts += [f"- {note}" for note in results.notes]
@@ -106,7 +108,8 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
 def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
     tables = [overview(results)]
     if detailed:
-        tables = [*(detail(method, results) for method in results.methods), runs_table(results), *tables]
+        subgoals = [table for method in results.methods if (table := subgoal_table(method, results))]
+        tables = [*(detail(method, results) for method in results.methods), *subgoals, runs_table(results), *tables]
     return [*tables, comparison_table(comparisons)] if comparisons else tables
 
 

@@ -4,13 +4,11 @@ import asyncio
 import logging
 import os
 import signal
-import sys
-import warnings
 from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config import cli
+from mme_vla.config import cli, log_to_terminal
 from mme_vla.loading import load_policy
 
 if TYPE_CHECKING:
@@ -35,7 +33,7 @@ def main(cfg: DictConfig) -> None:
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     settings = ServeSettings.from_dict({str(key): value for key, value in config.items()})
-    _log_to_terminal()
+    log_to_terminal(logger, clock=True)
     policy, name, _ = load_policy(cfg, "serve", logger)
     server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
     if not settings.local_only and settings.api_key is None:
@@ -69,15 +67,6 @@ async def run(server: "PolicyServer") -> None:
         logger.warning("stopped at once; requests were cut off")
         os._exit(1)  # the policy's thread cannot be interrupted
     logger.info("stopped · %s", server.stats.line())
-
-
-def _log_to_terminal() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-    logger.setLevel(logging.INFO)
-    logger.handlers = [handler]
-    logger.propagate = False
-    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
 
 
 if __name__ == "__main__":

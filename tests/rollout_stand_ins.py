@@ -59,12 +59,17 @@ class InlineEnvs:
 
 
 def roll(
-    policy: MMEPolicy, jobs: list[Job], envs: InlineEnvs, subgoals: Any = None, **settings: Any
+    policy: MMEPolicy,
+    jobs: list[Job],
+    envs: InlineEnvs,
+    subgoals: Any = None,
+    subgoal_folder: Path | None = None,
+    **settings: Any,
 ) -> list[EpisodeRecord]:
     """Records of a rollout in this process."""
     records: list[EpisodeRecord] = []
     chosen = RolloutSettings(**{"flow_steps": 2, **settings})
-    Rollout(policy, envs, FACTS, chosen, records.append, subgoals).run(jobs)
+    Rollout(policy, envs, FACTS, chosen, records.append, subgoals, subgoal_folder).run(jobs)
     return records
 
 

@@ -22,6 +22,7 @@ from mme_vla.evaluation.analyses.modulation import ModulationWatch
 from mme_vla.evaluation.analyses.recurrence import recurrence_curves
 from mme_vla.evaluation.analyses.recurrence_plot import recurrence_plot
 from mme_vla.evaluation.analyses.replay import replay
+from mme_vla.evaluation.analyses.rerun_log import RerunLog
 from mme_vla.evaluation.cost_table import counted
 from mme_vla.testing import random_batch, small_policy, unit_stats
 
@@ -189,3 +190,45 @@ def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys
         main(arguments)
     assert ended.value.code == 2
     assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "logged"),
+    [(["attention", "--model", "framesamp_context", "--most", "1"], "attention/memory"),
+     (["modulation", "--model", "framesamp_modul", "--most", "1"], "modulation/scale_mean"),
+     (["recurrence", "--model", "rmt_modul", "--stride", "200", "--output", "{}/r.svg"], "recurrence/slot_change"),
+     (["selection", "--memory", "framesamp", "--every", "60", "--output", "{}/s.mp4"], "remembered")],
+    ids=["attention", "modulation", "recurrence", "selection"],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:load_recording:DeprecationWarning")
+def test_rerun_gets_pictures_words_and_numbers(arguments: list[str], logged: str, tmp_path: Path) -> None:
+    rerun = pytest.importorskip("rerun", reason="needs the extra viz")
+    path = tmp_path / "log.rrd"
+    episode = [] if arguments[0] == "selection" else ["--episodes", "0"]
+    main([*(word.format(tmp_path) for word in arguments), *episode, "--rerun", str(path)])
+    schema = str(rerun.recording.load_recording(path).schema())
+    for entity in ("views/image", "views/wrist_image", "goal", "simple_subgoal", logged):
+        assert f"/episode_0/{entity}:" in schema
+    assert "timeline:step" in schema
+
+
+def test_rerun_files_have_the_viewers_suffix(tmp_path: Path) -> None:
+    pytest.importorskip("rerun", reason="needs the extra viz")
+    with pytest.raises(UserError, match=r"\.rrd"):
+        RerunLog(tmp_path / "log.txt")
+
+
+def test_laps_of_a_watch_add_up_to_the_whole() -> None:
+    policy = small_policy("framesamp_modul")
+    batch = random_batch(policy, 2)
+    with AttentionWatch(policy) as attention, ModulationWatch(policy) as modulation:
+        laps = []
+        for seed in range(2):
+            noise = torch.randn(2, 20, 32, generator=torch.Generator().manual_seed(seed))
+            policy.sample_actions(batch, noise, steps=1)
+            laps.append((attention.lap().layers, modulation.lap().overall["scale"][0]))
+        with pytest.raises(UserError, match="No action token"):
+            attention.lap()
+    assert not torch.equal(laps[0][0], laps[1][0])
+    assert torch.stack([mass for mass, _ in laps]).mean(0) == pytest.approx(attention.result().layers)
+    assert np.mean([scale for _, scale in laps]) == pytest.approx(modulation.result().overall["scale"][0])

@@ -103,13 +103,13 @@ def test_the_right_end_up_and_the_other_in_from_the_right_side_is_success(env):
     assert insert(env, env.end, env.side) == (True, False)
 
 
-def test_an_insertion_is_shown_in_red_for_twenty_steps(env):
+def test_an_insertion_is_shown_in_red_for_twenty_steps_after_it(env):
     hidden = env._red_disc.position[2]
     env.progress.index = INSERTING
     insert(env, env.end, env.side)
     assert env._red_disc.position[2] > 0
     env.peg.restore()
-    wait(env, 19)
+    wait(env, 20)
     assert env._red_disc.position[2] > 0
     wait(env)
     assert env._red_disc.position[2] == hidden < 0

@@ -102,14 +102,14 @@ def test_staying_over_a_disc_or_returning_to_it_counts_once(lock, tip):
     assert flags == (True, False) and lock.visited == lock.path
 
 
-def test_a_visited_disc_is_marked_for_40_steps(lock, tip):
+def test_a_visited_disc_is_marked_for_40_steps_after_the_visit(lock, tip):
     disc = lock.path[0]
     mark = lock._marks[lock.discs.index(disc)]
     tip.put(disc)
     wait(lock)
     assert mark.position == pytest.approx(disc.position)
     tip.put((0.4, 0.4))
-    wait(lock, 39)
+    wait(lock, 40)
     assert mark.position == pytest.approx(disc.position)
     wait(lock)
     assert mark.position[2] < -5

@@ -127,12 +127,12 @@ def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(stick, monke
         assert tip.put(place, z=0.099, aside=(0.009, 0)) == tip.put((0.4, 0.4)) == (False, True)
 
 
-def test_a_target_is_marked_for_40_steps_when_the_tip_is_near(stick, tip):
+def test_a_target_is_marked_for_40_steps_after_the_tip_was_near(stick, tip):
     disc, mark = stick.route[0], stick._marks[stick.discs.index(stick.route[0])]
     tip.put(disc, aside=(0.029, 0))
     wait(stick)
     tip.put((0.4, 0.4))
-    wait(stick, 39)
+    wait(stick, 40)
     assert mark.position == pytest.approx(disc.position)
     wait(stick)
     assert mark.position[2] < -5

@@ -6,13 +6,16 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from envs_testing import Scene, recorded, setup
 
+from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
 from mme_vla.envs.objects import (
     build_aperture_box,
@@ -224,4 +227,42 @@ def test_the_first_pictures_are_the_recorded_ones(h5_folder):
     assert centroid(pixels, env.cube.segmentation_ids) == (53, 144)
     assert centroid(pixels, env.target.segmentation_ids) == (92, 108)
     assert centroid(pixels, env.button.segmentation_ids) == (63, 100)
+    env.close()
+
+
+def test_what_waits_under_the_floor_is_left_out_of_the_pictures_until_it_is_shown() -> None:
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    from mme_vla.envs.motions import Mark, build_mark
+
+    def fill(env: Scene) -> None:
+        env.add(build_disc(env, "target", 0.04, 0.005, "gray", (0.0, 0.0)))
+        env.add(build_mark(env, "mark", 0.0402, 0.014))
+
+    env = Scene(fill, obs_mode="rgb", render_backend=render_backend(), sim_backend="physx_cpu")
+    target, disc = (next(thing for thing in env.things if thing.name == name) for name in ("target", "mark"))
+    body = disc.entity._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
+
+    def redness() -> float:
+        picture = env.get_obs()["sensor_data"]["base_camera"]["rgb"][0].cpu().numpy().astype(int)
+        return float(((picture[..., 0] > 200) & (picture[..., 1] < 30)).mean())
+
+    mark = Mark(disc, target.position, 2)
+    assert body.visibility == 0 and redness() == 0
+    mark.update(1, touched=True)
+    assert body.visibility == 1 and redness() > 0.002
+    mark.update(4, touched=False)
+    assert body.visibility == 0 and redness() == 0
+    env.close()
+
+
+def test_all_tasks_are_gymnasium_ids() -> None:
+    load_tasks()
+    assert set(TASK_NAMES) <= set(gymnasium.registry)
+    options = {"obs_mode": "none", "render_backend": "none", "sim_backend": "physx_cpu"}
+    env = gymnasium.make("StopCube", seed=0, difficulty="easy", **options)
+    env.reset()
+    assert env.unwrapped.goals()[0].startswith("press the button")
     env.close()

@@ -116,7 +116,7 @@ def test_a_target_is_marked_while_the_cube_is_over_it_and_20_steps_longer(swing,
     hand.carry(swing.cube, over=swing.right, z=LOW)
     assert right.position == pytest.approx(swing.right.position) and left.position[2] < -5
     hand.carry(swing.cube, over=swing.button)
-    wait(swing, 18)
+    wait(swing, 19)
     assert right.position == pytest.approx(swing.right.position)
     wait(swing)
     assert right.position[2] < -5

@@ -18,6 +18,7 @@ pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes
 from mme_vla.envs import make_env
 from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import Observer
 from mme_vla.envs.recorder import RecordedStep, Recorder
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
@@ -31,6 +32,9 @@ RECOVERY = ("z", "z", "z", "xy", "xy", "xy")  # of train episodes 0 to 5
 SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 PIXELS = 1.0
 """Mean absolute difference allowed between the first pictures, of 255."""
+PIXELS_ALONG = 0.5
+"""The same along an episode."""
+MOST_PICTURES = 24
 
 
 @pytest.fixture(scope="module", params=REFS or [None], ids=lambda ref: f"{ref.task}-{ref.index}" if ref else "none")
@@ -55,6 +59,13 @@ class Episode:
 
     def at(self, step: int, key: str) -> Any:
         return self._group[f"timestep_{step}/{key}"][()]
+
+    def picture_steps(self, view: str, most: int) -> list[int]:
+        """Steps with a picture of their own, spread over the episode; small files link others to the one before."""
+        paths = [f"timestep_{k}/obs/{view}" for k in range(self.length)]
+        places = [h5py.h5o.get_info(self._group[path].id).addr for path in paths]
+        own = [k for k in range(self.length) if k == 0 or places[k] != places[k - 1]]
+        return [own[i] for i in np.linspace(0, len(own) - 1, min(most, len(own))).astype(int)]
 
     def texts(self, key: str) -> list[str]:
         """The different texts in the order they appear, each once in a row."""
@@ -100,6 +111,43 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
             break
     env.close()
     assert info["status"] == "success", info.get("error_message")
+
+
+def test_pictures_along_the_replay_are_the_recorded_ones(episode: Episode, monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    wanted = {view: episode.picture_steps(view, MOST_PICTURES) for view in ("front_rgb", "wrist_rgb")}
+    drawn, shown = set().union(*wanted.values()), iter(range(10**6))
+    frame = Observer.frame
+
+    def sparse(observer: Observer, info: dict[str, Any]) -> dict[str, Any]:
+        """Takes the wanted pictures alone, since one takes as long as hundreds of steps."""
+        made = next(shown)
+        # The list that an episode begins with ends with a frame that no step was stored for.
+        observer.render = (made if made < episode.execution else made - 1) in drawn
+        return {"front_rgb": None, "wrist_rgb": None} | frame(observer, info)
+
+    monkeypatch.setattr(Observer, "frame", sparse)
+    monkeypatch.setattr(Observer, "segmentation", lambda _: np.zeros((256, 256), np.int64))  # for grounded texts alone
+    env = make_env(episode.ref.task, max_steps=5000, **episode.scene)
+    observation, _ = env.reset()
+    assert len(observation["front_rgb_list"]) == episode.execution + 1
+    views = {view: observation[f"{view}_list"][:-1] for view in wanted}
+    for action in episode.actions("joint_angle"):
+        observation, _, terminated, _, _ = env.step(action)
+        for view, pictures in views.items():
+            pictures += observation[f"{view}_list"]
+        if bool(terminated):
+            break
+    env.close()
+    for view, pictures in views.items():
+        steps = [k for k in wanted[view] if k < len(pictures)]
+        assert len(steps) >= 0.8 * len(wanted[view]), "the replay ends long before the recording does"
+        for k in steps:
+            difference = np.abs(pictures[k].astype(int) - episode.at(k, f"obs/{view}").astype(int)).mean()
+            assert difference < PIXELS_ALONG, f"{view} of step {k} differs by {difference:.2f} of 255 on average"
 
 
 class FirstStepError(Exception):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.make import make_env
+    from mme_vla.envs.make import load_tasks, make_env
     from mme_vla.envs.metadata import EpisodeSpec, episode, episodes
     from mme_vla.envs.names import TASK_NAMES
     from mme_vla.envs.vector import VecEnv, make_vec_env
@@ -20,6 +20,7 @@ __all__ = [
     "VecEnv",
     "episode",
     "episodes",
+    "load_tasks",
     "make_env",
     "make_vec_env",
 ]
@@ -33,6 +34,7 @@ _HOMES = {
     "VecEnv": "vector",
     "episode": "metadata",
     "episodes": "metadata",
+    "load_tasks": "make",
     "make_env": "make",
     "make_vec_env": "vector",
 }

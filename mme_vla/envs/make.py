@@ -96,6 +96,22 @@ def require_simulator() -> None:
         raise UserError("The simulator is not installed; run: pip install 'mme-vla[sim]'")
 
 
+def load_tasks(*tasks: str) -> None:
+    """Register tasks, all of them if none is named: in `TASKS`, and with Gymnasium under their own names.
+
+    >>> load_tasks()  # doctest: +SKIP
+    >>> gymnasium.make("StopCube", seed=0, difficulty="easy", obs_mode="rgb")  # doctest: +SKIP
+
+    Raises:
+        UserError: the simulator is missing.
+    """
+    require_simulator()
+    from mme_vla.envs.tasks import module_name
+
+    for task in tasks or TASK_NAMES:
+        import_module(f"mme_vla.envs.tasks.{module_name(task)}")
+
+
 def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any) -> Any:
     """Build one task as a bare ManiSkill environment.
 
@@ -108,11 +124,10 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
     Raises:
         UserError: the simulator is missing, rendering is not possible here, or no such task is registered.
     """
-    require_simulator()
-    from mme_vla.envs.tasks import module_name
-
     if task in TASK_NAMES:
-        import_module(f"mme_vla.envs.tasks.{module_name(task)}")
+        load_tasks(task)
+    else:
+        require_simulator()
     backend = "none"
     if render:
         from mme_vla.envs.rendering_check import render_backend

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.objects import TARGET_COLOURS, Disc, build_highlight, build_sphere
+from mme_vla.envs.objects import COLOURS, Disc, build_highlight, build_sphere
 from mme_vla.envs.things import AWAY, Thing, distance_xy
 
 if TYPE_CHECKING:
@@ -144,9 +144,9 @@ class Highlight:
             self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
 
 
-def build_mark(env: "MemoryTask", name: str, radius: float, half_length: float) -> Disc:
+def build_mark(env: "MemoryTask", name: str, radius: float, thickness: float) -> Disc:
     """Red rings that cover a target's own, for `Mark`; metres."""
-    return build_highlight(env, name, radius, half_length, TARGET_COLOURS["red"], rings=True)
+    return build_highlight(env, name, radius, thickness / 2, COLOURS["red"], rings=True)
 
 
 class Mark:
@@ -155,7 +155,7 @@ class Mark:
     Args:
         disc: what marks the target.
         place: where the disc's centre lies while it is shown, [3].
-        steps: how long it stays.
+        steps: how long it stays, beside the step of the touch itself.
     """
 
     def __init__(self, disc: Thing, place: np.ndarray, steps: int) -> None:
@@ -168,7 +168,7 @@ class Mark:
         """Show or hide the disc after step `k`."""
         if touched:
             self._until = k + self._steps
-        if (k < self._until) != self._shown:
+        if (k <= self._until) != self._shown:
             self._shown = not self._shown
             self._move(self._place if self._shown else BELOW_TABLE)
 

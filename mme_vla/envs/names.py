@@ -8,11 +8,5 @@ TASK_NAMES = (
 )  # fmt: skip
 """In the benchmark's order, which the seeds of the episodes follow."""
 
-VIDEO_TASKS = (
-    "VideoUnmask", "VideoUnmaskSwap", "VideoRepick", "VideoPlaceButton", "VideoPlaceOrder",
-    "MoveCube", "InsertPeg", "PatternLock", "RouteStick",
-)  # fmt: skip
-"""Tasks whose episodes begin with a conditioning video."""
-
 STICK_TASKS = ("PatternLock", "RouteStick")
 """Tasks whose robot holds a stick instead of a gripper."""

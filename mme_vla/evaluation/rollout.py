@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +20,8 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout_episode import RunningEpisode
 from mme_vla.evaluation.rollout_progress import RolloutProgress
 from mme_vla.evaluation.rollout_settings import RolloutSettings
+from mme_vla.evaluation.subgoal_score import EXTRA
+from mme_vla.evaluation.subgoal_trace import SubgoalTrace
 from mme_vla.policy import MMEPolicy
 from mme_vla.subgoal import SubgoalPredictor
 
@@ -75,6 +78,7 @@ class Rollout:
         facts: what the records say of the policy.
         record: called with every record, as soon as there is one.
         subgoals: who says the subgoal; None leaves it out of the prompt.
+        subgoal_folder: where every subgoal is written down with its picture; None keeps the scores alone.
     """
 
     policy: MMEPolicy
@@ -83,6 +87,7 @@ class Rollout:
     settings: RolloutSettings
     record: Callable[[EpisodeRecord], None]
     subgoals: SubgoalPredictor | None = None
+    subgoal_folder: Path | None = None
     progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, shown=False))
     workload: Workload = field(default_factory=Workload)
     _waiting: list[Job] = field(default_factory=list)
@@ -116,7 +121,10 @@ class Rollout:
         settings, memory = self.settings, self.policy.memory
         # Of some memories most frames are never encoded.
         piece = settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
-        running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece)
+        trace = None
+        if self.subgoals is not None:
+            trace = SubgoalTrace(self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}")
+        running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace)
         running.worker = worker
         self._running[worker] = running
         self.envs.start(worker, job)
@@ -170,10 +178,10 @@ class Rollout:
     def _act(self, batch: list[RunningEpisode]) -> None:
         begun = time.perf_counter()
         if self.subgoals is not None:
-            for running, subgoal in zip(
-                batch, self.subgoals.predict([running.watched for running in batch]), strict=True
-            ):
-                running.episode.subgoal = subgoal.text
+            subgoals = self.subgoals.predict([running.watched for running in batch])
+            latency = time.perf_counter() - begun
+            for running, subgoal in zip(batch, subgoals, strict=True):
+                running.told(subgoal, latency)
         chunks = self.policy.act([running.episode for running in batch], self.settings.flow_steps)
         self.workload.batches += 1
         self.workload.chunks += len(batch)
@@ -201,6 +209,7 @@ class Rollout:
                 "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
                 "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
                 **({"video": running.video} if running.video else {}),
+                **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },
         )  # fmt: skip
         again = outcome == "error" and retry and self._tries[job] <= self.settings.retries

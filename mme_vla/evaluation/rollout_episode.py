@@ -10,8 +10,9 @@ from mme_vla.envs.vector_jobs import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
 from mme_vla.evaluation.rollout_env import Observation
+from mme_vla.evaluation.subgoal_trace import SubgoalTrace
 from mme_vla.policy import MMEPolicy
-from mme_vla.subgoal import SubgoalPredictor
+from mme_vla.subgoal import Subgoal, SubgoalPredictor
 
 
 def episode_seed(seed: int, task: str, episode: int) -> int:
@@ -27,14 +28,20 @@ class RunningEpisode:
     video do not keep other episodes waiting.
 
     Args:
-        piece: frames to a piece.
+        subgoals: who says the subgoal. piece: frames to a piece. trace: where the subgoals are noted.
     """
 
     def __init__(
-        self, policy: MMEPolicy, job: Job, seed: int, subgoals: SubgoalPredictor | None = None, piece: int = 32
+        self,
+        policy: MMEPolicy,
+        job: Job,
+        seed: int,
+        subgoals: SubgoalPredictor | None = None,
+        piece: int = 32,
+        trace: SubgoalTrace | None = None,
     ) -> None:
         self._policy, self._subgoals, self._piece = policy, subgoals, piece
-        self.job = job
+        self.job, self.trace = job, trace
         self.episode = policy.start_episode("", seed=episode_seed(seed, job.task, job.episode))
         self.watched: Any = None
         """What the subgoal predictor knows of the episode."""
@@ -98,6 +105,12 @@ class RunningEpisode:
     def thought(self, seconds: float) -> None:
         """Add this episode's share of the policy's time."""
         self._thinking += seconds
+
+    def told(self, subgoal: Subgoal, latency_s: float) -> None:
+        """Take the subgoal of the current frame, which came after so many seconds."""
+        self.episode.subgoal = subgoal.text
+        if self.trace is not None:
+            self.trace.add(self.watched, subgoal, latency_s)
 
     def chosen(self, actions: np.ndarray) -> None:
         """Note the actions [n, 8] that are sent to the environment."""

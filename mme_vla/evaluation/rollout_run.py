@@ -17,9 +17,11 @@ from mme_vla.evaluation.rollout_plan import Shard, take_share
 from mme_vla.evaluation.rollout_progress import RolloutProgress
 from mme_vla.evaluation.rollout_settings import RolloutSettings
 from mme_vla.evaluation.run_file import claim_run, fingerprint
+from mme_vla.evaluation.subgoal_trace import SUBGOALS
 from mme_vla.policy import MMEPolicy
 from mme_vla.serving.session import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
+from mme_vla.subgoal.background import BackgroundPredictor
 
 USUAL_BUDGET = 512
 VIDEOS = "videos"
@@ -97,7 +99,8 @@ def _run(
         options["videos"] = (str(output / VIDEOS), settings.video)
     workers = settings.worker_count(len(jobs))
     with VecEnv([], workers, make_rollout_env, options, settings.timeout_s) as envs:
-        rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, progress)
+        folder = output / SUBGOALS if settings.subgoal_log else None
+        rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress)
         rollout.run(jobs)
     return rollout.workload
 
@@ -123,9 +126,14 @@ def run_settings(
         "source": None if source is None else "/".join(Path(source).parts[-4:]),
         "policy": fingerprint(dict(policy.config)),
         "dtype": dtype,
-        "subgoal": None if subgoals is None else {"name": facts.subgoal, "kind": subgoals.kind},
+        "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         **{name: getattr(settings, name) for name in kept},
     }
+
+
+def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
+    mode = {"mode": "background"} if isinstance(subgoals, BackgroundPredictor) else {}
+    return {"name": name, "kind": subgoals.kind, "interval": subgoals.interval, **mode}
 
 
 def check_subgoals(policy: MMEPolicy, subgoals: SubgoalPredictor | None) -> None:

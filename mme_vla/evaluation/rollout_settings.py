@@ -23,6 +23,7 @@ class RolloutSettings:
     encode_chunk: frames encoded before other episodes may act.
     retries: how often an episode whose environment failed is tried again before the run goes on without it.
     timeout_s: seconds after which an environment that does not answer is replaced.
+    subgoal_log: whether every subgoal is written down with its picture, where a predictor says them.
     """
 
     seed: int = 42
@@ -38,6 +39,7 @@ class RolloutSettings:
     timeout_s: float = 600.0
     render: bool = True
     video: str = "none"
+    subgoal_log: bool = True
 
     def __post_init__(self) -> None:
         for name, value, known in (

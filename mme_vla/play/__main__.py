@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config import cli
+from mme_vla.config import cli, log_to_terminal
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.play.run import Identity, PlayRun, choose_episodes, make_session
@@ -32,7 +32,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.play.web import require_page
 
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    _log_to_terminal()
+    log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
     wanted = choose_episodes(config["task"], config["episodes"], config["split"])
     for name in ("max_steps", "max_choices"):
@@ -132,14 +132,6 @@ def _check_simulator(looks: bool) -> None:
     require_simulator()
     if looks:
         render_backend()
-
-
-def _log_to_terminal() -> None:
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s", "%H:%M:%S"))
-    log.setLevel(logging.INFO)
-    log.handlers = [handler]
-    log.propagate = False
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Symbolic memory: who says the current subgoal. Importing the room registers the predictors it ships."""
 
+from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, Usage, build_predictor
 from mme_vla.subgoal.gemini import Gemini
 from mme_vla.subgoal.memer import Memer
@@ -7,5 +8,6 @@ from mme_vla.subgoal.oracle import Oracle
 from mme_vla.subgoal.qwenvl import QwenVL
 
 __all__ = [
-    "Gemini", "Memer", "Oracle", "QwenVL", "Subgoal", "SubgoalEpisode", "SubgoalPredictor", "Usage", "build_predictor",
+    "BackgroundPredictor", "Gemini", "Memer", "Oracle", "QwenVL", "Subgoal", "SubgoalEpisode", "SubgoalPredictor",
+    "Usage", "build_predictor",
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 """`oracle`: the subgoal that the environment itself reports, an upper bound for every predictor."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
@@ -25,14 +26,19 @@ class Oracle(SubgoalPredictor):
         return [self._read(episode) for episode in episodes]
 
     def _read(self, episode: SubgoalEpisode) -> Subgoal:
-        name = f"{self.kind}_subgoal_online"
-        text = episode.info.get(name)
-        if not isinstance(text, str):
+        if not isinstance(episode.info.get(f"{self.kind}_subgoal_online"), str):
             raise UserError(
-                f"subgoal=oracle needs the environment's {name!r} in observe(…, info); it reports "
+                f"subgoal=oracle needs the environment's '{self.kind}_subgoal_online' in observe(…, info); it reports "
                 f"{sorted(map(str, episode.info)) or 'nothing'}."
             )
-        text = text.strip().lower()
-        if text in ("", "complete", "no record"):
+        text = online_subgoal(episode.info, self.kind)
+        if text is None:
             return Subgoal(episode.subgoal.text, episode.subgoal.points)
         return Subgoal(text, points_of(text))
+
+
+def online_subgoal(info: Mapping[str, Any], kind: str) -> str | None:
+    """The subgoal that an environment reports, lower-case as in training; None where it names none."""
+    text = info.get(f"{kind}_subgoal_online")
+    text = text.strip().lower() if isinstance(text, str) else ""
+    return None if text in ("", "complete", "no record") else text

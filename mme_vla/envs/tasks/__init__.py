@@ -1,13 +1,11 @@
 """The sixteen tasks, one file each; importing a task registers it."""
 
 import re
-from importlib import import_module
 
 import gymnasium
 from mani_skill.utils.registration import register_env
 
 from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.names import TASK_NAMES
 from mme_vla.registry import TASKS
 
 
@@ -18,12 +16,6 @@ def register_task[T: type[MemoryTask]](task: T) -> T:
     if task.__name__ not in gymnasium.registry:
         register_env(task.__name__)(task)
     return task
-
-
-def load_tasks() -> None:
-    """Import every task, so that all are registered."""
-    for name in TASK_NAMES:
-        import_module(f"{__name__}.{module_name(name)}")
 
 
 def module_name(task: str) -> str:

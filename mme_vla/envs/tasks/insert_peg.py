@@ -60,7 +60,7 @@ class InsertPeg(MemoryTask):
         ]
         self.peg = self.pegs[0]
         self._disc = build_highlight(self, "disc", *MARK, APERTURE_COLOUR)
-        self._red_disc = build_mark(self, "disc_red", MARK[0] * 1.003, MARK[1] * 1.003)
+        self._red_disc = build_mark(self, "disc_red", MARK[0] * 1.003, 2 * MARK[1] * 1.003)
 
     def start_episode(self, draws: Draws) -> None:
         x, y = (-0.1 + 0.2 * draws.uniform() for _ in range(2))
@@ -244,6 +244,8 @@ class InsertPeg(MemoryTask):
         ends = [(peg, end) for peg in self.pegs for end in ENDS]
         peg, end = min(ends, key=lambda e: float(np.linalg.norm(getattr(*e).position - tcp)))
         demo.insert_peg(peg, end, side, self.box)
+        if not any(self._inside(half) for half in (peg.head, peg.tail)):
+            demo.insert_peg_fully(peg, end, side, self.box, begun=True)
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then grasp the same"

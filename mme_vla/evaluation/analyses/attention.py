@@ -65,6 +65,7 @@ class AttentionWatch:
     _lengths: list[int] = field(default_factory=list)
     _sums: Tensor | None = None
     _samples: int = 0
+    _lap: tuple[Tensor | None, int] = (None, 0)
     _watching: bool = False
     _handles: list[Any] = field(default_factory=list)
 
@@ -86,13 +87,28 @@ class AttentionWatch:
         Raises:
             UserError: nothing has.
         """
-        if self._sums is None:
+        return self._mass(None, 0)
+
+    def lap(self) -> AttentionMass:
+        """What has been seen since the last lap.
+
+        Raises:
+            UserError: nothing has.
+        """
+        mass = self._mass(*self._lap)
+        assert self._sums is not None
+        self._lap = (self._sums.clone(), self._samples)
+        return mass
+
+    def _mass(self, before: Tensor | None, samples: int) -> AttentionMass:
+        if self._sums is None or self._samples == samples:
             raise UserError("No action token has been seen: let the policy act inside the `with` block.")
+        sums = self._sums if before is None else self._sums - before
         parts = list(dict.fromkeys(PARTS.get(name, name) for name in self._names))
-        layers = torch.zeros(len(self._sums), len(parts), dtype=torch.float64)
+        layers = torch.zeros(len(sums), len(parts), dtype=torch.float64)
         for column, name in enumerate(self._names):
-            layers[:, parts.index(PARTS.get(name, name))] += self._sums[:, column]
-        return AttentionMass(parts, layers / self._samples)
+            layers[:, parts.index(PARTS.get(name, name))] += sums[:, column]
+        return AttentionMass(parts, layers / (self._samples - samples))
 
     def _begin(self, transformer: Any, args: tuple, kwargs: dict[str, Any]) -> None:
         layout: Layout = kwargs["layout"] if "layout" in kwargs else args[1]

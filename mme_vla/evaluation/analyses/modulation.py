@@ -30,6 +30,7 @@ class ModulationWatch:
 
     policy: MMEPolicy
     _sums: dict[int, Tensor] = field(default_factory=dict)
+    _lap: dict[int, Tensor] = field(default_factory=dict)
     _handles: list[Any] = field(default_factory=list)
 
     def __enter__(self) -> Self:
@@ -55,9 +56,23 @@ class ModulationWatch:
         Raises:
             UserError: nothing has.
         """
-        if not self._sums:
+        return self._stats({})
+
+    def lap(self) -> ModulationStats:
+        """What has been seen since the last lap.
+
+        Raises:
+            UserError: nothing has.
+        """
+        stats = self._stats(self._lap)
+        self._lap = dict(self._sums)
+        return stats
+
+    def _stats(self, before: dict[int, Tensor]) -> ModulationStats:
+        news = [self._sums[i] - before.get(i, 0) for i in sorted(self._sums)]
+        if not news or not news[0].any():
             raise UserError("No modulation has been seen: let the policy act inside the `with` block.")
-        sums = torch.stack([self._sums[i] for i in sorted(self._sums)])  # depth × (scale, bias) × (count, sum, squares)
+        sums = torch.stack(news)  # depth × (scale, bias) × (count, sum, squares)
         mean, std = _moments(sums)
         means, stds = _moments(sums.sum(0))
         overall = {name: (float(means[i]), float(stds[i])) for i, name in enumerate(("scale", "bias"))}

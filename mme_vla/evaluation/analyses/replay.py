@@ -1,6 +1,6 @@
 """A policy shown recorded episodes as an environment would show them, so that what happens inside can be watched."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -64,10 +64,19 @@ def replay_all(
     episodes: Sequence[int] | None,
     stride: int = STRIDE,
     most: int | None = None,
+    after: Callable[[int, int], None] = lambda episode, step: None,
 ) -> int:
-    """Replay several episodes (None: all); return how many chunks were chosen."""
-    chosen = range(len(source)) if episodes is None else episodes
-    return sum(1 for episode in chosen for _ in replay(policy, source, episode, stride, most))
+    """Replay several episodes (None: all); return how many chunks were chosen.
+
+    Args:
+        after: called after every chunk, with its episode and step.
+    """
+    count = 0
+    for episode in range(len(source)) if episodes is None else episodes:
+        for step, _ in replay(policy, source, episode, stride, most):
+            after(episode, step)
+            count += 1
+    return count
 
 
 def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:

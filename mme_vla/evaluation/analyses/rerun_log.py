@@ -1,0 +1,76 @@
+"""Episodes for the Rerun viewer: pictures, numbers and words over the steps, in one `.rrd` file."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from PIL import Image
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.types import VIEWS
+
+_JPEG_QUALITY = 90
+
+
+class RerunLog:
+    """Writes an `.rrd` file; a context manager. Look at it with `rerun <file>`.
+
+    Everything of episode n stands below `episode_<n>/`, on the timeline `step`.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Begin a file, replacing one of that name.
+
+        Raises:
+            UserError: Rerun is not installed, or `path` has another suffix.
+        """
+        try:
+            import rerun
+        except ImportError:
+            raise UserError("Rerun output needs the extra `viz`: pip install 'mme-vla[viz]'.") from None
+        if path.suffix != ".rrd":
+            raise UserError(f"--rerun {path}: the viewer reads files that end in .rrd.")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._rerun: Any = rerun
+        self._stream: Any = rerun.RecordingStream("mme_vla")
+        self._stream.save(str(path))
+        self._episode = 0
+
+    def at(self, episode: int, step: int) -> None:
+        """What is logged next belongs here."""
+        self._episode = episode
+        self._stream.set_time("step", sequence=step)
+
+    def picture(self, name: str, picture: np.ndarray | Image.Image) -> None:
+        """Log a picture [H, W, 3] uint8."""
+        image = self._rerun.Image(np.asarray(picture))
+        self._log(name, image.compress(jpeg_quality=_JPEG_QUALITY))
+
+    def number(self, name: str, value: float) -> None:
+        """Log a number; those below one parent (`attention/memory`, `attention/language`) share a plot."""
+        self._log(name, self._rerun.Scalars(float(value)))
+
+    def words(self, name: str, text: str) -> None:
+        """Log a text."""
+        self._log(name, self._rerun.TextDocument(text))
+
+    def views(self, source: EpisodeSource, episode: int, step: int) -> None:
+        """Go to a step of a recorded episode, and log its pictures and words."""
+        self.at(episode, step)
+        for view in VIEWS:
+            self.picture(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
+        self.words("goal", source.goal(episode))
+        for kind, text in source.subgoals(episode, step).items():
+            self.words(kind, text)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def _log(self, name: str, what: Any) -> None:
+        self._stream.log(f"episode_{self._episode}/{name}", what)

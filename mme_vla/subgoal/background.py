@@ -1,0 +1,96 @@
+"""A predictor in the background: the policy acts on with the last subgoal until the next one is there."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+
+from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
+
+
+class BackgroundEpisode(SubgoalEpisode):
+    """An episode as the policy sees it; the predictor's own (`inner`) stands still while a model answers for it."""
+
+    def __init__(self, inner: SubgoalEpisode) -> None:
+        super().__init__(inner.goal, inner.video, inner.task)
+        self.inner = inner
+        self.answered = False
+        self.fresh = False
+        self._news: list[tuple[np.ndarray, Mapping[str, Any] | None]] = []
+
+    def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
+        """Take frames, see `SubgoalEpisode`."""
+        super().observe(frames, info)
+        self._news.append((frames, info))
+
+    def catch_up(self) -> SubgoalEpisode:
+        """Hand on what was seen meanwhile; only while no model answers for this episode."""
+        for frames, info in self._news:
+            self.inner.observe(frames, info)
+        self._news.clear()
+        return self.inner
+
+
+class BackgroundPredictor(SubgoalPredictor):
+    """Runs another predictor in a thread.
+
+    Only the first subgoal of an episode is waited for. Later a question goes out as soon as the thread is free, for all
+    waiting episodes together, and its answer is used from the next chunk on. What comes out therefore depends on how
+    fast the model answers.
+
+    Args:
+        inner: the predictor. It is used by one thread at a time.
+    """
+
+    def __init__(self, inner: SubgoalPredictor) -> None:
+        super().__init__(inner.kind, inner.interval)
+        self.inner, self.usage = inner, inner.usage
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="subgoals")
+        self._asked: list[BackgroundEpisode] = []
+        self._answers: Future[list[Subgoal]] | None = None
+
+    def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> BackgroundEpisode:
+        """Begin an episode, see `SubgoalPredictor`."""
+        return BackgroundEpisode(self.inner.start_episode(goal, video, task))
+
+    def predict(self, episodes: Sequence[Any]) -> list[Subgoal]:
+        """The newest subgoals there are; asks for the episodes that are due if the thread is free.
+
+        Raises:
+            Exception: what the predictor itself raised meanwhile.
+        """
+        self._collect()
+        while not all(episode.answered for episode in episodes):
+            self._ask(episodes)
+            self._collect(wait=True)
+        self._ask(episodes)
+        subgoals = []
+        for episode in episodes:
+            last = episode.subgoal
+            subgoals.append(last if episode.fresh else Subgoal(last.text, last.points))
+            episode.fresh = False
+        return subgoals
+
+    def close(self) -> None:
+        """Drop what is under way and free the predictor."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        self.inner.close()
+
+    def _ask(self, episodes: Sequence[BackgroundEpisode]) -> None:
+        if self._answers is not None:
+            return
+        # What was answered just now for the current frame need not be asked again.
+        moved = [e for e in episodes if not e.answered or e.inner.frames_seen < e.frames_seen]
+        due = [episode for episode in moved if self.inner.due(episode.catch_up()) or not episode.answered]
+        if due:
+            self._asked = due
+            self._answers = self._thread.submit(self.inner.predict, [episode.inner for episode in due])
+
+    def _collect(self, wait: bool = False) -> None:
+        if self._answers is None or not (wait or self._answers.done()):
+            return
+        answers, self._answers = self._answers.result(), None
+        for episode, subgoal in zip(self._asked, answers, strict=True):
+            episode.subgoal, episode.answered, episode.fresh = subgoal, True, True
+        self._asked = []

@@ -1,0 +1,101 @@
+"""From training to results with the commands a user types, in the real simulator; needs the extra `sim` and Vulkan."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+
+pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+
+from mme_vla.envs.rendering_check import render_backend
+from mme_vla.errors import UserError
+from mme_vla.evaluation.record_log import read_records
+
+EPISODES = ["tasks=[PickXtimes,StopCube]", "episodes=3", "max_steps=40", "workers=2", "max_batch=1", "flow_steps=3"]
+
+
+def command(module: str, *words: str) -> list[str]:
+    return [sys.executable, "-W", "ignore", "-m", f"mme_vla.{module}", *words]
+
+
+def call(*words: str) -> str:
+    done = subprocess.run(command(*words), cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+@contextmanager
+def started(*words: str) -> Iterator[subprocess.Popen]:
+    """A command in a process group of its own, which is gone in the end."""
+    process = subprocess.Popen(command(*words), cwd=REPOSITORY, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        yield process
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def group_is_empty(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+@pytest.mark.timeout(600)
+def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(tmp_path: Path) -> None:
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    trained = tmp_path / "trained"
+    steps = ["train.steps=20", "train.warmup=5", "train.open_loop_chunks=0", "train.val_every=20", "train.workers=0"]
+    call("train", "model=framesamp_modul", f"output={trained}", *steps)
+
+    said = call("evaluate", f"checkpoint={trained}", *EPISODES, f"output={tmp_path / 'whole'}", "video=all")
+    assert "python -m mme_vla.results" in said
+    whole = {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "whole")}
+    assert len(whole) == 6 and len({digest for _, _, digest in whole.values()}) == 6
+    assert all(outcome in ("timeout", "fail", "success") for outcome, _, _ in whole.values()), whole
+    assert len(list((tmp_path / "whole" / "videos").glob("*.mp4"))) == 6
+
+    words = ("evaluate", f"checkpoint={trained}", *EPISODES, f"output={tmp_path / 'killed'}")
+    with started(*words) as process:
+        until = time.monotonic() + 200
+        while len(finished := lines(tmp_path / "killed")) < 2:
+            assert process.poll() is None and time.monotonic() < until
+            time.sleep(0.05)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        until = time.monotonic() + 30
+        while not group_is_empty(process.pid):
+            assert time.monotonic() < until, "workers outlive a run that was killed"
+            time.sleep(0.1)
+    finished = lines(tmp_path / "killed")
+    assert 2 <= len(finished) < 6
+    said = call(*words)
+    assert "of 6 episodes: going on" in said
+    assert lines(tmp_path / "killed")[: len(finished)] == finished, "what was finished was run again"
+    assert {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "killed")} == whole
+
+    shown = call("results", str(tmp_path / "killed"), "--tasks", "PickXtimes", "StopCube", "--episodes", "3")
+    assert "framesamp_modul" in shown and "20" in shown
+
+
+def records(folder: Path) -> list:
+    return read_records(folder / "episodes.jsonl")
+
+
+def lines(folder: Path) -> list[bytes]:
+    """The whole lines of a file of records that may be being written."""
+    path = folder / "episodes.jsonl"
+    return path.read_bytes().split(b"\n")[:-1] if path.exists() else []
