@@ -1,10 +1,10 @@
-"""Episodes a minute: one environment and no batches, against several workers that share one batching policy.
+"""Episodes a minute: one environment and no batches, against several workers without and with a batching policy.
 
     python benchmarks/rollout_throughput.py [--model framesamp_modul] [--workers 2] [--steps 64] [--no-render]
 
-Both do the same episodes with the same noise, one after the other in one run, on workers that are warm: the first
-episode of every worker, which imports the simulator, is not timed. The policy is tiny and untrained; its episodes run
-until the step limit, so that the work is the same whatever it does.
+All do the same episodes with the same noise, one contestant after the other in one run, on workers that are warm: the
+first episode of every worker, which imports the simulator, is not timed. The policy is tiny and untrained; its episodes
+run until the step limit, so that the work is the same whatever it does.
 """
 
 import argparse
@@ -47,6 +47,7 @@ class Measured:
             f"{render:.1f} s",
             f"{policy:.1f} s",
             f"{100 * policy / (sim + render):.0f} %",
+            f"{1000 * policy / sum(r.extra['chunks'] for r in self.records):.0f} ms",
             f"{self.mean_batch:.1f}",
             f"{self.wall_s:.1f} s",
         ]
@@ -82,16 +83,19 @@ def main() -> None:
     policy = small_policy(args.model)
     jobs = [Job(task, "test", episode) for episode in range(args.episodes) for task in TASKS]
     print(f"{args.model}, tiny · {len(jobs)} episodes of at most {args.steps + 1} steps · {machine()}\n")
-    print("| | episodes/min | steps/s | simulation | rendering | policy | policy over both | batch | wall |")
-    print("|---|---:|---:|---:|---:|---:|---:|---:|---:|")
+    columns = ["", "episodes/min", "steps/s", "simulation", "rendering", "policy", "policy over both"]
+    columns += ["policy a chunk", "batch", "wall"]
+    print("| " + " | ".join(columns) + " |\n|---|" + "---:|" * (len(columns) - 1))
     results = [
         measure(policy, "1 environment, unbatched", jobs, 1, 1, args),
+        measure(policy, f"{args.workers} workers, unbatched", jobs, args.workers, 1, args),
         measure(policy, f"{args.workers} workers, batched", jobs, args.workers, 16, args),
     ]
     for result in results:
         print("| " + " | ".join(result.row()) + " |")
     same = [{(r.key, r.outcome, r.steps) for r in result.records} for result in results]
-    print(f"\nsame outcomes and steps: {same[0] == same[1]}; gain {results[0].wall_s / results[1].wall_s:.2f}x")
+    gains = " and ".join(f"{results[0].wall_s / result.wall_s:.2f}x" for result in results[1:])
+    print(f"\nsame outcomes and steps: {same[0] == same[1] == same[2]}; gain of the others {gains}")
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.evaluation.rollout_plan import choose_episodes, choose_shard
     from mme_vla.evaluation.rollout_run import RunFacts, checkpoint_label, default_output, evaluate, memory_budget
     from mme_vla.evaluation.rollout_settings import RolloutSettings
+    from mme_vla.evaluation.submission import policy_facts
 
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
@@ -62,7 +63,8 @@ def main(cfg: DictConfig) -> None:
     output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d episodes into %s%s", len(jobs), output, f", of which shard {shard.index}/{shard.count}"
                 if shard.count > 1 else "")  # fmt: skip
-    notes = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
+    notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
+    notes["policy"] = policy_facts(policy.config)
     _end_on_sigterm()
     _spawn_as_usual()
     try:

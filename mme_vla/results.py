@@ -17,6 +17,7 @@ from mme_vla.evaluation.demo import demo_records
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.scopes import Protocol
 from mme_vla.evaluation.subgoal_score import subgoal_table
+from mme_vla.evaluation.submission import read_runs, training_details
 from mme_vla.evaluation.tables import (
     Table,
     comparison_table,
@@ -91,6 +92,7 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         boards = [table for method in results.methods for table in leaderboard(method, results)]
         subgoals = [table for method in results.methods if (table := subgoal_table(method, results))]
         parts = ["## Results\n", *map(to_markdown, [overview(results), *boards, *subgoals])]
+        parts.append(training_details(results.methods, read_runs(find_records(args.runs))))
         if comparisons:
             parts.append(to_markdown(comparison_table(comparisons)))
         parts += [f"- {note}" for note in results.notes]

@@ -111,6 +111,15 @@ def test_the_formula_gives_seeds_before_retries() -> None:
     assert formula("VideoUnmask", "train", 7) == (6700, "hard")
 
 
+@pytest.mark.parametrize("split", metadata.SPLITS)
+def test_retried_seeds_lie_close_above_the_formulas(split: str) -> None:
+    for task in TASK_NAMES:
+        for spec in episodes(task, split):
+            seed, difficulty = formula(task, split, spec.episode)
+            assert 0 <= spec.seed - seed <= 6 and spec.difficulty == difficulty
+            assert spec.source in ("official", "derived") or spec.seed == seed
+
+
 def test_importing_the_room_does_not_import_the_simulator() -> None:
     code = "import sys, mme_vla.envs as e; e.make_env, e.episodes; sys.exit('mani_skill' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

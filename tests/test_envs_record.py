@@ -15,6 +15,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs import record, show
 from mme_vla.envs.make import make_task
+from mme_vla.envs.recorder import Recorder
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
 
@@ -110,3 +111,15 @@ def test_an_episode_of_each_suite_is_drawn_to_its_success(task: str, difficulty:
     changed = [np.abs(a.picture.astype(int) - b.picture).mean() for a, b in pairwise(snapshots)]
     assert max(changed) > 1, "nothing moves"
     assert show.strip(snapshots, tiles=4).width == 4 * (show.TILE + show.GAP) - show.GAP
+
+
+def test_the_first_waypoint_of_the_execution_is_not_lost_with_those_of_the_video() -> None:
+    env = make_task("RouteStick", render=False, seed=16000, difficulty="easy")
+    recorded = Recorder(env, render=False).record()
+    env.close()
+    assert recorded.success
+    named = [step.action["waypoint_action"] for step in recorded.frames if not step.info["is_video_demo"]]
+    distinct = [w for i, w in enumerate(named) if i == 0 or not np.array_equal(w, named[i - 1])]
+    assert not np.isnan(distinct[0]).any()
+    moves = sum(subtask.choice != "" and not subtask.video for subtask in env.progress.subtasks)
+    assert len(distinct) == 2 * moves, "each arc has a middle and an end"

@@ -18,7 +18,7 @@ from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import read_records
 
-EPISODES = ["tasks=[PickXtimes,StopCube]", "episodes=3", "max_steps=40", "workers=2", "max_batch=1", "flow_steps=3"]
+EPISODES = ["tasks=[PickXtimes,StopCube]", "episodes=3", "max_steps=20", "workers=2", "max_batch=1", "flow_steps=3"]
 
 
 def command(module: str, *words: str) -> list[str]:
@@ -58,7 +58,7 @@ def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(
     except UserError as error:
         pytest.skip(str(error))
     trained = tmp_path / "trained"
-    steps = ["train.steps=20", "train.warmup=5", "train.open_loop_chunks=0", "train.val_every=20", "train.workers=0"]
+    steps = ["train.steps=10", "train.warmup=3", "train.open_loop_chunks=0", "train.val_every=10", "train.workers=0"]
     call("train", "model=framesamp_modul", f"output={trained}", *steps)
 
     said = call("evaluate", f"checkpoint={trained}", *EPISODES, f"output={tmp_path / 'whole'}", "video=all")

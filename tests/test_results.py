@@ -18,7 +18,9 @@ from mme_vla.evaluation.demo import demo_records
 from mme_vla.evaluation.intervals import bootstrap, effective_trials, holm, mean_std, sign_test, wilson
 from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.run_file import claim_run
 from mme_vla.evaluation.scopes import Protocol
+from mme_vla.evaluation.submission import policy_facts
 from mme_vla.evaluation.tables import leaderboard, overview, to_csv, to_latex, to_markdown
 from mme_vla.evaluation.tasks import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES
 from mme_vla.results import main
@@ -288,6 +290,38 @@ def test_the_command_reads_shards_and_writes_every_format(tmp_path: Path, capsys
     assert "<script" not in page
     assert 'src="http' not in page
     assert all(path.stat().st_size > 100 for path in files.values())
+
+
+def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
+    wins = {"BinFill": [1, 0], "MoveCube": [1, 1]}
+    config = {"memory": {"name": "ttt", "budget": 512}, "integration": {"name": "expert"},
+              "card": {"data": "robomme", "recipe": {"steps": 80000, "batch_size": 64, "lr": 5e-5}}}  # fmt: skip
+    claim_run(tmp_path / "a", {"model": "ttt_expert", "checkpoint": 100}, {"policy": policy_facts(config)})
+    for folder, name in (("a", "ttt_expert"), ("b", "pi05")):
+        with RecordLog(tmp_path / folder / "episodes.jsonl") as log:
+            for seed in (7, 42):
+                for made in records(name, wins, seed):
+                    log.append(made)
+    out = tmp_path / "out.md"
+    options = [
+        "--tasks",
+        "BinFill",
+        "MoveCube",
+        "--episodes",
+        "2",
+        "--samples",
+        "50",
+        "--brief",
+        "--markdown",
+        str(out),
+    ]
+    main([str(tmp_path / "a"), str(tmp_path / "b"), *options])
+    _, _, details = out.read_text().partition("## Training details")
+    trained, unknown = details.split("**pi05")
+    assert "memory ttt, 512 tokens, integration expert" in trained and "data: robomme" in trained
+    assert "updates 80000, samples an update 64, peak learning rate 5e-05" in trained
+    assert "joint_angle actions, at most 1300 steps, model seeds 7, 42" in trained
+    assert unknown.count("state it by hand") == 2
 
 
 def test_the_demo_says_that_it_is_made_up(capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,6 +37,7 @@ class MemoryTask(BaseEnv):
         seed: fixes the scene and the script; the `seed` of `reset` has no effect.
         difficulty: `easy`, `medium` or `hard`; by default seed % 3 decides.
         recovery: `z` or `xy` draws the pick that a recovery demonstration fails once, and how.
+        second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
 
     Raises:
         UserError: an unknown difficulty or recovery mode, or a negative seed.
@@ -58,6 +59,7 @@ class MemoryTask(BaseEnv):
         seed: int = 0,
         difficulty: str | None = None,
         recovery: str | None = None,
+        second_tries: bool = True,
         robot_uids: str | None = None,
         control_mode: str = "pd_joint_pos",
         **kwargs: Any,
@@ -71,6 +73,7 @@ class MemoryTask(BaseEnv):
         self.seed = seed
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
+        self.second_tries = second_tries
         self.recording = False
         """A demonstrator is recording: `dropped` is judged as it was when the official data were recorded."""
         self.observe: Callable[[dict[str, Any]], None] | None = None

@@ -1,8 +1,9 @@
 """Which seed and difficulty every episode of the benchmark's splits has; importing this needs no simulator.
 
 A seed follows from task, split and episode by a formula, except where the official demonstrator failed on it: the seed
-was then raised by one until it succeeded, which no formula tells. The shipped table therefore marks the seeds that are
-confirmed by an official episode; the others are the formula's. With the official files at hand (the `robomme` package
+was then raised by one until it succeeded. The shipped table was made by demonstrating every episode in the same way
+(benchmarks/episode_seeds.py), which is right where both demonstrators fail alike, and marks what is known from official
+episodes. With the official files at hand (the `robomme` package
 installed, or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`) theirs are used.
 """
 
@@ -38,8 +39,8 @@ class EpisodeSpec:
     seed: int
     difficulty: str
     source: str
-    """`official`: an official file or demonstration says so; `formula`: derived, and wrong by a few where the official
-    demonstrator had to try again."""
+    """`official`: an official file or demonstration says so. `derived`: the first seed on which our demonstrator,
+    without its second tries, succeeds; wrong by a few where the official one fails on another."""
 
     @property
     def recovery(self) -> str | None:

@@ -97,7 +97,7 @@ class GripperPrimitives(RobotControl):
         grasp = self._grasp_pose(thing, depth)
         rest = thing.position[2]
         self._grasp_at(grasp, thing, above)
-        if thing.position[2] - rest < LIFTED:
+        if self.env.second_tries and thing.position[2] - rest < LIFTED:
             # A finger was in something's way: once more, across the other sides.
             self.open()
             grasp = self._grasp_pose(thing, depth)

@@ -109,6 +109,7 @@ class Recorder:
         self._result.steps += 1
 
     def _note_waypoint(self, pose: "sapien.Pose", gripper: float) -> None:
+        self._enter_phase()
         angles = AngleTrack().follow(pose.q)
         # Straight down is a half turn either way: which one would be a matter of rounding.
         angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
@@ -120,10 +121,7 @@ class Recorder:
         # The text was set before the evaluation moved the pointer: it follows one step later.
         shown, self._shown = self._shown, progress.shown
         planned = progress.demonstrated
-        if planned.video != self._in_video:
-            if self._in_video is not None:
-                self._waypoint = None
-            self._in_video = planned.video
+        self._enter_phase()
         if planned.text == NO_RECORD:
             return
         step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, shown))
@@ -133,6 +131,13 @@ class Recorder:
             self._result.frames.append(step)
         else:
             self._on_step(step)
+
+    def _enter_phase(self) -> None:
+        """Forget the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
+        video = self._task.progress.demonstrated.video
+        if self._in_video is not None and video != self._in_video:
+            self._waypoint = None
+        self._in_video = video
 
     def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
         frame = self._observer.frame(evaluated)

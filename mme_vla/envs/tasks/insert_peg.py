@@ -37,7 +37,9 @@ SHOWN_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
 """How far from the box and from other pegs the hand has room around a peg, metres."""
+SIDEWAYS = -0.4  # cosine between the way from a near box and the way a peg may be drawn: a little past sideways
 WORKSPACE = (0.4, 0.72)  # nearest and farthest from the robot's base that a peg is moved to, metres
+FLUNG = 0.05  # from its place in one step, metres
 MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 
@@ -74,7 +76,7 @@ class InsertPeg(MemoryTask):
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
         self.mark = Mark(self._red_disc, below, SHOWN_STEPS)
-        self._helpful = 0
+        self._helpful, self._restoring = 0, False
 
     def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
         for _ in range(TRIES):
@@ -88,6 +90,16 @@ class InsertPeg(MemoryTask):
         if self.reset_in_progress:
             for peg in self.pegs:
                 peg.displace(peg.initial_pose)
+        elif self._restoring and self.second_tries and self._flung():
+            self.peg.restore()
+        self._restoring = self.reset_in_progress
+
+    def _flung(self) -> bool:
+        """Whether the peg left at once where it was put back: it keeps what speed the hand or the box gave it.
+
+        No official episode shows that, since its demonstrator could not go on from there; the peg is laid down at rest.
+        """
+        return float(np.linalg.norm(self.peg.position - self.peg.initial_pose.p)) > FLUNG
 
     # Predicates ---------------------------------------------------------------------------------------------------
 
@@ -171,16 +183,21 @@ class InsertPeg(MemoryTask):
         """Grasp as the benchmark does; where the box is in the hand's way, move the peg by its other end first."""
         other: PegEnd = "tail" if self.end == "head" else "head"
         plans: list[tuple[PegEnd, bool] | None] = [None, (other, False), (other, True), (self.end, True)]
+        if not self.second_tries:
+            return demo.grasp_peg(self.peg, self.end)
         # What helped in the video is likely to help again.
         for drag in plans[self._helpful :]:
             if drag is not None:
                 with suppress(PlanningError):
                     demo.drag_peg(self.peg, drag[0], self._way_out(), turn=drag[1])
-            demo.grasp_peg(self.peg, self.end)
+            with suppress(PlanningError):  # out of reach, for instance
+                demo.grasp_peg(self.peg, self.end)
             if self._lifted(self.end):
                 self._helpful = plans.index(drag)
                 return
-        raise PlanningError(f"{self.peg.name} cannot be grasped by its {self.end}: the box is in the way.")
+        raise PlanningError(
+            f"{self.peg.name} cannot be grasped by its {self.end}: it is out of reach, or the box is in the way."
+        )
 
     def _way_out(self) -> np.ndarray:
         """The shortest way [2] that takes the peg to an open place."""
@@ -196,7 +213,10 @@ class InsertPeg(MemoryTask):
         angles, lengths = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(0.04, 0.4, 0.02)
         ways = [length * np.array([np.cos(angle), np.sin(angle)]) for length in lengths for angle in angles]
         away = middle - self.box.position[:2]
-        open_ways = (way for way in ways if way @ away >= 0 and is_open(middle + way))
+        # A peg beside the box is not drawn through it; one that is only far away may come nearer.
+        beside = np.linalg.norm(away) < OPEN_FROM_BOX
+        most = SIDEWAYS * np.linalg.norm(away)
+        open_ways = (w for w in ways if (not beside or w @ away >= most * np.linalg.norm(w)) and is_open(middle + w))
         return next(open_ways, 0.1 * away / np.linalg.norm(away))
 
     def _demonstrate_insertion(self, demo: "Demonstrator") -> None:
@@ -209,7 +229,7 @@ class InsertPeg(MemoryTask):
             lambda: self._insert_anew(demo, turn=True),
             lambda: self._insert_anew(demo, turn=False),
         ]
-        for attempt in tries:
+        for attempt in tries if self.second_tries else tries[:1]:
             if not self._inserted(self.end, self.side):
                 with suppress(PlanningError):
                     attempt()

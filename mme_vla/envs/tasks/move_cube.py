@@ -101,7 +101,7 @@ class MoveCube(MemoryTask):
 
     def _demonstrate_hook(self, demo: "Demonstrator") -> None:
         demo.hook(self.cube, self.target, self._side())
-        for _ in range(MORE_TRIES):
+        for _ in range(MORE_TRIES if self.second_tries else 0):
             if not self._pushed():
                 demo.withdraw()
                 demo.grasp_peg(self.peg, "tail")
@@ -109,7 +109,7 @@ class MoveCube(MemoryTask):
 
     def _demonstrate_push(self, demo: "Demonstrator") -> None:
         demo.push(self.cube, self.target)
-        for _ in range(MORE_TRIES):
+        for _ in range(MORE_TRIES if self.second_tries else 0):
             if not self._pushed():
                 demo.withdraw()
                 demo.push(self.cube, self.target)

@@ -114,7 +114,11 @@ class StopCube(MemoryTask):
         """Press; if the wait before it ended so late that the cube would have passed, without closing the fingers."""
         crossing = self.deadline - self.interval // 2
         tolerated = self.interval // 15  # steps that the cube takes over half the target
-        demo.press(self.button, hold=False, close=self.steps_done + PRESS_STEPS <= crossing + tolerated)
+        demo.press(
+            self.button,
+            hold=False,
+            close=not self.second_tries or self.steps_done + PRESS_STEPS <= crossing + tolerated,
+        )
 
     def _wait(self, until: int) -> SubTask:
         return SubTask(
