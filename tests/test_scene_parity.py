@@ -150,6 +150,31 @@ def test_pictures_along_the_replay_are_the_recorded_ones(episode: Episode, monke
             assert difference < PIXELS_ALONG, f"{view} of step {k} differs by {difference:.2f} of 255 on average"
 
 
+def test_a_demonstration_of_ours_is_stored_as_the_official_one(episode: Episode) -> None:
+    env = make_task(episode.ref.task, render=False, **episode.scene)
+    recorded = Recorder(env, render=False).record()
+    env.close()
+    if len(recorded.frames) != episode.length:
+        pytest.skip(f"this demonstration has {len(recorded.frames)} steps here and {episode.length} in the file")
+    steps = list(enumerate(recorded.frames))
+    for name in ("simple_subgoal", "simple_subgoal_online"):
+        assert [s.info[name] for _, s in steps] == [text(episode.at(k, f"info/{name}")) for k, _ in steps]
+    for name in ("is_video_demo", "is_subgoal_boundary", "is_completed"):
+        assert [bool(s.info[name]) for _, s in steps] == [bool(episode.at(k, f"info/{name}")) for k, _ in steps]
+    assert [json.loads(s.action["choice_action"]) for _, s in steps] == [
+        json.loads(text(episode.at(k, "action/choice_action"))) for k, _ in steps
+    ]
+    for name in ("joint_action", "eef_action", "waypoint_action"):
+        ours = np.stack([s.action[name] for _, s in steps])
+        theirs = np.stack([episode.at(k, f"action/{name}") for k, _ in steps])
+        # After a press the arm rests a little differently.
+        np.testing.assert_allclose(ours, theirs, atol=5e-3, err_msg=name)
+    for name in ("joint_state", "eef_state", "gripper_state"):
+        ours = np.stack([s.obs[name] for _, s in steps])
+        theirs = np.stack([episode.at(k, f"obs/{name}") for k, _ in steps])
+        np.testing.assert_allclose(ours, theirs, atol=5e-3, err_msg=name)
+
+
 class FirstStepError(Exception):
     """The first stored step has been seen."""
 

@@ -38,6 +38,7 @@ class MemoryTask(BaseEnv):
         difficulty: `easy`, `medium` or `hard`; by default seed % 3 decides.
         recovery: `z` or `xy` draws the pick that a recovery demonstration fails once, and how.
         second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
+        robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's own words for `recovery`.
 
     Raises:
         UserError: an unknown difficulty or recovery mode, or a negative seed.
@@ -60,6 +61,8 @@ class MemoryTask(BaseEnv):
         difficulty: str | None = None,
         recovery: str | None = None,
         second_tries: bool = True,
+        robomme_failure_recovery: bool = False,
+        robomme_failure_recovery_mode: str | None = None,
         robot_uids: str | None = None,
         control_mode: str = "pd_joint_pos",
         **kwargs: Any,
@@ -68,6 +71,8 @@ class MemoryTask(BaseEnv):
             raise UserError(f"seed is {seed}; expected a non-negative integer.")
         if difficulty is not None and difficulty not in DIFFICULTIES:
             raise UserError(f"Unknown difficulty {difficulty!r}. {did_you_mean(str(difficulty), DIFFICULTIES)}")
+        if robomme_failure_recovery:
+            recovery = robomme_failure_recovery_mode or recovery or "none named"
         if recovery is not None and recovery not in RECOVERY_MODES:
             raise UserError(f"Unknown recovery mode {recovery!r}. {did_you_mean(str(recovery), RECOVERY_MODES)}")
         self.seed = seed

@@ -42,7 +42,7 @@ def demonstrate(env: "MemoryTask", demonstrator: Demonstrator, subtasks: Sequenc
             ended = _ended(env)
     finally:
         env.recording = recording
-    return env.progress.succeeded and not env.progress.failed
+    return env.success() and not env.progress.failed
 
 
 def _ended(env: "MemoryTask") -> bool:

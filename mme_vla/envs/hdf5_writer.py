@@ -49,8 +49,9 @@ class EpisodeWriter:
 
     def _write(self, group: Any, path: str, name: str, value: Any) -> None:
         if isinstance(value, str):
-            data = value.encode() if name in _BYTES else value
-            group.create_dataset(path, data=data, dtype=h5py.string_dtype())
+            # As in the official files; every text of the benchmark is ASCII.
+            encoding = "ascii" if name in _BYTES else "utf-8"
+            group.create_dataset(path, data=value.encode(encoding), dtype=h5py.string_dtype(encoding))
         elif isinstance(value, np.ndarray) and value.ndim == 3:
             group.create_dataset(path, data=value, compression="lzf")
         else:

@@ -144,9 +144,9 @@ class Highlight:
             self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
 
 
-def build_mark(env: "MemoryTask", name: str, radius: float, thickness: float) -> Disc:
+def build_mark(env: "MemoryTask", name: str, radius: float, half_length: float) -> Disc:
     """Red rings that cover a target's own, for `Mark`; metres."""
-    return build_highlight(env, name, radius, thickness / 2, COLOURS["red"], rings=True)
+    return build_highlight(env, name, radius, half_length, COLOURS["red"], rings=True)
 
 
 class Mark:
@@ -154,12 +154,12 @@ class Mark:
 
     Args:
         disc: what marks the target.
-        place: where the disc's centre lies while it is shown, [3].
+        place: the origin of what is marked, [3]; the disc's centre lies `Highlight.DEPTH` below it.
         steps: how long it stays, beside the step of the touch itself.
     """
 
     def __init__(self, disc: Thing, place: np.ndarray, steps: int) -> None:
-        self._disc, self._place, self._steps = disc, place, steps
+        self._disc, self._place, self._steps = disc, place - [0, 0, Highlight.DEPTH], steps
         self._until = -1
         self._shown = False
         self._move(BELOW_TABLE)

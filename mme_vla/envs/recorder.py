@@ -9,6 +9,7 @@ import numpy as np
 
 from mme_vla.envs.demonstration import demonstrate
 from mme_vla.envs.demonstrator import Demonstrator
+from mme_vla.envs.grasping import DOWNWARD_Q
 from mme_vla.envs.grounding import Grounding, project
 from mme_vla.envs.observations import AngleTrack, Include, Observer
 from mme_vla.envs.robot_control import PlanningError
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
 
 MAX_STEPS = 2000
 """Control steps after which a recording is given up."""
-SEAM = 5e-8  # rad
+SEAM, AT_REST = 5e-8, 1e-5  # rad
 GRIPPER_CLOSED = 0.03
 """Finger position below which the gripper counts as closed, metres."""
 
@@ -84,8 +85,9 @@ class Recorder:
         task.reset()
         self._observer.start()
         self._planned = Grounding(retry=False)
-        self._online = Grounding(retry=True)
+        self._online = Grounding(retry=False)  # unlike a running environment's, a file's text is made once
         self._action_angles = AngleTrack()
+        self._roll_shift: float | None = None
         self._waypoint: np.ndarray | None = None
         self._in_video: bool | None = None
         self._last_stored: str | int | None = None
@@ -112,7 +114,10 @@ class Recorder:
         self._enter_phase()
         angles = AngleTrack().follow(pose.q)
         # Straight down is a half turn either way: which one would be a matter of rounding.
-        angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
+        if np.array_equal(pose.q, DOWNWARD_Q):  # as over buttons
+            angles[0] = -np.pi
+        else:
+            angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
         self._waypoint = np.concatenate([pose.p, angles, [gripper]]).astype(np.float64)
 
     def _observe(self, evaluated: dict[str, Any]) -> None:
@@ -149,12 +154,15 @@ class Recorder:
         pose = self._demonstrator.arm.forward(action[:7])
         gripper = -1.0 if task.stick else float(action[7])
         angles = self._action_angles.follow(pose.q)
-        point = [int(v) for v in project(planned.targets[0].position)] if planned.choice and planned.targets else []
+        if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
+            self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
+        angles[0] += self._roll_shift
+        shown = project(planned.targets[0].position) if planned.choice and planned.targets else []
         return {
             "joint_action": np.append(action[:7], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
             "waypoint_action": np.full(7, np.nan, np.float32) if self._waypoint is None else self._waypoint,
-            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": point}),
+            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in shown]}),
         }
 
     def _texts(self, planned: "SubTask", shown: "SubTask") -> dict[str, Any]:

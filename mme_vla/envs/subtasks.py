@@ -59,8 +59,7 @@ class Progress:
         """Evaluate once; `failed` is what the task itself, whatever the sub-task, says of failure."""
         if not self._latch:
             self.failed = False
-        if self.succeeded:
-            self.failed = self.failed or failed
+        if self.succeeded:  # and stays so, whatever happens next
             return
         now = self.subtasks[self.index]
         self.failed = self.failed or failed or (now.failed is not None and now.failed())

@@ -11,7 +11,7 @@ from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import number, ordinal
 from mme_vla.envs.motions import Appear
 from mme_vla.envs.objects import Cube, H, build_board, build_button, build_cube
-from mme_vla.envs.placement import Region, draw_button, draw_cube
+from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task
@@ -50,6 +50,9 @@ class BinFill(MemoryTask):
             if place is not None:
                 cubes = self.cubes[colour]
                 cubes.append(self.add(build_cube(self, f"cube_{colour}_{len(cubes)}", colour, *place)))
+        for colour in COLOURS:
+            if len(self.cubes[colour]) < self.goal[colour]:
+                raise SceneError(f"BinFill, seed {self.seed}: a {colour} cube for the bin finds no place.")
 
     def _draw_counts(self, draws: Draws) -> None:
         """How many cubes of each colour belong into the bin, and how many lie on the table."""

@@ -62,7 +62,7 @@ class InsertPeg(MemoryTask):
         ]
         self.peg = self.pegs[0]
         self._disc = build_highlight(self, "disc", *MARK, APERTURE_COLOUR)
-        self._red_disc = build_mark(self, "disc_red", MARK[0] * 1.003, 2 * MARK[1] * 1.003)
+        self._red_disc = build_mark(self, "disc_red", MARK[0] * 1.003, MARK[1] * 1.003)
 
     def start_episode(self, draws: Draws) -> None:
         x, y = (-0.1 + 0.2 * draws.uniform() for _ in range(2))
@@ -75,7 +75,7 @@ class InsertPeg(MemoryTask):
         self.side = (-1, 1)[draws.integer(0, 2)]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
-        self.mark = Mark(self._red_disc, below, SHOWN_STEPS)
+        self.mark = Mark(self._red_disc, self.box.position, SHOWN_STEPS)
         self._helpful, self._restoring = 0, False
 
     def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
