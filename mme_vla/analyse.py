@@ -22,6 +22,7 @@ from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
+    from mme_vla.evaluation.analyses.recurrence import RecurrenceCurves
     from mme_vla.evaluation.analyses.rerun_log import RerunLog
     from mme_vla.policy import MMEPolicy
 
@@ -97,7 +98,11 @@ def recurrence(args: argparse.Namespace) -> None:
 
     policy, source, name = _subject(args)
     chosen = range(len(source)) if args.episodes is None else args.episodes
-    found = [recurrence_curves(policy, source, episode, args.stride) for episode in chosen]
+    with _rerun(args) as log:  # before the replays: a file that cannot be written is told at once
+        found = [recurrence_curves(policy, source, episode, args.stride) for episode in chosen]
+        if log is not None:
+            for curves in found:
+                _log_curves(log, source, curves)
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(recurrence_plot(found, f"{name} on {source.name}"), encoding="utf-8")
@@ -107,13 +112,6 @@ def recurrence(args: argparse.Namespace) -> None:
         for curves in found:
             for i, frame in enumerate(curves.frames):
                 writer.writerow([curves.episode, frame, *(f"{values[i]:.6g}" for values in curves.curves.values())])
-    with _rerun(args) as log:
-        if log is not None:
-            for curves in found:
-                for i, frame in enumerate(curves.frames.tolist()):
-                    log.views(source, curves.episode, frame)
-                    for key, values in curves.curves.items():
-                        log.number(f"recurrence/{key}", values[i])
     rows = [
         [str(c.episode), key, f"{values[0]:.4f}", f"{values[-1]:.4f}", f"{values.mean():.4f}"]
         for c in found
@@ -121,6 +119,13 @@ def recurrence(args: argparse.Namespace) -> None:
     ]
     _print(f"{name} on {source.name}", ["episode", "", "first frame", "last frame", "mean"], rows)
     print(f"wrote {path} and {path.with_suffix('.csv')}")
+
+
+def _log_curves(log: "RerunLog", source: "EpisodeSource", curves: "RecurrenceCurves") -> None:
+    for i, frame in enumerate(curves.frames.tolist()):
+        log.views(source, curves.episode, frame)
+        for key, values in curves.curves.items():
+            log.number(f"recurrence/{key}", values[i])
 
 
 def selection(args: argparse.Namespace) -> None:

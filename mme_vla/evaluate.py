@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config import cli, log_to_terminal
+from mme_vla.devices import find_device
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.loading import find_device, load_policy, words_of
+from mme_vla.loading import load_policy, words_of
 
 if TYPE_CHECKING:
     import torch
 
     from mme_vla.evaluation.rollout_run import Evaluation
     from mme_vla.policy import MMEPolicy
-    from mme_vla.subgoal import SubgoalPredictor
+    from mme_vla.subgoal import SubgoalPredictor, Usage
 
 # Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -53,7 +54,7 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
-    subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]))
+    subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]), device)
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
         None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
@@ -76,6 +77,7 @@ def main(cfg: DictConfig) -> None:
         raise SystemExit(130) from None
     finally:
         if subgoals is not None:
+            report_usage(subgoals.usage)
             subgoals.close()
     report(done, output)
 
@@ -91,12 +93,16 @@ def choose_device(name: str) -> "torch.device":
 
 
 def choose_subgoals(
-    policy: "MMEPolicy", section: dict[str, Any] | None, mode: str = "inline"
+    policy: "MMEPolicy",
+    section: dict[str, Any] | None,
+    mode: str = "inline",
+    device: "torch.device | None" = None,
 ) -> "SubgoalPredictor | None":
     """The predictor, saying the kind of subgoal the policy was trained with unless the command line names one.
 
     Args:
         section: the section `subgoal` of the configuration. mode: `inline`, or `background`.
+        device: the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the predictor.
 
     Raises:
         UserError: an unknown predictor, option or mode, or a policy that reads no subgoal, or another kind.
@@ -114,6 +120,8 @@ def choose_subgoals(
     kind = subgoal_kind(policy)
     if kind is not None and not words_of("subgoal.kind"):
         section = {**section, "kind": kind.removesuffix("_subgoal")}
+    if device is not None and section.get("device") == "auto":
+        section = {**section, "device": str(device)}
     predictor = build_predictor(section)
     check_subgoals(policy, predictor)
     return BackgroundPredictor(predictor) if predictor is not None and mode == "background" else predictor
@@ -151,6 +159,19 @@ def report(done: "Evaluation", output: Path) -> None:
     if any(record.outcome == "error" for record in done.records):
         logger.warning("some episodes ended in an error: the same command tries them again")
     logger.info("python -m mme_vla.results %s", output)
+
+
+def report_usage(usage: "Usage") -> None:
+    """Say in one line what a predictor did, as far as it did anything."""
+    counts = {
+        "calls": usage.calls, "answers from the cache": usage.cached, "retries": usage.retries,
+        "tokens read": usage.input_tokens, "tokens written": usage.output_tokens,
+        **{f"{problem} answers": count for problem, count in usage.problems.items()},
+    }  # fmt: skip
+    words = [f"{count:,} {what}" for what, count in counts.items() if count]
+    words += [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
+    if words:
+        logger.info("subgoals: %s", ", ".join(words))
 
 
 def _end_on_sigterm() -> None:

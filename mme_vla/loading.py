@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from omegaconf import DictConfig
 
+from mme_vla.devices import find_device
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
@@ -13,7 +14,18 @@ if TYPE_CHECKING:
 
     from mme_vla.policy import MMEPolicy
 
-_GROUPS = ("model", "backbone", "memory", "integration", "processor")
+# What a checkpoint brings along, so that it cannot be set beside one.
+_MODEL_KEYS = (
+    "name",
+    "model",
+    "backbone",
+    "memory",
+    "integration",
+    "policy",
+    "processor",
+    "subgoal_text",
+    "token_budget",
+)
 
 
 class LoadedPolicy(NamedTuple):
@@ -34,14 +46,14 @@ def load_policy(
         verb: what the command does with it, for messages. device: instead of the configured one.
 
     Raises:
-        UserError: neither a checkpoint nor a model is named, or both, or there is no such device.
+        UserError: neither a checkpoint nor a model is named, or both (or a part of one), or there is no such device.
     """
     from mme_vla.build import build_from_config
     from mme_vla.policy import MMEPolicy
     from mme_vla.training.checkpoint import resolve_checkpoint
 
     device = find_device(cfg.device) if device is None else device
-    named = words_of(*_GROUPS)
+    named = words_of(*_MODEL_KEYS)
     if cfg.checkpoint is not None:
         if named:
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
@@ -63,25 +75,6 @@ def load_policy(
     policy.require_processor().stats = unit_stats()
     logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
     return LoadedPolicy(policy, str(cfg.name), None)
-
-
-def find_device(name: str) -> "torch.device":
-    """The device of that name; `auto`: a GPU where there is one.
-
-    Raises:
-        UserError: it is no device, or not here.
-    """
-    import torch
-
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    try:
-        device = torch.device(name)
-    except RuntimeError:
-        raise UserError(f"device={name!r} is not a device; choose auto, cpu, cuda or cuda:<number>.") from None
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"device={name}: PyTorch sees no GPU here; use device=cpu.")
-    return device
 
 
 def words_of(*keys: str) -> list[str]:

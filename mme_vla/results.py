@@ -6,13 +6,12 @@ RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or be
 import argparse
 import sys
 from collections.abc import Sequence
-from itertools import combinations
 from pathlib import Path
 
 from mme_vla.config import print_user_errors
 from mme_vla.errors import UserError
-from mme_vla.evaluation.aggregate import Results, aggregate
-from mme_vla.evaluation.compare import Comparison, compare_all
+from mme_vla.evaluation.aggregate import Method, Results, aggregate
+from mme_vla.evaluation.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.demo import demo_records
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.scopes import Protocol
@@ -115,10 +114,17 @@ def _tables(results: Results, comparisons: list[Comparison], detailed: bool = Tr
     return [*tables, comparison_table(comparisons)] if comparisons else tables
 
 
-def _pairs(results: Results, asked: Sequence[Sequence[str]] | None) -> list:
+def _pairs(results: Results, asked: Sequence[Sequence[str]] | None) -> list[tuple[Method, Method]]:
+    """The pairs asked for; unasked, two methods alone where they share episodes, and otherwise a note."""
     if asked is not None:
         return [(results.method(first), results.method(second)) for first, second in asked]
-    return list(combinations(results.methods, 2)) if len(results.methods) == 2 else []
+    if len(results.methods) != 2:
+        return []
+    first, second = results.methods
+    if common_episodes(first, second):
+        return [(first, second)]
+    results.notes.append(f"{first.label} and {second.label} have no episode in common, and are not compared.")
+    return []
 
 
 def _parser() -> argparse.ArgumentParser:

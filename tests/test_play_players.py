@@ -58,8 +58,11 @@ def test_the_last_object_of_an_answer_counts(answer, choice, point):
         ('{"choice": "a", "point": [1, true]}', "two numbers"),
         ('{"choice": "a", "point": [1, NaN]}', "two numbers"),
         ('{"choice": "a", "point": [1, 1001]}', "within 0 and 1000"),
+        ('{"choice": "a", "point": [1, 1' + 400 * "0" + "]}", "within 0 and 1000"),
+        ('{"choice": "a", "point": [1, ' + 5000 * "9" + "]}", "no JSON object"),
+        ('{"choice": "a", "point": ' + 100_000 * "[" + 100_000 * "]" + "}", "no JSON object"),
     ],
-)
+)  # the long ones are more than Python reads
 def test_an_answer_that_cannot_be_used_says_why(answer, reason):
     with pytest.raises(MalformedAnswer, match=reason):
         parse_choice(answer, OPTIONS)

@@ -12,6 +12,7 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import read_records
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.play import ChoiceSession, RandomPlayer, Reveal
+from mme_vla.play.__main__ import _by_itself, line
 from mme_vla.play.players import play
 from mme_vla.play.run import Identity, PlayRun, choose_episodes
 
@@ -241,3 +242,71 @@ def test_episodes_are_named_in_several_ways():
 def test_episodes_that_are_not_there_are_refused(words, message):
     with pytest.raises(UserError, match=message):
         choose_episodes(*words)
+
+
+def test_records_of_runs_below_the_folder_are_not_its_own(tmp_path):
+    with a_run(tmp_path / "below") as other:
+        other.save(play(other.make(other.todo[0]), RandomPlayer()))
+    with a_run(tmp_path) as run:
+        assert (run.records, [which.episode for which in run.todo]) == ([], [0, 1])
+
+
+class Collapsing(BlocksEnv):
+    """Breaks in one of its methods."""
+
+    def __init__(self, place):
+        super().__init__()
+        self.place = place
+
+    def _break(self, place):
+        if place == self.place:
+            raise RuntimeError(f"the scene fell apart in {place}")
+
+    def reset(self):
+        self._break("reset")
+        return super().reset()
+
+    def step(self, action):
+        self._break("step")
+        return super().step(action)
+
+    def close(self):
+        self._break("close")
+        super().close()
+
+
+def breaking_run(folder, places):
+    def make(which):
+        place = places[which.episode]
+        if place == "make":
+            raise RuntimeError("no scene for this seed")
+        return ChoiceSession(Collapsing(place), which)
+
+    return PlayRun(folder, [an_episode(n) for n in range(len(places))], Identity("random", 0, 0, 1300, {}), make)
+
+
+def test_an_episode_that_breaks_is_recorded_as_an_error_and_the_others_are_played(tmp_path):
+    places = ["make", "", "reset", "step", "close", ""]
+    with breaking_run(tmp_path, places) as run:
+        _by_itself(run, RandomPlayer())
+        assert run.todo == []
+    records = read_records(tmp_path / "episodes.jsonl")
+    assert [(r.episode, r.outcome == "error" and r.error != "no path") for r in records] == [
+        (n, place in ("make", "reset", "step")) for n, place in enumerate(places)
+    ]
+    assert records[0].error == "RuntimeError: no scene for this seed"
+    assert records[3].error == records[3].extra["ended_by"] == "RuntimeError: the scene fell apart in step"
+    assert (records[0].seed, records[0].extra["decisions"]) == (560000, [])
+    assert "no scene for this seed" in line(records[0])
+    with breaking_run(tmp_path, places) as run:  # the same command again does not stumble over them
+        assert run.todo == []
+
+
+def test_a_mistake_of_the_user_ends_the_run(tmp_path):
+    def make(which):
+        raise UserError("No Vulkan driver here.")
+
+    with PlayRun(tmp_path, [an_episode()], Identity("random", 0, 0, 1300, {}), make) as run:
+        with pytest.raises(UserError, match="Vulkan"):
+            _by_itself(run, RandomPlayer())
+        assert run.todo == [an_episode()]

@@ -172,3 +172,28 @@ def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:
     path.write_text("{")
     with pytest.raises(UserError, match="damaged"):
         read_run(tmp_path)
+
+
+def test_a_run_begins_and_resumes_where_there_are_no_hard_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_links(*_: object) -> None:
+        raise PermissionError("Operation not permitted")
+
+    monkeypatch.setattr("os.link", no_links)
+    first = claim_run(tmp_path, {"a": 1})
+    assert claim_run(tmp_path, {"a": 1}) == first == read_run(tmp_path)
+    with pytest.raises(UserError, match="a was 1, is 2"):
+        claim_run(tmp_path, {"a": 2})
+    assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
+
+
+def test_processes_of_one_number_on_two_hosts_do_not_share_a_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    linked = []
+    monkeypatch.setattr("os.getpid", lambda: 1)
+    monkeypatch.setattr("os.link", lambda source, _: linked.append(source))
+    for _ in range(2):
+        claim_run(tmp_path, {"a": 1})
+    assert len(set(linked)) == 2

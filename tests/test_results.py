@@ -20,8 +20,8 @@ from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.run_file import claim_run
 from mme_vla.evaluation.scopes import Protocol
-from mme_vla.evaluation.submission import policy_facts
-from mme_vla.evaluation.tables import leaderboard, overview, to_csv, to_latex, to_markdown
+from mme_vla.evaluation.submission import policy_facts, training_details
+from mme_vla.evaluation.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
 from mme_vla.evaluation.tasks import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES
 from mme_vla.results import main
 
@@ -345,3 +345,39 @@ def test_the_demo_draws_around_the_papers_rates(demo: Results) -> None:
     method = demo.method("groundsg+qwenvl")
     assert method.average.mean == pytest.approx(32.7, abs=2)
     assert json.loads(demo_records([("pi05", None)], episodes=1)[0].to_json())["extra"] == {"made_up": True}
+
+
+def test_two_methods_without_a_common_episode_are_shown_and_refused_only_when_asked_to_be_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for made in [*records("pi05", {"BinFill": [1, 0]}), *records("ttt_modul", {"MoveCube": [1, 1]})]:
+            log.append(made)
+    options = [str(tmp_path), "--tasks", "BinFill", "MoveCube", "--episodes", "2", "--samples", "20", "--brief"]
+    main(options)
+    printed = capsys.readouterr().out
+    assert "incomplete (2 of 4)" in printed
+    assert "pi05 and ttt_modul have no episode in common, and are not compared." in printed
+    with pytest.raises(SystemExit) as ended:
+        main([*options, "--compare", "pi05", "ttt_modul"])
+    assert ended.value.code == 2
+    assert "nothing to pair" in capsys.readouterr().err
+
+
+def test_latex_escapes_comparison_signs() -> None:
+    assert r"$<$ 0.001 $>$" in to_latex(Table("p", ["p"], [["< 0.001 >"]]))
+
+
+@pytest.mark.parametrize(
+    ("config", "said"),
+    [
+        ({"memory": {"name": "ttt"}, "card": {"recipe": {"lr": "1e-4", "steps": 5}}}, "peak learning rate 1e-4"),
+        ({"memory": {"budget": 64}, "card": {"recipe": {}}}, "memory without a name, 64 tokens"),
+        ({"memory": "ttt", "integration": "expert", "card": "by hand"}, "memory ttt, integration expert"),
+        ({"card": {"recipe": "as released"}}, "training: as released"),
+    ],
+)
+def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(config: dict[str, object], said: str) -> None:
+    methods = aggregate(records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]}), SMALL).methods
+    run = {"settings": {"model": "a", "checkpoint": 100}, "notes": {"policy": policy_facts(config)}}
+    assert said in training_details(methods, [run])

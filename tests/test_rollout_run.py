@@ -17,7 +17,7 @@ from rollout_stand_ins import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole
 
 from mme_vla import UserError
 from mme_vla.envs.vector_jobs import Job
-from mme_vla.evaluate import choose_device, choose_subgoals
+from mme_vla.evaluate import choose_device
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout_plan import Shard, choose_episodes, choose_shard, take_share
@@ -111,6 +111,25 @@ def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monke
         whole_run(quick_policy("pi05"), tmp_path, execute=8)
     with pytest.raises(UserError, match=r"policy was"):
         whole_run(quick_policy("framesamp_modul"), tmp_path)
+
+
+def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import mme_vla.evaluation.rollout_run as module
+
+    monkeypatch.setattr(module, "VecEnv", inline)
+    policy = quick_policy("pi05")
+    settings = RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
+    for folder in (tmp_path / "runs" / "seed7", tmp_path / "runs"):  # the second lies above the first
+        done = module.evaluate(policy, JOBS[:1], folder, FACTS, settings, base=make_far_env, shown=False)
+        assert done.workload.batches > 0 and len(done.records) == 1
+    foreign = tmp_path / "runs" / "episodes-foreign.jsonl"
+    other = EpisodeRecord("tiny", "untrained", 7, "PickXtimes", 1, 1, "easy", "success", 5)
+    foreign.write_text(other.to_json() + "\n")
+    done = module.evaluate(policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_far_env, shown=False)
+    assert done.workload.batches > 0 and {record.model_seed for record in done.records} == {42}
+    assert module.evaluate(
+        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_far_env, shown=False
+    ).workload.batches == 0  # fmt: skip
 
 
 def test_shards_side_by_side_make_the_whole_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -230,15 +249,6 @@ def test_a_caption_stands_below_the_pictures() -> None:
     assert told[64:].max() > 200 and bare[64:].max() == 0
     demo = compose_frame(front, wrist, None, demo=True)
     assert (demo[:BORDER, :128] == RED).all() and (demo[BORDER : 64 - BORDER, BORDER : 128 - BORDER].max() <= 9)
-
-
-def test_subgoals_and_policies_must_go_together(caplog: pytest.LogCaptureFixture) -> None:
-    oracle = {"name": "oracle", "kind": "grounded", "interval": 1}
-    assert choose_subgoals(quick_policy("simplesg"), oracle).kind == "simple", "the policy's own kind"
-    with pytest.raises(UserError, match="reads no subgoal"):
-        choose_subgoals(quick_policy("pi05"), oracle)
-    assert choose_subgoals(quick_policy("simplesg"), None) is None
-    assert "plain prompt" in caplog.text
 
 
 def test_runs_find_their_folder_by_what_they_are() -> None:

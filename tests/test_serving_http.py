@@ -1,14 +1,17 @@
 """The HTTP form of the protocol on the same port, and the command that serves."""
 
+import asyncio
 import http.client
 import json
 import logging
 import os
+import re
 import signal
 import socket
 import subprocess
 import sys
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from mme_vla.config import compose
 from mme_vla.errors import UserError
 from mme_vla.loading import load_policy
 from mme_vla.serving import Client, Limits, pack, unpack
+from mme_vla.serving.web import BadRequestError, HttpRequest
 
 LOGGER = logging.getLogger(__name__)
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}
@@ -211,3 +215,51 @@ def test_the_command_loads_a_checkpoint(policy, tmp_path):
     assert name == "tokendrop_expert"
     parts = course(rounds=0)
     np.testing.assert_array_equal(acted_directly(loaded, parts)[0], acted_directly(policy, parts)[0])
+
+
+def test_a_new_session_takes_the_place_of_the_longest_silent(served):
+    http, settings = served.server._http, served.server.settings
+    http.sessions.clear()
+    names = [("127.0.0.1", str(i)) for i in range(settings.limits.connections)]
+    kept = {name: http._session(name) for name in names}
+    kept[names[0]].requests = 1  # at work
+    kept[names[3]].used -= 100
+    newcomer = ("127.0.0.1", "new")
+    http._session(newcomer)
+    assert set(http.sessions) == {*names, newcomer} - {names[3]}
+    for name in names:
+        kept[name].requests = 1
+    http.sessions[newcomer].requests = 1
+    with pytest.raises(BadRequestError, match="at work"):
+        http._session(("127.0.0.1", "another"))
+    http.sessions.clear()
+
+
+def test_a_refused_request_that_waited_does_not_end_the_session_begun_meanwhile(served):
+    http, key = served.server._http, ("127.0.0.1", "twice")
+
+    async def meet():
+        first = http._session(key)
+        request = HttpRequest("POST", "/infer", {"x-session": "twice"}, "127.0.0.1", b"garbage")
+        await first.turn.acquire()
+        waiting = asyncio.ensure_future(http._answer(request))
+        await asyncio.sleep(0)
+        assert first.requests == 1
+        del http.sessions[key]  # as an error of the request before it does
+        second = http._session(key)
+        first.turn.release()
+        assert (await waiting).status == 400
+        return http.sessions.pop(key) is second
+
+    assert served.on_loop(meet())
+
+
+@pytest.mark.parametrize(
+    "word", ["policy.compute_dtype=bfloat16", "policy.history_dtype=float32", "token_budget=64", "+subgoal_text.kind=x"]
+)
+def test_what_a_checkpoint_brings_cannot_be_set_beside_it(word, monkeypatch):
+    overrides = SimpleNamespace(overrides=SimpleNamespace(task=["checkpoint=x", word]))
+    monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.initialized", lambda: True)
+    monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.get", lambda: overrides)
+    with pytest.raises(UserError, match=f"leave out {re.escape(word)}"):
+        load_policy(compose("serve", ["checkpoint=x"]), "serve", LOGGER)

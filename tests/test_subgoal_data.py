@@ -219,3 +219,25 @@ def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
     assert found["per_device_train_batch_size"] * found["gradient_accumulation_steps"] * 4 == 64
     page = (REPOSITORY / "docs" / "subgoals.md").read_text().replace(" \\\n ", "")
     assert command("grounded") in page and command("grounded").endswith("swift sft swift_grounded.json")
+
+
+def test_settings_that_cannot_work_are_named(tmp_path):
+    from mme_vla.config import compose
+
+    listed = tmp_path / "list.json"
+    listed.write_text("[1]")
+    for word, said in (
+        ("episodes=2", "episodes=2 must be a list of whole numbers"),
+        ("episodes=[a]", "must be a list of whole numbers"),
+        ("noise=[a,b]", "must be a list of whole numbers"),
+        ("noise=3", "noise=3 must be a list"),
+        ("noise=[1,0]", "noise"),
+        ("sets=simple", "sets=simple must be a list of words"),
+        ("seed=-1", "seed=-1"),
+    ):
+        with pytest.raises(UserError, match=said):
+            module.run(compose("subgoal_build", ["input=sample", f"output={tmp_path / 'out'}", word]))
+    for tasks in (tmp_path / "missing.json", tmp_path, listed):
+        with pytest.raises(UserError, match="tasks="):
+            open_input("sample", tasks)
+    assert not (tmp_path / "out").exists()

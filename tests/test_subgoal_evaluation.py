@@ -21,6 +21,7 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.report import html_report
 from mme_vla.evaluation.scopes import Protocol
 from mme_vla.evaluation.subgoal_score import SubgoalScore, point_distances, subgoal_table, total_score
+from mme_vla.evaluation.subgoal_trace import SubgoalTrace
 from mme_vla.subgoal import BackgroundPredictor, Subgoal, SubgoalPredictor, build_predictor
 from mme_vla.subgoal.parsing import points_of
 
@@ -53,6 +54,7 @@ def test_every_subgoal_is_written_down_with_its_time_and_picture(tmp_path: Path)
     assert [line["text"] for line in written] == ["Push at <3, 13>.", "Push at <19, 13>.", "pull"]
     assert [line["oracle"] for line in written] == ["push at <0, 9>", "push at <16, 9>", "push at <32, 9>"]
     assert [line["answer"] for line in written] == ["answer 0", "answer 16", "answer 32"]
+    assert [line["asked_step"] for line in written] == [0, 16, 32]
     assert all(line["asked"] and line["latency_s"] >= 0 for line in written)
     assert 0 < written[0]["seconds"] < written[1]["seconds"] < written[2]["seconds"] < record.seconds.total
     for line in written:
@@ -119,8 +121,8 @@ def test_results_tell_right_subgoals_and_distances_by_task() -> None:
 class Slow(SubgoalPredictor):
     """Answers only when told to; keeps what it was asked."""
 
-    def __init__(self) -> None:
-        super().__init__("simple")
+    def __init__(self, interval: int = 1) -> None:
+        super().__init__("simple", interval)
         self.go, self.asked = threading.Semaphore(0), []
         self.error: Exception | None = None
         self.seen: list[int] = []
@@ -174,6 +176,29 @@ def test_in_the_background_only_the_first_subgoal_is_waited_for() -> None:
     predictor.close()
 
 
+def test_a_question_that_came_due_while_the_thread_was_busy_is_asked_once_it_is_free() -> None:
+    slow = Slow(interval=48)
+    predictor = BackgroundPredictor(slow)
+    first, second = predictor.start_episode("A"), predictor.start_episode("B")
+    for episode in (first, second):
+        episode.observe(frames(0, 1))
+    slow.go.release()
+    predictor.predict([first, second])
+    for _ in range(3):
+        first.observe(frames(0, 16))
+    predictor.predict([first])  # asked at 48, and the thread stays busy
+    for _ in range(4):
+        second.observe(frames(0, 16))
+    assert predictor.predict([second]) == [Subgoal("b 0")], "due since 48"
+    slow.go.release(2)
+    settle(predictor)
+    predictor.predict([second])
+    settle(predictor)
+    assert slow.asked == [[("a", 0), ("b", 0)], [("a", 48)], [("b", 64)]]
+    assert predictor.predict([second]) == [Subgoal("b 64", asked=True)] and second.asked_step == 64
+    predictor.close()
+
+
 def test_what_waits_for_the_thread_is_asked_in_one_batch() -> None:
     slow = Slow()
     predictor = BackgroundPredictor(slow)
@@ -217,6 +242,15 @@ def test_a_rollout_with_a_predictor_in_the_background_ends_like_any_other(tmp_pa
     assert {record.extra["subgoals"]["chunks"] for record in records} == {3}
     with pytest.raises(UserError, match="subgoal_mode='behind'"):
         choose_subgoals(quick_policy("groundsg"), {"name": "oracle"}, "behind")
+
+
+def test_a_folder_left_by_another_process_does_not_stop_a_trace(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "VideoUnmask_ep0").mkdir()
+    monkeypatch.setattr("mme_vla.evaluation.subgoal_trace.shutil.rmtree", lambda *_, **__: None)
+    SubgoalTrace("simple", tmp_path, "VideoUnmask_ep0")
+    assert (tmp_path / "VideoUnmask_ep0.jsonl").read_bytes() == b""
 
 
 TINY_VLM = ["subgoal=qwenvl", "subgoal.model=tiny", "subgoal.device=cpu", "subgoal.max_new_tokens=8"]

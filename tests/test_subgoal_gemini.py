@@ -4,10 +4,9 @@ import json
 import logging
 import sys
 import time
-from types import SimpleNamespace
 
-import numpy as np
 import pytest
+from subgoal_fakes import ApiError, Client, frames, kinds, play, predictor_of, response, says, started
 
 from mme_vla.errors import UserError
 from mme_vla.subgoal import Gemini
@@ -18,77 +17,9 @@ from mme_vla.subgoal.gemini_prompts import VOCABULARY, gemini_system
 SECRET = "AIza-not-a-real-key"
 
 
-class ApiError(Exception):
-    """Looks like google-genai's."""
-
-    def __init__(self, code, message=""):
-        super().__init__(f"{code} {message}")
-        self.code = code
-
-
-def response(text, *, finish="STOP", blocked=None):
-    return SimpleNamespace(
-        text=text,
-        usage_metadata=SimpleNamespace(prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80),
-        candidates=[SimpleNamespace(finish_reason=SimpleNamespace(name=finish))],
-        prompt_feedback=SimpleNamespace(block_reason=blocked),
-    )
-
-
-def says(subgoal):
-    return response(f'```json\n{{"description": "x",\n "subgoal": "{subgoal}"}}\n```')
-
-
-class Client:
-    """Has google-genai's interface; answers with these outcomes in turn (exceptions are raised, functions called)."""
-
-    def __init__(self, *outcomes):
-        self.outcomes, self.asked = list(outcomes), []
-        self.models = self
-
-    def generate_content(self, *, model, contents, config):
-        self.asked.append((contents, config))
-        outcome = self.outcomes.pop(0)
-        if callable(outcome):
-            outcome = outcome()
-        if isinstance(outcome, Exception):
-            raise outcome
-        return outcome
-
-
 @pytest.fixture(autouse=True)
 def secret(monkeypatch):
     monkeypatch.setenv("GEMINI_API_KEY", SECRET)
-
-
-def predictor_of(*outcomes, **options):
-    client = Client(*outcomes)
-    return Gemini(client=client, **{"backoff": 0, "requests_per_minute": None, **options}), client
-
-
-def frames(count, first=0):
-    return np.stack([np.full((32, 32, 3), (first + t) % 256, np.uint8) for t in range(count)])
-
-
-def started(predictor, task="StopCube", video=0):
-    episode = predictor.start_episode("stop the cube", frames(video) if video else None, task)
-    episode.observe(frames(1))
-    return episode
-
-
-def play(predictor, episode, chunks):
-    """Predict, then execute 16 actions; returns the subgoals and the steps at which the model was asked."""
-    said, asked = [], []
-    for _ in range(chunks):
-        subgoal = predictor.predict([episode])[0]
-        said.append(subgoal)
-        asked += [episode.step] if subgoal.asked else []
-        episode.observe(frames(16, episode.frames_seen))
-    return said, asked
-
-
-def kinds(parts):
-    return [part["inline_data"]["mime_type"] if "inline_data" in part else "text" for part in parts]
 
 
 def test_questions_come_at_their_steps_and_late_tasks_wait():

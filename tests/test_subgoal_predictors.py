@@ -238,3 +238,62 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
             parameters = inspect.signature(one).parameters.values()
             defaults |= {p.name: p.default for p in parameters if p.kind is not p.VAR_KEYWORD}
         assert {k: v for k, v in defaults.items() if k not in ("vlm", "client")} == keys
+
+
+def steps_asked(predictor, execute, chunks, task=""):
+    episode = at_start(predictor, task=task)
+    asked = []
+    for _ in range(chunks):
+        asked += [episode.step] if predictor.predict([episode])[0].asked else []
+        advance(episode, execute)
+    return asked
+
+
+@pytest.mark.parametrize(
+    ("interval", "execute", "expected"),
+    [
+        (48, 20, [0, 60, 100, 160]),
+        (48, 16, [0, 48, 96, 144]),
+        (16, 16, [*range(0, 160, 16)]),
+        (1, 16, [*range(0, 160, 16)]),
+    ],
+)
+def test_no_question_is_dropped_whatever_the_length_of_a_chunk(interval, execute, expected):
+    predictor = QwenVL("simple", interval=interval, vlm=Scripted(*["a"] * 10))
+    assert steps_asked(predictor, execute, -(-160 // execute) + (execute == 20)) == expected
+
+
+def test_what_came_due_while_a_subgoal_was_held_is_left_out():
+    predictor = QwenVL("simple", interval=48, vlm=Scripted("press", "pick", "put"))
+    assert steps_asked(predictor, 16, 12, "ButtonUnmask") == [0, 96, 144]
+    predictor = QwenVL("simple", interval=32, vlm=Scripted(*["press the first button"] * 3))
+    assert steps_asked(predictor, 16, 9, "ButtonUnmaskSwap") == [0, 128], "112 would answer what came due at 96"
+
+
+def test_an_episode_that_is_joined_late_is_asked_at_once():
+    predictor = QwenVL("simple", interval=48, vlm=Scripted("a"))
+    episode = predictor.start_episode("goal")
+    episode.observe(frames(21))
+    assert predictor.predict([episode])[0].asked and episode.asked_step == 20
+
+
+def test_a_predictor_knows_the_plain_options_it_was_built_from():
+    section = {"name": "memer", "kind": "simple", "recent": 4, "vlm": Scripted()}
+    assert build_predictor(section).settings == {"kind": "simple", "recent": 4}
+    assert Oracle().settings == {}
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        ({"device": "gpu"}, "device='gpu'"),
+        ({"device": "cuda:99"}, "device=cuda:99"),
+        ({"dtype": "float8"}, "dtype='float8'"),
+        ({"dtype": "nn"}, "dtype='nn'"),
+        ({"batch_size": 0}, "batch_size=0"),
+        ({"max_new_tokens": 0}, "max_new_tokens=0"),
+    ],
+)
+def test_options_of_a_model_that_cannot_work_are_named(options, named):
+    with pytest.raises(UserError, match=named):
+        build_predictor({"name": "qwenvl", "model": "tiny", "device": "cpu", **options})

@@ -165,7 +165,7 @@ def test_coordinates_go_there_and_back():
         write_boxes("a <bbox>", [])
 
 
-def test_holding_rules_of_the_four_tasks():
+def test_holding_rules_of_the_three_tasks():
     assert [hold_until(t, None) for t in ("ButtonUnmask", "PickHighlight", "ButtonUnmaskSwap", "BinFill")] == [
         90,
         90,
@@ -189,3 +189,29 @@ def test_the_room_is_imported_without_any_language_model():
     code += "from mme_vla.subgoal import build_predictor\nassert build_predictor({'name': 'oracle'}).kind == 'grounded'"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
+
+
+DIGITS = "9" * 5000  # more than Python turns into a number
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda: parse_subgoal(f"pick at <|box_start|>({DIGITS},1)<|box_end|>"),
+        lambda: parse_memer(f'{{"current_subtask": "a", "keyframe_positions": [{DIGITS}]}}', 8),
+        lambda: parse_memer('{"current_subtask": ' + "[" * 200_000 + "]" * 200_000 + "}", 8),
+        lambda: parse_memer(r'{"current_subtask": "a \ud800"}', 8),
+        lambda: parse_gemini(f'{{"subgoal" : {DIGITS}}}'),
+        lambda: parse_gemini('{"subgoal": ' + "[" * 200_000 + "]" * 200_000 + "}"),
+        lambda: pixels_of_pairs(f"move to <{DIGITS}, 3>"),
+    ],
+    ids=["box", "position", "deep", "half a character", "number", "deep gemini", "pair"],
+)
+def test_answers_that_python_itself_cannot_read_are_malformed(read):
+    with pytest.raises(MalformedAnswer):
+        read()
+
+
+def test_numbers_too_long_for_a_point_are_no_point():
+    text = f"pick at <{DIGITS}, 1>"
+    assert mark_points(text) == (text, [])

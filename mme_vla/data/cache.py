@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
@@ -268,12 +269,9 @@ def run(cfg: "DictConfig") -> None:
 
 def _device(name: str) -> torch.device:
     """`auto` and `cuda` mean this process's own GPU under torchrun."""
-    if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
-    device = torch.device(name)
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise UserError(f"device={name}: PyTorch sees no GPU here; use device=cpu.")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0"))) if name == "cuda" else device
+    device = find_device(name)
+    own = int(os.environ.get("LOCAL_RANK", "0"))
+    return torch.device("cuda", own) if device.type == "cuda" and device.index is None else device
 
 
 def main() -> None:

@@ -49,6 +49,8 @@ class MemoryTask(BaseEnv):
     """The robot holds a stick instead of a gripper."""
     shared_draws: ClassVar[bool] = False
     """`plan`, `build` and `start_episode` draw from one generator; otherwise `plan` has one of its own."""
+    spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
+    """From where, and to where, the camera for people looks; no policy sees its pictures."""
     latch_failure: ClassVar[bool] = False
     """A failure lasts; otherwise it is judged anew at each step."""
     recovery_drawn_per_episode: ClassVar[bool] = False
@@ -252,5 +254,6 @@ class MemoryTask(BaseEnv):
 
     @property
     def _default_human_render_camera_configs(self) -> Sequence[CameraConfig]:
-        pose = sapien_utils.look_at(eye=[0.6, 0.7, 0.6], target=[0, 0, 0.35])
+        eye, target = self.spectator
+        pose = sapien_utils.look_at(eye=eye, target=target)
         return [CameraConfig("render_camera", pose, 512, 512, 1, 0.01, 100)]

@@ -157,7 +157,7 @@ class Recorder:
         if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
-        shown = project(planned.targets[0].position) if planned.choice and planned.targets else []
+        shown = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
         return {
             "joint_action": np.append(action[:7], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),

@@ -65,6 +65,11 @@ def compare_all(pairs: Sequence[tuple[Method, Method]], protocol: Protocol) -> l
     return [replace(c, corrected=p, significant=p < level) for c, p in zip(made, corrected, strict=True)]
 
 
+def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
+    """The episodes that every run of both methods has."""
+    return set.intersection(*(set(run.records) for method in (first, second) for run in method.runs))
+
+
 def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     """Compare two methods.
 

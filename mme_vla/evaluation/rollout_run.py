@@ -9,8 +9,8 @@ from mme_vla.envs.make import make_env
 from mme_vla.envs.vector import VecEnv
 from mme_vla.envs.vector_jobs import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import RecordLog, find_records, read_records
-from mme_vla.evaluation.records import EpisodeRecord, finished, merge
+from mme_vla.evaluation.record_log import RecordLog, read_records
+from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout import Rollout, RunFacts, Workload
 from mme_vla.evaluation.rollout_env import make_rollout_env
 from mme_vla.evaluation.rollout_plan import Shard, take_share
@@ -25,6 +25,9 @@ from mme_vla.subgoal.background import BackgroundPredictor
 
 USUAL_BUDGET = 512
 VIDEOS = "videos"
+INDIFFERENT = ("name", "workers", "batch_size", "device", "cache", "key_variable", "timeout", "retries", "backoff",
+               "requests_per_minute", "input_price", "output_price")  # fmt: skip
+"""A predictor's options that do not decide what it says (its name is kept anyway)."""
 
 
 class Evaluation(NamedTuple):
@@ -69,14 +72,14 @@ def evaluate(
     shard = shard or Shard()
     mine = take_share(jobs, shard)
     with RecordLog(output / shard.file) as log:
-        done = _done(output, mine)
+        done = _done(output, mine, facts)
         missing = [job for job in mine if (job.task, job.episode) not in finished(done)]
         kept = [record for record in done if record.outcome != "error"]
         with RolloutProgress(len(mine), kept, shown) as progress:
             if kept:
                 progress.say(f"{output} holds {len(kept)} of {len(mine)} episodes: going on with the others")
             workload = _run(policy, missing, output, facts, settings, subgoals, base, log, progress)
-    return Evaluation(_done(output, mine), workload)
+    return Evaluation(_done(output, mine, facts), workload)
 
 
 def _run(
@@ -122,8 +125,7 @@ def run_settings(
     return {
         "model": facts.model,
         "checkpoint": facts.checkpoint,
-        # Its end alone: machines that share a run may have the folder at different places.
-        "source": None if source is None else "/".join(Path(source).parts[-4:]),
+        "source": _end_of(source),
         "policy": fingerprint(dict(policy.config)),
         "dtype": dtype,
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
@@ -133,7 +135,14 @@ def run_settings(
 
 def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
     mode = {"mode": "background"} if isinstance(subgoals, BackgroundPredictor) else {}
-    return {"name": name, "kind": subgoals.kind, "interval": subgoals.interval, **mode}
+    decisive = {key: value for key, value in subgoals.settings.items() if key not in INDIFFERENT}
+    decisive |= {key: _end_of(decisive[key]) for key in ("model", "adapter") if key in decisive}
+    return {**decisive, "name": name, "kind": subgoals.kind, "interval": subgoals.interval, **mode}
+
+
+def _end_of(place: str | None) -> str | None:
+    """The end of a path alone: machines that share a run may have the folder at different places."""
+    return None if place is None else "/".join(Path(place).parts[-4:])
 
 
 def check_subgoals(policy: MMEPolicy, subgoals: SubgoalPredictor | None) -> None:
@@ -175,8 +184,10 @@ def default_output(facts: RunFacts) -> Path:
     return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
 
 
-def _done(output: Path, mine: Sequence[Job]) -> list[EpisodeRecord]:
-    """What the folder has of these episodes, whoever wrote it."""
-    wanted = {(job.task, job.split, job.episode) for job in mine}
-    found = [record for path in find_records([output]) for record in read_records(path)]
-    return [r for r in merge(found, "first") if (r.task, r.split, r.episode) in wanted]
+def _done(output: Path, mine: Sequence[Job], facts: RunFacts) -> list[EpisodeRecord]:
+    """What the folder has of these episodes, whichever shard wrote it; folders below it hold other runs."""
+    checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
+    run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split)
+    wanted = {(job.task, job.episode) for job in mine}
+    found = [record for path in sorted(output.glob("episodes*.jsonl")) for record in read_records(path)]
+    return [record for record in merge(found, "first") if record.run == run and record.key in wanted]

@@ -3,6 +3,8 @@
 import hashlib
 import json
 import os
+import time
+import uuid
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,15 +41,11 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
         "begun": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     folder.mkdir(parents=True, exist_ok=True)
-    target, mine = folder / RUN_FILE, folder / f".{RUN_FILE}.{os.getpid()}"
-    mine.write_text(json.dumps(content, indent=2, sort_keys=True) + "\n")
     try:
-        os.link(mine, target)  # whole or not at all, and never over another's
+        _write_new(folder / RUN_FILE, json.dumps(content, indent=2, sort_keys=True) + "\n")
         return content
     except FileExistsError:
-        pass
-    finally:
-        mine.unlink()
+        _await_content(folder / RUN_FILE)
     there = read_run(folder)
     if there["fingerprint"] != content["fingerprint"]:
         raise UserError(
@@ -73,6 +71,32 @@ def read_run(folder: Path) -> dict[str, Any]:
     except (json.JSONDecodeError, KeyError, TypeError) as error:
         raise UserError(f"{path} is damaged ({error}); remove it if the records beside it are of this run.") from None
     return content
+
+
+def _write_new(target: Path, text: str) -> None:
+    """Write a file that is not there yet.
+
+    Raises:
+        FileExistsError: it is.
+    """
+    mine = target.with_name(f".{target.name}.{uuid.uuid4().hex}")  # process ids repeat on hosts that share a folder
+    mine.write_text(text)
+    try:
+        os.link(mine, target)  # whole or not at all, and never over another's
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        with target.open("x") as file:
+            file.write(text)
+    finally:
+        mine.unlink()
+
+
+def _await_content(path: Path, patience: float = 2) -> None:
+    """Without hard links another process may have made the file, but not filled it yet."""
+    end = time.monotonic() + patience
+    while path.stat().st_size == 0 and time.monotonic() < end:
+        time.sleep(0.05)
 
 
 def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""What a predictor said in one episode: every subgoal on disk, with its time and the picture it was made for."""
+"""What a predictor said in one episode: every subgoal on disk, with its time and the picture it was used for."""
 
 import json
 import shutil
@@ -19,7 +19,8 @@ SUBGOALS = "subgoals"
 class SubgoalTrace:
     """Scores the subgoals of an episode and, given a folder, writes them down as they come.
 
-    `<folder>/<name>.jsonl` has a line for each time the policy acted; `<folder>/<name>/<step>.jpg` are the pictures.
+    `<folder>/<name>.jsonl` has a line for each time the policy acted, `<folder>/<name>/<step>.jpg` the picture it acted
+    on. A subgoal that was kept, or came in the background, is older: `asked_step` is the step of its question.
     What an earlier try of the same episode left there is replaced.
 
     Args:
@@ -33,7 +34,7 @@ class SubgoalTrace:
         self._begun = time.perf_counter()
         if folder is not None:
             shutil.rmtree(folder / name, ignore_errors=True)
-            (folder / name).mkdir(parents=True)
+            (folder / name).mkdir(parents=True, exist_ok=True)
             self._file.write_bytes(b"")
 
     def add(self, episode: SubgoalEpisode, subgoal: Subgoal, latency_s: float) -> None:
@@ -59,6 +60,7 @@ class SubgoalTrace:
             "points": subgoal.points,
             "oracle": self._meant,
             "asked": subgoal.asked,
+            "asked_step": episode.asked_step,
             "answer": subgoal.answer,
             "problem": subgoal.problem,
             "image": picture,

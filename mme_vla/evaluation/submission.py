@@ -17,8 +17,9 @@ RECIPE = {
 
 def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a policy's configuration tells of it and of its training, for the notes of a run."""
-    card = config.get("card") or {}
-    kept = {part: dict(config[part]) if config.get(part) else None for part in ("memory", "integration")}
+    card = config.get("card")
+    card = card if isinstance(card, Mapping) else {}
+    kept = {part: _section(config.get(part)) for part in ("memory", "integration")}
     return {**kept, "data": card.get("data"), "recipe": card.get("recipe")}
 
 
@@ -41,7 +42,7 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
                 run for run in runs
                 if (run["settings"].get("model"), run["settings"].get("checkpoint")) == (method.model, checkpoint)
             ]  # fmt: skip
-            facts = next((run["notes"]["policy"] for run in about if run.get("notes", {}).get("policy")), None)
+            facts = next((run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")), None)
             seeds = sorted({run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint})
             parts.append(f"**{method.label}, checkpoint {checkpoint}**\n")
             parts += [f"- {name}: {text}" for name, text in _lines(facts)]
@@ -57,10 +58,30 @@ def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
     if facts is None:
         return [("policy", UNKNOWN), ("training", UNKNOWN)]
     memory, integration, recipe = facts.get("memory"), facts.get("integration"), facts.get("recipe")
-    policy = "no memory" if memory is None else f"memory {memory['name']}, {memory.get('budget')} tokens"
+    memory, integration = _section(memory), _section(integration)
+    policy = f"memory {memory.get('name', 'without a name')}" if memory else "no memory"
+    if memory and memory.get("budget") is not None:
+        policy += f", {_text(memory['budget'])} tokens"
     if integration:
-        policy += f", integration {integration['name']}"
+        policy += f", integration {integration.get('name', 'without a name')}"
     if not recipe:
         return [("policy", policy), ("training", UNKNOWN)]
-    settings = ", ".join(f"{words} {recipe[name]:g}" for name, words in RECIPE.items() if recipe.get(name) is not None)
+    settings = _settings(recipe) if isinstance(recipe, Mapping) else str(recipe)
     return [("policy", policy), ("data", str(facts.get("data") or UNKNOWN)), ("training", settings)]
+
+
+def _settings(recipe: Mapping[str, Any]) -> str:
+    stated = (f"{words} {_text(recipe[name])}" for name, words in RECIPE.items() if recipe.get(name) is not None)
+    return ", ".join(stated) or UNKNOWN
+
+
+def _section(value: Any) -> dict[str, Any] | None:
+    """A part of the configuration; one that is a word alone is its name."""
+    if not value:
+        return None
+    return dict(value) if isinstance(value, Mapping) else {"name": str(value)}
+
+
+def _text(value: Any) -> str:
+    """A number in its shortest form; anything else (YAML reads `1e-4` as text) as it is."""
+    return f"{value:g}" if isinstance(value, int | float) else str(value)

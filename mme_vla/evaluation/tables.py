@@ -203,6 +203,7 @@ def to_markdown(table: Table) -> str:
 
 
 _LATEX = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "±": r"$\pm$", "−": "$-$",
+          "<": "$<$", ">": "$>$",
           "π": r"$\pi$", "$": r"\$", "{": r"\{", "}": r"\}",
           "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}  # fmt: skip
 

@@ -12,6 +12,7 @@ from mme_vla.config import cli, log_to_terminal
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.play.run import Identity, PlayRun, choose_episodes, make_session
+from mme_vla.play.session import ChoiceSession, EpisodeId
 
 log = logging.getLogger("mme_vla.play")
 HUMAN = "human"
@@ -75,18 +76,38 @@ def _on_the_page(run: PlayRun, participant: str, host: str, port: int) -> None:
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:
-    from mme_vla.play.players import play
-
     todo = list(run.todo)
     log.info("%d episodes to play, %d played before", len(todo), len(run.wanted) - len(todo))
     for number, which in enumerate(todo, 1):
+        log.info("%d/%d %s", number, len(todo), line(_play_one(run, which, player)))
+
+
+def _play_one(run: PlayRun, which: EpisodeId, player: Any) -> EpisodeRecord:
+    """Play and record one episode; what breaks in it ends it with an error, but not the run."""
+    from mme_vla.play.players import play
+
+    session: ChoiceSession | None = None
+    try:
         session = run.make(which)
-        try:
-            play(session, player)
-        finally:
-            session.close()
-        record = run.save(session, **player.notes())
-        log.info("%d/%d %s", number, len(todo), line(record))
+        play(session, player)
+        return run.save(session, **player.notes())
+    except UserError:  # the next episode would only meet it again
+        raise
+    except Exception as error:
+        log.warning("%s, episode %d broke", which.task, which.episode, exc_info=True)
+        # A player that has not begun still has the notes of the episode before.
+        notes = player.notes() if session is not None and session.reveals else {}
+        return run.save_error(which, f"{type(error).__name__}: {error}", session, **notes)
+    finally:
+        if session is not None:
+            _close(session)
+
+
+def _close(session: ChoiceSession) -> None:
+    try:
+        session.close()
+    except Exception:  # after a crash there may be nothing left to close
+        log.warning("the simulator could not be closed", exc_info=True)
 
 
 def line(record: EpisodeRecord) -> str:

@@ -48,9 +48,11 @@ class Desk:
 
     def begin(self) -> None:
         """Set the next episode up, or say that there is none."""
-        self._enter("loading" if self.run.todo else "finished")
         if self.run.todo:
+            self._enter("loading")
             self._work(self._load)
+        else:
+            self._enter("finished")
 
     def choose(self, request: Mapping[str, Any]) -> None:
         """Carry a choice out.
@@ -80,22 +82,22 @@ class Desk:
 
     def state(self) -> dict[str, Any]:
         """All but the frames, as JSON takes it."""
-        run = self.run
-        done = len(run.wanted) - len(run.todo)
+        # The simulator's thread changes these meanwhile: each is read once.
+        run, phase, session, session_id, todo = self.run, self.phase, self.session, self.session_id, list(self.run.todo)
+        done = len(run.wanted) - len(todo)
         state: dict[str, Any] = {
-            "phase": self.phase, "error": self.error, "for_s": round(time.monotonic() - self._since, 1),
+            "phase": phase, "error": self.error, "for_s": round(time.monotonic() - self._since, 1),
             "total": len(run.wanted), "played": done, "successes": sum(record.success for record in run.records),
-            "participant": self.participant, "session": self.session_id,
+            "participant": self.participant, "session": session_id,
         }  # fmt: skip
-        if self.phase == "finished":
+        if phase == "finished":
             state["summary"] = [
                 {"task": task, "successes": successes, "episodes": count, "human": paper["Human"]}
                 for task, successes, count, paper in run.summary()
             ]
-        which = run.todo[0] if self.session is None and run.todo else self.session and self.session.episode
-        if which:
+        which = session.episode if session is not None else todo[0] if todo else None
+        if which is not None:
             state |= {"task": which.task, "split": which.split, "episode": which.episode}
-        session = self.session
         if session is not None and session.reveals:
             reveals, decisions = list(session.reveals), list(session.decisions)
             state |= {

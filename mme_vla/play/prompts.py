@@ -106,7 +106,9 @@ def _pixel(point: Any, option: Option) -> list[int]:
     if not isinstance(point, list) or len(point) != 2:
         raise MalformedAnswer(f'option {option.label} needs "point": [row, column]')
     for value in point:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise MalformedAnswer("a point is made of two numbers")
+        if isinstance(value, float) and not math.isfinite(value):  # of a whole number too long, isfinite raises
             raise MalformedAnswer("a point is made of two numbers")
         if not 0 <= value <= THOUSAND:
             raise MalformedAnswer(f"a point lies within 0 and {THOUSAND}")
@@ -117,6 +119,6 @@ def _last_object(answer: str) -> dict[str, Any]:
     for text in reversed(_OBJECT.findall(answer)):
         try:
             return dict(json.loads(text))
-        except json.JSONDecodeError:
+        except (ValueError, RecursionError):  # also numbers too long to read, and lists nested too deep
             continue
     raise MalformedAnswer("the answer holds no JSON object")

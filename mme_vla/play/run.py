@@ -12,7 +12,7 @@ from mme_vla.envs.metadata import episodes as episodes_of
 from mme_vla.envs.names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.paper import paper_table
-from mme_vla.evaluation.record_log import RECORDS, RecordLog, find_records, read_records
+from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.run_file import claim_run
 from mme_vla.evaluation.tasks import PAPER_ORDER
@@ -82,7 +82,8 @@ class PlayRun:
         self._log = RecordLog(folder / RECORDS)
         self.wanted = list(wanted)
         keys = {(which.task, which.episode) for which in self.wanted}
-        there = [record for path in find_records([folder]) for record in read_records(path)]
+        # Folders below hold runs of their own.
+        there = [record for path in sorted(folder.glob("episodes*.jsonl")) for record in read_records(path)]
         self.records = [record for record in merge(there, "last") if (record.task, record.episode) in keys]
         done = finished(self.records, retry_errors)
         self.todo = [which for which in self.wanted if (which.task, which.episode) not in done]
@@ -90,11 +91,38 @@ class PlayRun:
     def save(self, session: ChoiceSession, **extra: Any) -> EpisodeRecord:
         """Write the record of a session that is over."""
         own = self.identity
-        record = session.record(own.model, own.checkpoint, own.model_seed, own.max_steps, **extra)
+        return self._keep(
+            session.episode, session.record(own.model, own.checkpoint, own.model_seed, own.max_steps, **extra)
+        )
+
+    def save_error(
+        self, which: EpisodeId, reason: str, session: ChoiceSession | None = None, **extra: Any
+    ) -> EpisodeRecord:
+        """Write that an episode could not be played to its end.
+
+        Args:
+            which: the episode. reason: what broke.
+            session: as far as it came; None where it could not even be made.
+            extra: more to keep with the record.
+        """
+        if session is not None:
+            if not session.over:
+                session.give_up("error", reason)
+            return self.save(session, **extra)
+        own = self.identity
+        record = EpisodeRecord(
+            model=own.model, checkpoint=own.checkpoint, model_seed=own.model_seed, max_steps=own.max_steps,
+            action_space="multi_choice", task=which.task, episode=which.episode, seed=which.seed,
+            difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
+            extra={"decisions": [], "ended_by": reason, **extra},
+        )  # fmt: skip
+        return self._keep(which, record)
+
+    def _keep(self, which: EpisodeId, record: EpisodeRecord) -> EpisodeRecord:
         self._log.append(record)
         self.records.append(record)
-        if session.episode in self.todo:
-            self.todo.remove(session.episode)
+        if which in self.todo:
+            self.todo.remove(which)
         return record
 
     def summary(self) -> list[tuple[str, int, int, dict[str, float]]]:

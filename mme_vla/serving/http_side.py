@@ -36,7 +36,10 @@ ROUTES = {"/healthz": "GET", "/metadata": "GET", "/stats": "GET", "/reset": "POS
 
 @dataclass
 class _Kept:
+    """A session. requests: those it works on or that wait for their turn; `used`: end of the last one."""
+
     session: Session
+    requests: int = 0
     turn: asyncio.Lock = field(default_factory=asyncio.Lock)
     used: float = field(default_factory=time.monotonic)
 
@@ -83,7 +86,7 @@ class HttpSide:
             await asyncio.sleep(min(every, self._settings.limits.idle_s))
             oldest = time.monotonic() - self._settings.limits.idle_s
             for key, kept in list(self.sessions.items()):
-                if kept.used < oldest and not kept.turn.locked():
+                if kept.used < oldest and not kept.requests:
                     del self.sessions[key]
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -168,29 +171,44 @@ class HttpSide:
             raise BadRequestError(400, "The body is empty: send a packed request.")
         key = (request.peer, request.headers.get("x-session", ""))
         kept = self._session(key)
-        async with kept.turn:
-            try:
-                return HttpAnswer(body=pack(await kept.session.answer(request.body)), kind=MSGPACK)
-            except UserError as error:
-                self._stats.count("refused")
-                logger.info("%s: refused: %s", request.peer, error)
-                self.sessions.pop(key, None)
-                return HttpAnswer(400, f"{error}\n".encode())
-            except Exception as error:
-                self._stats.count("failed")
-                logger.exception("%s: failed", request.peer)
-                self.sessions.pop(key, None)
-                reason = f"The server failed on this request ({type(error).__name__}: {str(error)[:200]}).\n"
-                return HttpAnswer(500, reason.encode())
-            finally:
-                kept.used = time.monotonic()
+        kept.requests += 1
+        try:
+            async with kept.turn:
+                return await self._work(key, kept, request)
+        finally:
+            kept.requests -= 1
+            kept.used = time.monotonic()
+
+    async def _work(self, key: tuple[str, str], kept: _Kept, request: HttpRequest) -> HttpAnswer:
+        try:
+            return HttpAnswer(body=pack(await kept.session.answer(request.body)), kind=MSGPACK)
+        except UserError as error:
+            self._stats.count("refused")
+            logger.info("%s: refused: %s", request.peer, error)
+            self._drop(key, kept)
+            return HttpAnswer(400, f"{error}\n".encode())
+        except Exception as error:
+            self._stats.count("failed")
+            logger.exception("%s: failed", request.peer)
+            self._drop(key, kept)
+            reason = f"The server failed on this request ({type(error).__name__}: {str(error)[:200]}).\n"
+            return HttpAnswer(500, reason.encode())
 
     def _session(self, key: tuple[str, str]) -> _Kept:
+        """The session of that name; a new one takes the place of the longest silent where there is no other."""
         if key not in self.sessions:
             if len(self.sessions) >= self._settings.limits.connections:
-                raise BadRequestError(503, f"{len(self.sessions)} sessions are open, as many as this server keeps.")
+                silent = [name for name, kept in self.sessions.items() if not kept.requests]
+                if not silent:
+                    raise BadRequestError(503, f"{len(self.sessions)} sessions are at work, as many as fit here.")
+                del self.sessions[min(silent, key=lambda name: self.sessions[name].used)]
             self.sessions[key] = _Kept(Session(self._engine, self._settings))
         return self.sessions[key]
+
+    def _drop(self, key: tuple[str, str], kept: _Kept) -> None:
+        # A request that waited for its turn may end after another one has begun anew under the same name.
+        if self.sessions.get(key) is kept:
+            del self.sessions[key]
 
 
 async def _drain(reader: asyncio.StreamReader, patience: float = 5) -> None:

@@ -3,12 +3,14 @@
 import hashlib
 import json
 import logging
+import math
 import os
-import queue
 import threading
 import time
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +19,10 @@ import numpy as np
 from mme_vla.errors import UserError
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.media import mp4_bytes, png_bytes
+from mme_vla.subgoal.threads import within
 
 log = logging.getLogger(__name__)
-Turn = tuple[str, list[Any]]  # role; parts: texts, pictures [H, W, 3], videos [t, H, W, 3]
+Turn = tuple[str, list[Any]]  # role; parts: texts, pictures [H, W, 3], videos [t, H, W, 3], bare or as `Shown`
 
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
@@ -47,6 +50,42 @@ class Settings:
     cache: str | None = None
     input_price: float = 1.25
     output_price: float = 10.0
+
+    def __post_init__(self) -> None:
+        for name, wanted in _WANTED.items():
+            value = getattr(self, name)
+            if name == "requests_per_minute" and value is None:
+                continue
+            usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+            if not usable or value < 0 or (value == 0 and "above" in wanted):
+                raise UserError(f"{name}={value!r} must be {wanted}.")
+        if not isinstance(self.retries, int):
+            raise UserError(f"retries={self.retries!r} must be a whole number, 0 or more.")
+
+
+_WANTED = {
+    "temperature": "a number, 0 or more",
+    "timeout": "a number of seconds above 0",
+    "retries": "a whole number, 0 or more",
+    "backoff": "a number of seconds, 0 or more",
+    "requests_per_minute": "a number above 0, or null for no limit",
+    "input_price": "a number of dollars, 0 or more",
+    "output_price": "a number of dollars, 0 or more",
+}
+
+
+class Shown:
+    """A picture [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
+
+    def __init__(self, pixels: np.ndarray) -> None:
+        self.pixels = pixels
+
+    @cached_property
+    def part(self) -> Mapping[str, Any]:
+        """What is sent."""
+        picture = self.pixels.ndim == 3
+        kind, data = ("image/png", png_bytes(self.pixels)) if picture else ("video/mp4", mp4_bytes(self.pixels))
+        return {"inline_data": {"mime_type": kind, "data": data}}
 
 
 @dataclass(frozen=True)
@@ -94,14 +133,14 @@ class Api:
             UserError: the key or the model's name is not accepted.
         """
         known = self._cache_file(system, turns)
-        if known is not None and known.is_file():
+        if known is not None and (kept := _read_reply(known)) is not None:
             with self._lock:
                 self.usage.cached += 1
-            return Reply(**json.loads(known.read_text()))
+            return kept
         reply = self._tried(system, turns)
         if known is not None:
             known.parent.mkdir(parents=True, exist_ok=True)
-            draft = known.with_suffix(f".{threading.get_ident()}.partial")
+            draft = known.with_suffix(f".{uuid.uuid4().hex}.partial")  # other processes may share the folder
             draft.write_text(json.dumps(vars(reply)))
             draft.replace(known)
         return reply
@@ -140,7 +179,7 @@ class Api:
     def _once(self, contents: list[Any], config: dict[str, Any]) -> Reply:
         started = self.clock()
         call = self.client.models.generate_content
-        response = _within(
+        response = within(
             self.settings.timeout, lambda: call(model=self.settings.model, contents=contents, config=config)
         )
         used = getattr(response, "usage_metadata", None)
@@ -174,7 +213,8 @@ class Api:
         digest = hashlib.sha256(json.dumps([self.settings.model, self.settings.temperature, system]).encode())
         for role, parts in turns:
             digest.update(f"\n{role}".encode())
-            for part in parts:
+            for shown in parts:
+                part = shown.pixels if isinstance(shown, Shown) else shown
                 # The pictures themselves, not their encoding, which may differ between versions of the encoder.
                 raw = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
                 digest.update(f"\n{getattr(part, 'shape', 'text')} {len(raw)} ".encode() + raw)
@@ -203,28 +243,19 @@ def _make_client(settings: Settings) -> Any:
 def _part(part: Any) -> Mapping[str, Any]:
     if isinstance(part, str):
         return {"text": part}
-    kind, data = ("image/png", png_bytes(part)) if part.ndim == 3 else ("video/mp4", mp4_bytes(part))
-    return {"inline_data": {"mime_type": kind, "data": data}}
+    return (part if isinstance(part, Shown) else Shown(part)).part
 
 
-def _within[T](seconds: float, call: Callable[[], T]) -> T:
-    """Run `call`, waiting no longer than that; a call that hangs is left behind in its thread."""
-    results: queue.SimpleQueue[tuple[bool, Any]] = queue.SimpleQueue()
-
-    def work() -> None:
-        try:
-            results.put((True, call()))
-        except BaseException as error:
-            results.put((False, error))
-
-    threading.Thread(target=work, daemon=True).start()
+def _read_reply(path: Path) -> Reply | None:
+    """An answer that was kept; None where there is none, or its file is damaged."""
     try:
-        succeeded, value = results.get(timeout=seconds)
-    except queue.Empty:
-        raise TimeoutError(f"no answer within {seconds:g} s") from None
-    if not succeeded:
-        raise value
-    return value
+        kept = json.loads(path.read_text())
+        return Reply(str(kept["text"]), int(kept["input_tokens"]), int(kept["output_tokens"]))
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        log.warning("%s is damaged (%s): the question is asked again", path, error)
+        return None
 
 
 def _is_passing(error: Exception) -> bool:

@@ -1,12 +1,15 @@
 """A predictor in the background: the policy acts on with the last subgoal until the next one is there."""
 
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, wait
 from typing import Any
 
 import numpy as np
 
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
+from mme_vla.subgoal.threads import start
+
+GRACE = 2.0  # seconds that closing waits: better not to end the process while a local model computes
 
 
 class BackgroundEpisode(SubgoalEpisode):
@@ -36,8 +39,8 @@ class BackgroundPredictor(SubgoalPredictor):
     """Runs another predictor in a thread.
 
     Only the first subgoal of an episode is waited for. Later a question goes out as soon as the thread is free, for all
-    waiting episodes together, and its answer is used from the next chunk on. What comes out therefore depends on how
-    fast the model answers.
+    waiting episodes together, and its answer is used from the next chunk on; one that came due while the thread was
+    busy goes out once it is free. What comes out therefore depends on how fast the model answers.
 
     Args:
         inner: the predictor. It is used by one thread at a time.
@@ -45,8 +48,7 @@ class BackgroundPredictor(SubgoalPredictor):
 
     def __init__(self, inner: SubgoalPredictor) -> None:
         super().__init__(inner.kind, inner.interval)
-        self.inner, self.usage = inner, inner.usage
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="subgoals")
+        self.inner, self.usage, self.settings = inner, inner.usage, inner.settings
         self._asked: list[BackgroundEpisode] = []
         self._answers: Future[list[Subgoal]] | None = None
 
@@ -74,7 +76,8 @@ class BackgroundPredictor(SubgoalPredictor):
 
     def close(self) -> None:
         """Drop what is under way and free the predictor."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        if self._answers is not None:
+            wait([self._answers], GRACE)
         self.inner.close()
 
     def _ask(self, episodes: Sequence[BackgroundEpisode]) -> None:
@@ -85,7 +88,8 @@ class BackgroundPredictor(SubgoalPredictor):
         due = [episode for episode in moved if self.inner.due(episode.catch_up()) or not episode.answered]
         if due:
             self._asked = due
-            self._answers = self._thread.submit(self.inner.predict, [episode.inner for episode in due])
+            inner = [episode.inner for episode in due]
+            self._answers = start(lambda: self.inner.predict(inner))
 
     def _collect(self, wait: bool = False) -> None:
         if self._answers is None or not (wait or self._answers.done()):
@@ -93,4 +97,5 @@ class BackgroundPredictor(SubgoalPredictor):
         answers, self._answers = self._answers.result(), None
         for episode, subgoal in zip(self._asked, answers, strict=True):
             episode.subgoal, episode.answered, episode.fresh = subgoal, True, True
+            episode.asked_step = episode.inner.asked_step
         self._asked = []

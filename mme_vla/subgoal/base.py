@@ -19,6 +19,7 @@ from mme_vla.subgoal.prompts import KINDS
 
 log = logging.getLogger(__name__)
 PROBLEMS = ("malformed", "empty", "refused", "failed")
+_PLAIN = (str, int, float, bool, list, dict, type(None))  # the values of a configuration
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,7 @@ class SubgoalEpisode:
     video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
     frame: the current front picture [H, W, 3] uint8. step: actions executed so far.
     info: what the environment reports beside the picture. subgoal: the last prediction.
+    asked_step: the step of the last question; None while there was none.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None = None, task: str = "") -> None:
@@ -77,6 +79,7 @@ class SubgoalEpisode:
         self.frames_seen = 0
         self.info: Mapping[str, Any] = {}
         self.subgoal = Subgoal(None)
+        self.asked_step: int | None = None
         self._frame: np.ndarray | None = None
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
@@ -117,8 +120,10 @@ class SubgoalPredictor:
 
     Args:
         kind: `simple` (words alone) or `grounded` (with points).
-        interval: ask at steps that are multiples of it; predictions are wanted whenever a new chunk is due, every 16
-            steps, so 1 asks every time.
+        interval: a question is due at every multiple of it, and goes out with the first prediction from there on;
+            predictions are wanted whenever a new chunk is due, every 16 steps, so 1 asks every time.
+
+    settings: the options that `build_predictor` built it from, as plain values; empty for one built otherwise.
     """
 
     def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
@@ -128,6 +133,7 @@ class SubgoalPredictor:
             raise UserError(f"subgoal.interval={interval} must be a positive number of steps.")
         self.kind, self.interval = kind, interval
         self.usage = Usage()
+        self.settings: dict[str, Any] = {}
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> SubgoalEpisode:
         """Begin an episode.
@@ -145,13 +151,17 @@ class SubgoalPredictor:
         """
         due = [episode for episode in episodes if self.due(episode)]
         for episode, subgoal in zip(due, self.answer(due) if due else [], strict=True):
-            episode.subgoal = subgoal
+            episode.subgoal, episode.asked_step = subgoal, episode.step
         asked = {id(episode) for episode in due}
         return [e.subgoal if id(e) in asked else Subgoal(e.subgoal.text, e.subgoal.points) for e in episodes]
 
     def due(self, episode: SubgoalEpisode) -> bool:
-        """Whether the episode's subgoal is to be asked for now."""
-        return episode.step % self.interval == 0
+        """Whether the episode's subgoal is to be asked for now: never yet, or a multiple of the interval was passed."""
+        return episode.asked_step is None or self.due_step(episode) > episode.asked_step
+
+    def due_step(self, episode: SubgoalEpisode) -> int:
+        """The step at which the newest question was due, however late the prediction comes."""
+        return episode.step - episode.step % self.interval
 
     def answer(self, episodes: Sequence[Any]) -> list[Subgoal]:
         """Ask for these episodes, all at once where that is possible."""
@@ -188,9 +198,11 @@ def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None
     name = options.pop("name")
     predictor = SUBGOALS[name]
     try:
-        return predictor(**options)
+        built: SubgoalPredictor = predictor(**options)
     except TypeError as error:
         raise UserError(f"The subgoal predictor {name!r} does not take these options: {options} ({error}).") from error
+    built.settings = {key: value for key, value in options.items() if isinstance(value, _PLAIN)}
+    return built
 
 
 def _checked(frames: np.ndarray, what: str) -> np.ndarray:

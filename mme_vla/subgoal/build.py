@@ -173,7 +173,7 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
     needed = ("simple_subgoal", "grounded_subgoal")
     if lacking := [name for name in needed if name not in source.subgoal_names]:
         raise UserError(f"{source.root} has no column {' and no '.join(lacking)}: nothing to learn subgoals from.")
-    given = json.loads(tasks.read_text()) if tasks is not None else {}
+    given = {} if tasks is None else _read_tasks(tasks)
     found = []
     for e in range(len(source)):
         task = given.get(str(e)) or source.task(e)
@@ -188,6 +188,16 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
         pictures = partial(_lerobot_pictures, source, e)
         found.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, pictures))
     return found
+
+
+def _read_tasks(path: Path) -> dict[str, str]:
+    try:
+        given = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"tasks={path} cannot be read as JSON: {error}.") from None
+    if not isinstance(given, dict) or not all(isinstance(task, str) for task in given.values()):
+        raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
+    return given
 
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
@@ -211,22 +221,34 @@ def _lerobot_pictures(source: EpisodeSource, episode: int, steps: Sequence[int])
 
 def run(cfg: "DictConfig") -> dict[str, int]:
     """Build what configs/subgoal_build.yaml and the command line say."""
-    inputs = [cfg.input] if isinstance(cfg.input, str) else list(cfg.input)
-    tasks = None if cfg.tasks is None else Path(cfg.tasks)
-    episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
-    if cfg.episodes is not None:
-        episodes = [episode for episode in episodes if episode.number in set(cfg.episodes)]
-    for name in cfg.sets:
+    inputs = [cfg.input] if isinstance(cfg.input, str) else _list(cfg, "input", str)
+    tasks = None if cfg.tasks is None else Path(str(cfg.tasks))
+    numbers = None if cfg.episodes is None else set(_list(cfg, "episodes", int))
+    sets = _list(cfg, "sets", str)
+    for name in sets:
         if name not in SETS:
             raise UserError(f"sets: there is no {name!r}; known: {', '.join(SETS)}.")
-    noise = None if cfg.noise is None else tuple(cfg.noise)
+    noise = None if cfg.noise is None else tuple(_list(cfg, "noise", int))
     options = RowOptions(noise=noise, seed=cfg.seed, **cfg.rows)
+    episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
+    episodes = [episode for episode in episodes if numbers is None or episode.number in numbers]
     output = Path(cfg.output)
-    counts = build(episodes, output, list(cfg.sets), options)
+    counts = build(episodes, output, sets, options)
     for name, count in counts.items():
         write_arguments(output, name)
         print(f"{output / name}.jsonl: {count} rows of {len(episodes)} episodes")
     return counts
+
+
+def _list(cfg: "DictConfig", key: str, kind: type) -> list[Any]:
+    """A key that is a list of whole numbers or of words."""
+    from omegaconf import ListConfig
+
+    given = cfg[key]
+    if not isinstance(given, ListConfig) or any(not isinstance(v, kind) or isinstance(v, bool) for v in given):
+        wanted, example = ("whole numbers", "[0,1]") if kind is int else ("words", f"[{given}]")
+        raise UserError(f"{key}={given} must be a list of {wanted}, such as {key}={example}.")
+    return list(given)
 
 
 def main() -> None:

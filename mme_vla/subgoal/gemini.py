@@ -2,16 +2,17 @@
 
 import threading
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
 
+from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.api import Api, ApiFailure, Reply, Settings
+from mme_vla.subgoal.api import Api, ApiFailure, Reply, Settings, Shown
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.gemini_prompts import LATE, first_query, gemini_system, next_query
 from mme_vla.subgoal.parsing import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.subgoal.threads import side_by_side
 
 CLIP = 4  # frames: fewer are not worth a video
 
@@ -19,8 +20,8 @@ CLIP = 4  # frames: fewer are not worth a video
 class GeminiEpisode(SubgoalEpisode):
     """An episode, its conversation, and the frames the model has not seen.
 
-    turns: what was asked and answered, each a role and parts; a part is a text, a picture [H, W, 3] or a video
-    [t, H, W, 3].
+    turns: what was asked and answered, each a role and parts; a part is a text, or a picture [H, W, 3] or video
+    [t, H, W, 3], which is encoded once for all questions that show it.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
@@ -38,13 +39,14 @@ class GeminiEpisode(SubgoalEpisode):
         """The parts of the next question."""
         if self.turns:
             return self._since(self.unseen)
-        video = [self.video] if len(self.video) else []
-        opening = [*video, self.unseen[0] if self.unseen else self.frame, first_query(self.goal, bool(video))]
+        video = [Shown(self.video)] if len(self.video) else []
+        picture = Shown(self.unseen[0] if self.unseen else self.frame)
+        opening: list[Any] = [*video, picture, first_query(self.goal, bool(video))]
         return opening + (self._since(self.unseen[1:]) if len(self.unseen) > 1 else [])
 
     def _since(self, frames: list[np.ndarray]) -> list[Any]:
         clip = len(frames) >= CLIP
-        return [np.stack(frames) if clip else self.frame, next_query(clip)]
+        return [Shown(np.stack(frames) if clip else self.frame), next_query(clip)]
 
 
 @SUBGOALS.register("gemini")
@@ -56,7 +58,7 @@ class Gemini(SubgoalPredictor):
 
     Args:
         interval: steps between two questions.
-        wait: for tasks with a long first subgoal, no second question before this step.
+        wait: for tasks with a long first subgoal, no second question due before this step.
         workers: questions under way at once.
         client: an object with google-genai's `client.models.generate_content`; None makes one.
         settings: keys of `api.Settings`.
@@ -72,6 +74,10 @@ class Gemini(SubgoalPredictor):
         **settings: Any,
     ) -> None:
         super().__init__(kind, interval)
+        if workers < 1:
+            raise UserError(f"workers={workers} must be at least 1: questions under way at once.")
+        if wait < 0:
+            raise UserError(f"wait={wait} must be a number of steps, 0 or more.")
         self.wait, self.workers = wait, workers
         self.api = Api(Settings(**settings), self.usage, client)
         self._lock = threading.Lock()
@@ -83,14 +89,13 @@ class Gemini(SubgoalPredictor):
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether to ask now; a question that failed is repeated at the next opportunity."""
         assert isinstance(episode, GeminiEpisode)
-        if episode.again or episode.step == 0:
+        if episode.again or episode.asked_step is None:
             return True
-        return super().due(episode) and not (episode.task in LATE and episode.step < self.wait)
+        return super().due(episode) and not (episode.task in LATE and self.due_step(episode) < self.wait)
 
     def answer(self, episodes: Sequence[GeminiEpisode]) -> list[Subgoal]:
         """Ask for all of them, some at a time."""
-        with ThreadPoolExecutor(min(self.workers, len(episodes))) as pool:
-            return list(pool.map(self._ask, episodes))
+        return side_by_side(self._ask, episodes, self.workers)
 
     def _ask(self, episode: GeminiEpisode) -> Subgoal:
         turn = ("user", episode.next_turn())
@@ -109,8 +114,8 @@ class Gemini(SubgoalPredictor):
     def _read(self, episode: GeminiEpisode, reply: Reply) -> Subgoal:
         try:
             text = parse_gemini(reply.text).lower()
+            if says_done(text):
+                return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=reply.text)
+            return self.accepted(pixels_of_pairs(text), reply.text)
         except MalformedAnswer as error:
             return self.kept(episode, "malformed", reply.text, str(error))
-        if says_done(text):
-            return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=reply.text)
-        return self.accepted(pixels_of_pairs(text), reply.text)

@@ -16,9 +16,10 @@ SIDE = 256  # of the front picture, in pixels
 THOUSAND = 1000
 Point = tuple[int, int]
 
-_BOX = re.compile(r"<\|box_start\|>\(\s*(\d+)\s*,\s*(\d+)\s*\)<\|box_end\|>")
+# Runs of digits are bounded: Python refuses to read thousands of them.
+_BOX = re.compile(r"<\|box_start\|>\(\s*(\d{1,6})\s*,\s*(\d{1,6})\s*\)<\|box_end\|>")
 _BOX_MARK = re.compile(r"<\|box_(?:start|end)\|>")
-_PIXELS = re.compile(r"at <(-?\d+), (-?\d+)>")
+_PIXELS = re.compile(r"at <(-?\d{1,6}), (-?\d{1,6})>")
 _PAIR = re.compile(r"<\s*(-?\d+(?:\.\d+)?)\s*,\s*(-?\d+(?:\.\d+)?)\s*>")
 _SUBGOAL_KEY = re.compile(r'"subgoal"([^\n]*)')
 _QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
@@ -105,7 +106,7 @@ def parse_memer(answer: str, recent: int, side: int = SIDE) -> tuple[Parsed, lis
         raise MalformedAnswer("the answer has no current_subtask")
     if not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions):
         raise MalformedAnswer("keyframe_positions is not a list of whole numbers")
-    return parse_subgoal(subtask, side), sorted({p for p in positions if 1 <= p <= recent})
+    return parse_subgoal(_writable(subtask), side), sorted({p for p in positions if 1 <= p <= recent})
 
 
 def parse_gemini(answer: str) -> str:
@@ -119,19 +120,26 @@ def parse_gemini(answer: str) -> str:
     for rest in _SUBGOAL_KEY.findall(answer):
         quoted = _QUOTED.search(rest)
         if quoted and quoted[1].strip():
-            return quoted[1].strip().replace('\\"', '"')
+            return _writable(quoted[1].strip().replace('\\"', '"'))
     text = _json_object(answer).get("subgoal")
     if not isinstance(text, str) or not text.strip():
         raise MalformedAnswer("the answer names no subgoal")
-    return text.strip()
+    return _writable(text.strip())
 
 
 def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
-    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side]."""
+    """Turn every `<y, x>` of a prompted model's subgoal from thousandths into pixels, clipped to [0, side].
+
+    Raises:
+        MalformedAnswer: a number is too long to be read.
+    """
     points: list[Point] = []
 
     def pixel(match: re.Match[str]) -> str:
-        y, x = (min(max(to_pixels(float(match[i]), side), 0), side) for i in (1, 2))
+        try:
+            y, x = (min(max(to_pixels(float(match[i]), side), 0), side) for i in (1, 2))
+        except (ValueError, OverflowError):
+            raise MalformedAnswer("a point's number is too long") from None
         points.append((y, x))
         return f"<{y}, {x}>"
 
@@ -161,8 +169,17 @@ def _json_object(answer: str) -> dict[str, object]:
         raise MalformedAnswer("the answer holds no JSON object")
     try:
         found = json.loads(answer[start : stop + 1])
-    except json.JSONDecodeError as error:
-        raise MalformedAnswer(f"the answer is not JSON ({error.msg})") from None
+    except (ValueError, RecursionError) as error:  # also a number of thousands of digits, and very deep nesting
+        raise MalformedAnswer(f"the answer is not JSON ({getattr(error, 'msg', error)})") from None
     if not isinstance(found, dict):
         raise MalformedAnswer("the answer is no JSON object")
     return found
+
+
+def _writable(text: str) -> str:
+    """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise MalformedAnswer("the answer holds half a character") from None
+    return text

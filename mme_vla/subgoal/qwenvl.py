@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
 from mme_vla.subgoal.history import SubgoalHistory, hold_until
@@ -37,6 +38,8 @@ class VLMPredictor(SubgoalPredictor):
         vlm: VLM | None = None,
     ) -> None:
         super().__init__(kind, interval)
+        if max_new_tokens < 1:
+            raise UserError(f"max_new_tokens={max_new_tokens} must be at least 1.")
         self.max_new_tokens = max_new_tokens
         self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=batch_size)
 
@@ -64,7 +67,7 @@ class QwenVL(VLMPredictor):
     """Asks for the next subgoal, given all that were different from the one before.
 
     Args:
-        hold: keep the first subgoals of four tasks for a fixed time, as released.
+        hold: keep the first subgoals of three tasks for a fixed time, as released.
     """
 
     def __init__(self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any) -> None:
@@ -76,9 +79,9 @@ class QwenVL(VLMPredictor):
         return QwenEpisode(goal, video, task)
 
     def due(self, episode: SubgoalEpisode) -> bool:
-        """Whether to ask now: at multiples of the interval, unless the last subgoal is to be held."""
+        """Whether to ask now: see `SubgoalPredictor`; what came due while the last subgoal is held is left out."""
         last = episode.subgoal.text
-        held = self.hold and last is not None and episode.step <= hold_until(episode.task, last)
+        held = self.hold and last is not None and self.due_step(episode) <= hold_until(episode.task, last)
         return super().due(episode) and not held
 
     def question(self, episode: QwenEpisode) -> Question:

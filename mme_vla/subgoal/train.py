@@ -9,8 +9,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-
+from mme_vla.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.subgoal.dataset import Collator, RowDataset
 from mme_vla.subgoal.vlm import VLM, load_model
@@ -71,9 +70,7 @@ def run(cfg: "DictConfig") -> Path:
 
     output = Path(cfg.output)
     checkpoint = find_checkpoint(output, cfg.resume)
-    device = ("cuda" if torch.cuda.is_available() else "cpu") if cfg.device == "auto" else str(cfg.device)
-    if device != "cpu" and not torch.cuda.is_available():
-        raise UserError(f"device={device}: PyTorch sees no GPU here; use device=cpu.")
+    device = str(find_device(str(cfg.device)))
     set_seed(cfg.seed)
     model, processor = load_model(cfg.vlm, "bfloat16" if device != "cpu" else "float32")
     lora = LoraConfig(

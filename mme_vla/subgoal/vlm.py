@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from mme_vla.errors import UserError
+from mme_vla.devices import find_device
+from mme_vla.errors import UserError, did_you_mean
 from mme_vla.subgoal.media import FPS, VIDEO_FRAMES, Clip
 from mme_vla.subgoal.prompts import IMAGE, VIDEO, split_media
 from mme_vla.subgoal.tiny import make_tiny
@@ -16,6 +17,7 @@ from mme_vla.subgoal.tiny import make_tiny
 IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: a picture; a video frame
 TOKEN_SIDE = 32  # pixels of a token: patches of 16, merged 2×2
 TINY = "tiny"
+DTYPES = ("float32", "bfloat16", "float16")
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class VLM:
     """
 
     def __init__(self, model: Any, processor: Any, batch_size: int = 8) -> None:
+        _check_batch(batch_size)
         self.model, self.processor, self.batch_size = model, processor, batch_size
         limit_pictures(processor)
 
@@ -79,11 +82,13 @@ class VLM:
             name: a repository on the hub, a folder, or `tiny`.
             adapter: folder or repository of a LoRA adapter (PEFT); ms-swift's checkpoints are such.
             device: `auto` (a GPU where there is one), `cpu`, `cuda`, `cuda:1`, …
-            dtype: of the weights.
+            dtype: of the weights, one of `DTYPES`.
 
         Raises:
-            UserError: the extra `vlm` is not installed, or nothing loadable is there.
+            UserError: the extra `vlm` is not installed, nothing loadable is there, or an option cannot work.
         """
+        _check_batch(batch_size)
+        place = find_device(device)  # before the minutes that loading may take
         model, processor = load_model(name, dtype)
         if adapter is not None:
             from peft import PeftModel
@@ -92,9 +97,7 @@ class VLM:
                 model = PeftModel.from_pretrained(model, adapter).merge_and_unload()
             except (OSError, ValueError) as error:
                 raise UserError(f"subgoal.adapter={adapter!r} is no LoRA adapter of {name!r}: {error}") from None
-        if device == "auto":
-            device = "cuda" if torch.cuda.is_available() else "cpu"
-        return cls(model.to(device).eval(), processor, batch_size)
+        return cls(model.to(place).eval(), processor, batch_size)
 
     def encode(self, questions: Sequence[Question], side: str = "left") -> Any:
         """Token ids, masks and pixels of a batch, padded on `side`."""
@@ -146,8 +149,10 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
     """A model and its processor, on the CPU.
 
     Raises:
-        UserError: the extra `vlm` is not installed, or there is no such model.
+        UserError: the extra `vlm` is not installed, or there is no such model or dtype.
     """
+    if dtype not in DTYPES:
+        raise UserError(f"dtype={dtype!r} of a Qwen3-VL. {did_you_mean(str(dtype), DTYPES)}")
     try:
         from transformers import AutoProcessor, Qwen3VLForConditionalGeneration
     except ImportError:
@@ -160,6 +165,11 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
     except (OSError, ValueError) as error:
         place = "that folder" if Path(name).exists() else "the hub"
         raise UserError(f"No Qwen3-VL model {name!r} in {place}: {str(error).splitlines()[0]}") from None
+
+
+def _check_batch(size: int) -> None:
+    if not isinstance(size, int) or size < 1:
+        raise UserError(f"batch_size={size!r} must be a whole number, 1 or more.")
 
 
 def limit_pictures(processor: Any) -> None:

@@ -33,6 +33,7 @@ class BinFill(MemoryTask):
     """Any cube counts towards its colour; the counts are judged at the button."""
 
     shared_draws = True
+    spectator = ((1, 0, 0.4), (0, 0, 0.4))
     latch_failure = True
     recovery_drawn_per_episode = True
 

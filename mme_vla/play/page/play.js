@@ -260,7 +260,14 @@ $("picture").addEventListener("click", (event) => {
   const box = $("picture").getBoundingClientRect();
   setPoint(((event.clientY - box.top) / box.height) * SIDE, ((event.clientX - box.left) / box.width) * SIDE);
 });
-$("seek").addEventListener("input", () => { film.pause(); film.seek(Number($("seek").value)); });
+// Set with the mouse, the slider and the speed box give the keys back to the page.
+$("seek").addEventListener("pointerup", () => $("seek").blur());
+$("speed").addEventListener("change", () => { if (!$("speed").matches(":focus-visible")) $("speed").blur(); });
+$("seek").addEventListener("input", () => {
+  const at = Number($("seek").value); // read before pausing, which sets the slider to the frame shown
+  film.pause();
+  film.seek(at);
+});
 $("toggle").addEventListener("click", toggle);
 $("replay").addEventListener("click", replay);
 $("present").addEventListener("click", showPresent);
@@ -269,7 +276,10 @@ $("do").addEventListener("click", send);
 $("next").addEventListener("click", () => { complain(""); post("next", {}); });
 
 document.addEventListener("keydown", (event) => {
-  if (event.ctrlKey || event.altKey || event.metaKey || ["SELECT", "INPUT"].includes(event.target.tagName)) return;
+  if (event.ctrlKey || event.altKey || event.metaKey) return;
+  // The slider and the speed box keep the keys that set them; all others are the page's wherever the focus is.
+  const own = { INPUT: /^Arrow/, SELECT: /^(Arrow|Enter$| $)/ }[event.target.tagName];
+  if (own?.test(event.key)) return;
   const onOption = event.target.classList?.contains("option");
   const onButton = event.target.tagName === "BUTTON" && !onOption;
   const arrows = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
