@@ -116,7 +116,7 @@ def test_retried_seeds_lie_close_above_the_formulas(split: str) -> None:
     for task in TASK_NAMES:
         for spec in episodes(task, split):
             seed, difficulty = formula(task, split, spec.episode)
-            assert 0 <= spec.seed - seed <= 6 and spec.difficulty == difficulty
+            assert 0 <= spec.seed - seed <= 8 and spec.difficulty == difficulty
             assert spec.source in ("official", "derived") or spec.seed == seed
 
 
