@@ -23,7 +23,14 @@ def hard() -> Iterator[ButtonUnmask]:
 
 @pytest.mark.parametrize(
     ("seed", "difficulty", "counts"),
-    [(1, "easy", {3}), (2, "easy", {3}), (3, "medium", {5}), (4, "medium", {5}), (6, "hard", {4, 5, 6})],
+    [
+        (1, "easy", {3}),
+        (2, "easy", {3}),
+        (3, "medium", {5}),
+        (4, "medium", {5}),
+        (6, "hard", {4, 5, 6}),
+        (7, "hard", {4, 5, 6}),
+    ],
 )
 def test_button_then_containers_then_colours_come_from_the_stream(seed, difficulty, counts):
     env = make(ButtonUnmask, seed, difficulty)

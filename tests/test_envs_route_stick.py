@@ -48,12 +48,13 @@ def watch(env: RouteStick, tip: Tip) -> None:
 
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
-def test_everything_comes_from_the_stream_in_order(difficulty, monkeypatch):
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_everything_comes_from_the_stream_in_order(seed, difficulty, monkeypatch):
     colours = []
     build = RouteStick.build.__globals__["build_obstacle"]
     monkeypatch.setitem(RouteStick.build.__globals__, "build_obstacle", lambda *a: colours.append(a[-1]) or build(*a))
-    env = make(RouteStick, 1, difficulty)
-    stream = Draws(1)
+    env = make(RouteStick, seed, difficulty)
+    stream = Draws(seed)
     turn = Rotation.from_euler("z", -30 + 60 * stream.uniform(), degrees=True)
     shown, hidden, blocks = (
         turn.apply([(-0.1, 0.07 * i, z) for i in range(first, 5, 2)])

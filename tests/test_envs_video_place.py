@@ -57,15 +57,17 @@ def keeps_apart(env: VideoPlace) -> bool:
     )
 
 
-@pytest.fixture(scope="module")
-def order() -> Iterator[VideoPlaceOrder]:
-    env = make(VideoPlaceOrder, 1, "hard")
+@pytest.fixture(scope="module", params=[(VideoPlaceOrder, 1), (VideoPlaceButton, 2)], ids=["order", "button"])
+def order(request: pytest.FixtureRequest) -> Iterator[VideoPlace]:
+    """Either task; the rules of the execution are the same."""
+    task, seed = request.param
+    env = make(task, seed, "hard")
     yield env
     env.close()
 
 
 @pytest.fixture
-def hand(order: VideoPlaceOrder, monkeypatch: pytest.MonkeyPatch) -> Hand:
+def hand(order: VideoPlace, monkeypatch: pytest.MonkeyPatch) -> Hand:
     order.reset()
     return Hand(order, monkeypatch)
 
