@@ -16,7 +16,7 @@ from mme_vla.evaluation.rollout_env import make_rollout_env
 from mme_vla.evaluation.rollout_plan import Shard, take_share
 from mme_vla.evaluation.rollout_progress import RolloutProgress
 from mme_vla.evaluation.rollout_settings import RolloutSettings
-from mme_vla.evaluation.run_file import claim_run, fingerprint
+from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
 from mme_vla.evaluation.subgoal_trace import SUBGOALS
 from mme_vla.policy import MMEPolicy
 from mme_vla.serving.session import subgoal_kind
@@ -25,9 +25,6 @@ from mme_vla.subgoal.background import BackgroundPredictor
 
 USUAL_BUDGET = 512
 VIDEOS = "videos"
-INDIFFERENT = ("name", "workers", "batch_size", "device", "cache", "key_variable", "timeout", "retries", "backoff",
-               "requests_per_minute", "input_price", "output_price")  # fmt: skip
-"""A predictor's options that do not decide what it says (its name is kept anyway)."""
 
 
 class Evaluation(NamedTuple):

@@ -13,6 +13,9 @@ from typing import Any
 from mme_vla.errors import UserError
 
 RUN_FILE = "run.json"
+INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "timeout", "retries", "backoff",
+               "requests_per_minute", "input_price", "output_price")  # fmt: skip
+"""Options of a model that predicts or plays which do not decide what it says, and may differ when a run goes on."""
 
 
 def fingerprint(settings: Mapping[str, Any]) -> str:

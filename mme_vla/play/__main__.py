@@ -11,14 +11,12 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.config import cli, log_to_terminal
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.run_file import INDIFFERENT
 from mme_vla.play.run import Identity, PlayRun, choose_episodes, make_session
 from mme_vla.play.session import ChoiceSession, EpisodeId
 
 log = logging.getLogger("mme_vla.play")
 HUMAN = "human"
-# What decides no outcome, and may differ when a run is resumed.
-INDIFFERENT = ("cache", "device", "requests_per_minute", "timeout", "retries", "backoff", "input_price", "output_price",
-               "key_variable")  # fmt: skip
 
 
 @cli("play")
