@@ -5,7 +5,6 @@ from mme_vla.envs.objects.shapes import RGB
 from mme_vla.envs.objects.solids import (
     COLOURS,
     HIDDEN_H,
-    TARGET_COLOURS,
     WHITE,
     Board,
     Container,
@@ -30,7 +29,6 @@ __all__ = [
     "HIDDEN_H",
     "PEG_COLOUR",
     "RGB",
-    "TARGET_COLOURS",
     "WHITE",
     "Board",
     "Button",
