@@ -15,7 +15,7 @@ from mme_vla.evaluation.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.demo import demo_records
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.scopes import Protocol
-from mme_vla.evaluation.subgoal_score import subgoal_table
+from mme_vla.evaluation.subgoal_score import subgoal_tables
 from mme_vla.evaluation.submission import read_runs, training_details
 from mme_vla.evaluation.tables import (
     Table,
@@ -89,8 +89,7 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         texts[args.latex] = "\n".join(to_latex(table) for table in _tables(results, comparisons))
     if args.markdown:
         boards = [table for method in results.methods for table in leaderboard(method, results)]
-        subgoals = [table for method in results.methods if (table := subgoal_table(method, results))]
-        parts = ["## Results\n", *map(to_markdown, [overview(results), *boards, *subgoals])]
+        parts = ["## Results\n", *map(to_markdown, [overview(results), *boards, *subgoal_tables(results)])]
         parts.append(training_details(results.methods, read_runs(find_records(args.runs))))
         if comparisons:
             parts.append(to_markdown(comparison_table(comparisons)))
@@ -109,8 +108,12 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
 def _tables(results: Results, comparisons: list[Comparison], detailed: bool = True) -> list[Table]:
     tables = [overview(results)]
     if detailed:
-        subgoals = [table for method in results.methods if (table := subgoal_table(method, results))]
-        tables = [*(detail(method, results) for method in results.methods), *subgoals, runs_table(results), *tables]
+        tables = [
+            *(detail(method, results) for method in results.methods),
+            *subgoal_tables(results),
+            runs_table(results),
+            *tables,
+        ]
     return [*tables, comparison_table(comparisons)] if comparisons else tables
 
 

@@ -41,7 +41,7 @@ def test_the_benchmarks_own_words_ask_for_a_recovery_demonstration() -> None:
     env = make_task("PickXtimes", render=False, seed=0, difficulty="easy", **words)
     assert env.recovery == "xy"
     env.close()
-    with pytest.raises(UserError, match="recovery mode"):
+    with pytest.raises(UserError, match="needs a robomme_failure_recovery_mode"):
         make_task("PickXtimes", render=False, seed=0, robomme_failure_recovery=True)
 
 

@@ -74,7 +74,9 @@ class MemoryTask(BaseEnv):
         if difficulty is not None and difficulty not in DIFFICULTIES:
             raise UserError(f"Unknown difficulty {difficulty!r}. {did_you_mean(str(difficulty), DIFFICULTIES)}")
         if robomme_failure_recovery:
-            recovery = robomme_failure_recovery_mode or recovery or "none named"
+            recovery = robomme_failure_recovery_mode or recovery
+            if recovery is None:
+                raise UserError(f"robomme_failure_recovery needs a robomme_failure_recovery_mode of {RECOVERY_MODES}.")
         if recovery is not None and recovery not in RECOVERY_MODES:
             raise UserError(f"Unknown recovery mode {recovery!r}. {did_you_mean(str(recovery), RECOVERY_MODES)}")
         self.seed = seed

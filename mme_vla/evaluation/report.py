@@ -8,7 +8,7 @@ from mme_vla.evaluation import plots
 from mme_vla.evaluation.aggregate import USUAL_BUDGET, Results
 from mme_vla.evaluation.compare import Comparison
 from mme_vla.evaluation.cost_table import chunk_flops
-from mme_vla.evaluation.subgoal_score import subgoal_table
+from mme_vla.evaluation.subgoal_score import subgoal_tables
 from mme_vla.evaluation.tables import Table, comparison_table, detail, overview, runs_table
 
 _CSS = """
@@ -71,7 +71,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     if comparisons:
         verdicts = "; ".join(comparison.verdict for comparison in comparisons) + "."
         parts.append(_section("Paired comparison", _table(comparison_table(comparisons)), verdicts))
-    subgoals = [table for method in results.methods if (table := subgoal_table(method, results))]
+    subgoals = subgoal_tables(results)
     if subgoals:
         text = "Words are right when they equal the environment's, points aside; distances are of the points then."
         parts.append(_section("Subgoals", "".join(f"<h3>{escape(t.title)}</h3>{_table(t)}" for t in subgoals), text))

@@ -117,6 +117,11 @@ def point_distances(said: str | None, meant: str) -> list[float] | None:
     return [float(np.hypot(a - c, b - d)) for (a, b), (c, d) in zip(said_points, meant_points, strict=True)]
 
 
+def subgoal_tables(results: Results) -> list[Table]:
+    """Subgoals of every method that has a predictor."""
+    return [table for method in results.methods if (table := subgoal_table(method, results))]
+
+
 def subgoal_table(method: Method, results: Results) -> Table | None:
     """Subgoals of one method per task, over all its runs; None for a method without."""
     records = [record for run in method.runs for record in run.records.values() if EXTRA in record.extra]
