@@ -18,3 +18,28 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     near = get_close_matches(name, known, n=3, cutoff=0.6)
     hint = f"Did you mean {' or '.join(map(repr, near))}? " if near else ""
     return f"{hint}Known: {', '.join(known) or 'none'}."
+
+
+def brief(value: object, most: int = 80, quote: bool = True) -> str:
+    """A value as it stands in a message: its repr, cut in the middle where it is longer than `most` characters.
+
+    >>> brief("x" * 1000, 9)
+    "'xxx…xxx'"
+    """
+    try:
+        text = repr(value) if quote or not isinstance(value, str) else value
+    except (ValueError, RecursionError):  # an integer of thousands of digits, a value nested too deeply
+        text = f"a value of type {type(value).__name__}"
+    half = (most - 1) // 2
+    return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
+
+
+def listed(names: Iterable[object], most: int = 12) -> str:
+    """Names as one list of a message, the first `most` of them and how many more there are.
+
+    >>> listed(["a", "b", "c"], 2)
+    'a, b and 1 more'
+    """
+    every = [brief(str(name), 120, quote=False) for name in names]
+    rest = len(every) - most
+    return ", ".join(every[:most]) + (f" and {rest:,} more" if rest > 0 else "")

@@ -1,0 +1,12 @@
+"""Files as they really are: damaged, shared, half written, from strangers. Nothing here knows what is in them."""
+
+from mme_vla.files.checksums import SUMS, check_sums, file_sum, write_sums
+from mme_vla.files.locks import FolderLock
+from mme_vla.files.places import inside, safe_name
+from mme_vla.files.reading import parse_json, read_json, read_json_lines, read_text
+from mme_vla.files.writing import write_atomically, write_json
+
+__all__ = [
+    "SUMS", "FolderLock", "check_sums", "file_sum", "inside", "parse_json", "read_json", "read_json_lines", "read_text",
+    "safe_name", "write_atomically", "write_json", "write_sums",
+]  # fmt: skip

@@ -1,0 +1,65 @@
+"""A checksum of every file of a folder, in the layout of `sha256sum`, which can check it as well: `sha256sum -c`."""
+
+import hashlib
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from mme_vla.errors import UserError
+from mme_vla.files.places import inside
+from mme_vla.files.reading import read_text
+from mme_vla.files.writing import write_atomically
+
+SUMS = "SHA256SUMS"
+_LINE = re.compile(r"([0-9a-f]{64})  ([^\n]+)")
+
+
+def file_sum(path: Path) -> str:
+    """The SHA-256 of a file's bytes, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def write_sums(folder: Path, names: Iterable[str] | None = None) -> None:
+    """Write `SHA256SUMS` for these files of a folder, by default for all files in it and below."""
+    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    chosen = sorted(set(names) if names is not None else {name for name in found if name != SUMS})
+    with write_atomically(folder / SUMS) as draft:
+        draft.write_text("".join(f"{file_sum(folder / name)}  {name}\n" for name in chosen))
+
+
+def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
+    """Compare files with the sums that were written beside them.
+
+    Args:
+        folder: a folder that may hold `SHA256SUMS`.
+        names: the files about to be read; by default all that are listed. Files that are not listed are not checked:
+            people add notes and cards.
+
+    Returns:
+        Whether there were sums to compare with; folders written by others, or before there were sums, have none.
+
+    Raises:
+        UserError: a file is missing or its content is not what was written.
+    """
+    sums = folder / SUMS
+    if not sums.exists():
+        return False
+    table = {}
+    for number, line in enumerate(read_text(sums, "a list of checksums").splitlines(), start=1):
+        match = _LINE.fullmatch(line)
+        if match is None:
+            raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
+        table[match[2]] = match[1]
+    for name in sorted(table) if names is None else names:
+        if name not in table:
+            continue
+        path = inside(folder, name)
+        if not path.is_file():
+            raise UserError(f"{path} is missing, though {sums} lists it. Copy the whole folder again.")
+        if file_sum(path) != table[name]:
+            raise UserError(
+                f"{path} is damaged: its content is not what was written (SHA-256 differs from {SUMS}). Take an "
+                f"earlier checkpoint or copy the file again; if you changed it on purpose, delete {SUMS}."
+            )
+    return True

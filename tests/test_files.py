@@ -1,0 +1,150 @@
+"""The readers and writers every room uses: what lies in a file's place, names that lead elsewhere, sums, locks."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.files import (
+    SUMS,
+    FolderLock,
+    check_sums,
+    inside,
+    parse_json,
+    read_json,
+    read_json_lines,
+    read_text,
+    safe_name,
+    write_atomically,
+    write_json,
+    write_sums,
+)
+
+DEEP = "[" * 200_000
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"{", "not valid JSON"), (b"", "not valid JSON"), (DEEP.encode(), "nested too deeply"), (b"[1]", "an object"),
+        (b'{"a": 1' + b"0" * 5000 + b"}", "not valid JSON"), (b'{"a": Infinity}', "Infinity is not a number"),
+        (b'{"a": 1e999}', "out of range"), (b'{"a": "\xff"}', "not UTF-8"),
+    ],
+    ids=["cut", "empty", "deep", "list", "digits", "infinity", "overflow", "latin"],
+)  # fmt: skip
+def test_damaged_json_is_one_short_sentence_that_names_the_file(tmp_path: Path, content: bytes, words: str) -> None:
+    file = tmp_path / "plan.json"
+    file.write_bytes(content)
+    with pytest.raises(UserError, match=words) as caught:
+        read_json(file)
+    assert str(file) in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+def test_whatever_stands_in_a_files_place_is_refused_without_waiting(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "endless").symlink_to("/dev/zero")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "large").write_bytes(b" " * 101)
+    for name in ("pipe", "endless", "folder", "loop", "missing", "large", "nu\0l"):
+        with pytest.raises(UserError):
+            read_text(tmp_path / name, limit=100)
+
+
+def test_lines_of_json_name_the_damaged_line(tmp_path: Path) -> None:
+    file = tmp_path / "log.jsonl"
+    file.write_text('{"a": "\u2028"}\n\n{"a": 2}\n{"a"\n', encoding="utf-8")
+    lines = read_json_lines(file)
+    assert [next(lines), next(lines)] == [(1, {"a": "\u2028"}), (3, {"a": 2})]
+    with pytest.raises(UserError, match="line 4"):
+        next(lines)
+
+
+def test_numbers_that_are_not_finite_are_read_where_they_are_allowed() -> None:
+    assert parse_json("[NaN]", "a log", kind=list, finite=False)[0] != 0
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "plan.json"
+    write_json(file, {"a": 1})
+    with pytest.raises(KeyboardInterrupt), write_atomically(file) as draft:
+        draft.write_text("half")
+        raise KeyboardInterrupt
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(file, {"a": float("nan")})
+    assert json.loads(file.read_text()) == {"a": 1}
+    assert [path.name for path in tmp_path.iterdir()] == ["plan.json"]
+
+
+def test_a_name_that_leads_out_of_its_folder_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "checkpoint"
+    (folder / "sub").mkdir(parents=True)
+    (folder / "model").write_text("")
+    (folder / "link").symlink_to(tmp_path / "secret")
+    (folder / "near").symlink_to("model")
+    assert inside(folder, "sub/../model").is_file()
+    assert inside(folder, "near").is_file()
+    for name in ("../secret", "/etc/passwd", "link", "", ".", "sub/../../secret", "nu\0l"):
+        with pytest.raises(UserError, match="outside"):
+            inside(folder, name)
+
+
+def test_names_of_folders_hold_no_paths() -> None:
+    assert safe_name("tokendrop_expert") == "tokendrop_expert"
+    for name in ("../x", "/x", "a/b", "", ".hidden", "x" * 101, "a\nb"):
+        with pytest.raises(UserError, match="cannot name a folder"):
+            safe_name(name)
+
+
+def test_a_flipped_bit_is_found_by_its_sum(tmp_path: Path) -> None:
+    (tmp_path / "weights").write_bytes(b"\0" * 64)
+    (tmp_path / "config").write_text("{}")
+    assert not check_sums(tmp_path)
+    write_sums(tmp_path)
+    (tmp_path / "note").write_text("added later")
+    assert check_sums(tmp_path)
+    (tmp_path / "weights").write_bytes(b"\0" * 63 + b"\1")
+    assert check_sums(tmp_path, ["config"])
+    with pytest.raises(UserError, match="weights is damaged"):
+        check_sums(tmp_path)
+    (tmp_path / "weights").unlink()
+    with pytest.raises(UserError, match="missing"):
+        check_sums(tmp_path)
+    (tmp_path / SUMS).write_text("nonsense\n")
+    with pytest.raises(UserError, match="line 1"):
+        check_sums(tmp_path)
+
+
+def test_the_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    write_sums(tmp_path)
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert (tmp_path / SUMS).read_text() == f"{known}  a\n"
+
+
+def test_a_folder_belongs_to_one_process_until_that_ends_however_it_ends(tmp_path: Path) -> None:
+    hold = "import sys; from pathlib import Path; from mme_vla.files import FolderLock\n"
+    hold += "FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
+    other = subprocess.Popen(
+        [sys.executable, "-c", hold, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert other.stdout is not None
+    assert other.stdout.readline() == "held\n"
+    with pytest.raises(UserError, match=f"process {other.pid}"):
+        FolderLock(tmp_path).acquire()
+    other.kill()
+    other.communicate()
+    with FolderLock(tmp_path), pytest.raises(UserError, match="in use"):
+        FolderLock(tmp_path).acquire()
+    FolderLock(tmp_path).acquire().release()
+
+
+def test_values_and_lists_in_messages_stay_short() -> None:
+    assert brief("x" * 1000, 9) == "'xxx…xxx'"
+    assert len(brief(10**5000)) <= 80
+    assert listed(["a", "b", "c"], 2) == "a, b and 1 more"
