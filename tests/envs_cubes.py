@@ -7,13 +7,13 @@ import pytest
 import sapien
 from envs_unmask import wait
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.demonstration import demonstrate
-from mme_vla.envs.demonstrator import Demonstrator
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import Button, Cube, Disc, H
-from mme_vla.envs.placement import TRIALS, Region
-from mme_vla.envs.things import Thing
+from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import Button, Cube, Disc, H
+from mme_vla.envs.scene.placement import TRIALS, Region
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.task import MemoryTask
 
 Flags = tuple[bool, bool]
 """Success and failure after a step."""

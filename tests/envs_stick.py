@@ -9,10 +9,10 @@ import sapien
 import torch
 from envs_testing import recorded, setup
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.primitives_stick import arc
-from mme_vla.envs.things import Thing
+from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.task import MemoryTask
 
 Flags = tuple[bool, bool]
 """Success and failure at an evaluation."""

@@ -6,9 +6,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.draws import Draws
+from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import MemoryTask
 
 
 class Scene(MemoryTask):

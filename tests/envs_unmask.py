@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import sapien
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import Button, Container
-from mme_vla.envs.placement import CONTAINER_HALF, TRIALS, Region
-from mme_vla.envs.things import Thing
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import Button, Container
+from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Region
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.task import MemoryTask
 
 
 def make(task: type[MemoryTask], seed: int, difficulty: str, **settings: object) -> MemoryTask:

@@ -12,11 +12,11 @@ import sapien
 from envs_testing import Scene, recorded
 from scipy.spatial.transform import Rotation
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.demonstration import demonstrate
-from mme_vla.envs.demonstrator import Demonstrator, PlanningError
-from mme_vla.envs.grasping import failing_offset, grasp_orientation
-from mme_vla.envs.objects import (
+from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError
+from mme_vla.envs.robot.grasping import failing_offset, grasp_orientation
+from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.scene.objects import (
     PEG_COLOUR,
     build_aperture_box,
     build_board,
@@ -26,12 +26,12 @@ from mme_vla.envs.objects import (
     build_disc,
     build_peg,
 )
-from mme_vla.envs.primitives_stick import arc
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD
+from mme_vla.envs.task import MemoryTask
 from mme_vla.envs.tasks.pattern_lock import PatternLock
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.tasks.video_unmask import VideoUnmask
-from mme_vla.envs.things import distance_xy
 
 PHYSICS = {"obs_mode": "none", "render_backend": "none"}
 

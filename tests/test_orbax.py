@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from mme_vla import UserError
-from mme_vla.testing import small_policy
+from mme_vla.testing.small import small_policy
 from mme_vla.weights import detect_format, load_into, open_source, read_stats
 from mme_vla.weights.orbax import find_params, read_orbax, write_orbax
 

@@ -13,10 +13,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from mme_vla import UserError, build_policy
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import random_batch, small_policy
+from mme_vla.commands.weights import convert
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.weights import detect_format, load_into
-from mme_vla.weights.convert import convert
 from mme_vla.weights.ports import to_lerobot, to_openpi
 
 EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"

@@ -11,8 +11,8 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from safetensors.torch import load_file
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.pretrained import load_tensors, save_tensors
-from mme_vla.testing import random_batch, small_policy
+from mme_vla.policy.tensor_files import load_tensors, save_tensors
+from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.weights import load_into
 
 

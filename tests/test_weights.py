@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import save_file
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.testing import PERCEPTUAL, random_batch, small_policy, unit_stats
+from mme_vla.commands.weights import convert
+from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
 from mme_vla.weights import detect_format, load_into, open_source, read_stats, start_from, transfer
 from mme_vla.weights.adapter import memory_parameters
-from mme_vla.weights.convert import convert
 from mme_vla.weights.released import released_table
 
 pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
@@ -193,7 +193,7 @@ def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tm
 
 def test_a_memory_of_ones_own_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
     policy = build_policy("framesamp_context")
-    monkeypatch.setattr("mme_vla.memory.names.released_names", lambda memory: None)
+    monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: None)
     with pytest.raises(UserError, match="no released names"):
         released_table(policy)
     assert set(start_from(policy, bases["released"])) == memory_parameters(policy)

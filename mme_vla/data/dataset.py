@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.data.cache import VisionCache
+from mme_vla.data.cache.store import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.memory.base import MemoryModule, stack_history
 from mme_vla.processing.processor import Processor
-from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.processing.subgoal_text import SubgoalText
 from mme_vla.types import VIEWS, Batch
 
 

@@ -13,17 +13,17 @@ import gymnasium
 import numpy as np
 import torch
 
-from mme_vla.envs.demonstrator import Demonstrator
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
-from mme_vla.envs.robot_control import PlanningError
+from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
-    from mme_vla.envs.base import MemoryTask
     from mme_vla.envs.subtasks import SubTask
+    from mme_vla.envs.task import MemoryTask
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from mme_vla.errors import UserError, did_you_mean
 if TYPE_CHECKING:
     import sapien
 
-    from mme_vla.envs.base import MemoryTask
+    from mme_vla.envs.task import MemoryTask
 
 IMAGE_SIZE = 256
 FOCAL_LENGTH = 128.0  # pixels: 90 degrees over 256 pixels

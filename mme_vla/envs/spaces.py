@@ -27,8 +27,8 @@ from mme_vla.envs.observations import IMAGE_SIZE
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
-    from mme_vla.envs.base import MemoryTask
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.task import MemoryTask
 
 
 class UnreachableError(RuntimeError):

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, trainable
 from mme_vla.training.console import ProgressLine, memory_gib
 from mme_vla.training.ema import EMA

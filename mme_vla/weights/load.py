@@ -10,15 +10,15 @@ from pathlib import Path
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.finetune import merge_state
-from mme_vla.policy import MMEPolicy
-from mme_vla.pretrained import assign_tensors, check_fit, dtype_of
+from mme_vla.policy.finetune import merge_state
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import assign_tensors, check_fit, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
+from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
 from mme_vla.weights.source import Source, open_source
-from mme_vla.weights.stats import read_stats, stats_files
 
 ADAPTERS: dict[str, Callable[[MMEPolicy], Adapter]] = {
     "lerobot": port_adapter,

@@ -5,7 +5,7 @@ import re
 import gymnasium
 from mani_skill.utils.registration import register_env
 
-from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.task import MemoryTask
 from mme_vla.registry import TASKS
 
 
