@@ -1,0 +1,19 @@
+"""The commands: the only place that reads a command line. `mme-vla NAME` and `python -m mme_vla NAME` run them."""
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "train": ("train", "train a policy"),
+    "evaluate": ("evaluate", "run a policy on the benchmark"),
+    "results": ("results", "tables, comparisons and a report from finished runs"),
+    "analyse": ("analyse", "what a memory attends to, selects, modulates and costs"),
+    "inspect": ("inspect", "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it"),
+    "serve": ("serve", "put a policy behind a port"),
+    "play": ("play", "play the tasks yourself, or let a model play"),
+    "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
+    "cache": ("cache", "the vision tokens of a dataset, computed once"),
+    "record": ("record", "demonstrate episodes of the benchmark and keep them as a dataset"),
+    "gallery": ("gallery", "the tasks at a glance, one demonstrated episode each, on one page"),
+    "weights": ("weights", "a checkpoint from one format to another"),
+    "subgoal-build": ("subgoal_build", "training data of the subgoal predictors"),
+    "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
+}
+"""Name on the command line → module of this room, and what it does in a line."""

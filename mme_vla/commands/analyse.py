@@ -279,7 +279,3 @@ def _parser() -> argparse.ArgumentParser:
     made.add_argument("--budgets", nargs="*", type=int, help=f"memory budgets; none named: {BUDGETS}")
     made.add_argument("--backbone", default="pi05", help="size (default: %(default)s)")
     return parser
-
-
-if __name__ == "__main__":
-    main()

@@ -194,7 +194,3 @@ def _spawn_as_usual() -> None:
     """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
     if multiprocessing.get_start_method() == "loky":
         multiprocessing.set_start_method("spawn", force=True)
-
-
-if __name__ == "__main__":
-    main()

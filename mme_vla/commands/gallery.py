@@ -145,7 +145,3 @@ def main() -> None:
     from mme_vla.config.composition import cli
 
     cli("show")(run)()
-
-
-if __name__ == "__main__":
-    main()

@@ -219,7 +219,3 @@ def _plain(value: Any) -> str:
 
 def _numbers(values: np.ndarray) -> str:
     return "  ".join(f"{x:.3f}" for x in values)
-
-
-if __name__ == "__main__":
-    main()

@@ -151,7 +151,3 @@ def _check_simulator(looks: bool) -> None:
     require_simulator()
     if looks:
         render_backend()
-
-
-if __name__ == "__main__":
-    main()

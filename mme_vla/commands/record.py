@@ -195,7 +195,3 @@ def main() -> None:
     from mme_vla.config.composition import cli
 
     cli("record")(run)()
-
-
-if __name__ == "__main__":
-    main()

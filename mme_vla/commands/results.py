@@ -154,7 +154,3 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
     parser.add_argument("--demo", action="store_true", help="made-up records with the paper's success rates")
     return parser
-
-
-if __name__ == "__main__":
-    main()

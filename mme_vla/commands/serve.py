@@ -67,7 +67,3 @@ async def run(server: "PolicyServer") -> None:
         logger.warning("stopped at once; requests were cut off")
         os._exit(1)  # the policy's thread cannot be interrupted
     logger.info("stopped · %s", server.stats.line())
-
-
-if __name__ == "__main__":
-    main()

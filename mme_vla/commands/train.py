@@ -112,7 +112,3 @@ def cache_command() -> str:
     if "--config-dir" in sys.argv[:-1]:
         words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
     return shlex.join(["python", "-m", "mme_vla.data.cache", *words])
-
-
-if __name__ == "__main__":
-    main()

@@ -10,7 +10,7 @@ deterministic.
 import io
 import string
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -59,12 +59,9 @@ def read_corpus() -> list[str]:
     return files("mme_vla").joinpath("assets/tokenizer_corpus.txt").read_text(encoding="utf-8").splitlines()
 
 
-def main(arguments: list[str]) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Train on the shipped corpus and write `tokenizer.model` into the folder named first, or the current one."""
+    arguments = sys.argv[1:] if arguments is None else arguments
     path = Path(arguments[0] if arguments else ".") / "tokenizer.model"
     path.write_bytes(train_tokenizer(read_corpus()))
     print(f"Wrote {path} ({VOCAB_SIZE} pieces).")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

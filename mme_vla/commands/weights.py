@@ -120,7 +120,3 @@ def _policy(found: Source, overrides: Sequence[str]) -> MMEPolicy:
     from mme_vla.policy.build import build_from_config
 
     return build_from_config(compose("policy", words), device="meta")
-
-
-if __name__ == "__main__":
-    main()

@@ -34,7 +34,7 @@ VERSION_BASE = "1.3"
 
 def config_dir() -> Path:
     """Return the folder of the YAML tree: inside the package when a wheel is installed, else the repository's."""
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parents[1]
     shipped = package / "configs"
     return shipped if shipped.is_dir() else package.parent / "configs"
 

@@ -27,16 +27,16 @@ __all__ = [
 
 _HOMES = {
     "EpisodeSpec": "metadata",
-    "Job": "vector_jobs",
-    "Reply": "vector_jobs",
+    "Job": "vector.jobs",
+    "Reply": "vector.jobs",
     "RoboMMEEnv": "interface",
-    "TASK_NAMES": "names",
-    "VecEnv": "vector",
+    "TASK_NAMES": "task_names",
+    "VecEnv": "vector.pool",
     "episode": "metadata",
     "episodes": "metadata",
     "load_tasks": "make",
     "make_env": "make",
-    "make_vec_env": "vector",
+    "make_vec_env": "vector.pool",
 }
 
 

@@ -1,36 +1,25 @@
-"""The environment every task is made from: robot, table, cameras, the order of a step, success and failure.
+"""The script every task is made from: the order of a step, success and failure, on the stage of `scene/stage.py`.
 
 A task says which objects there are (`plan`, `build`, `start_episode`), what happens to them (`before_physics`,
 `after_step`), and what is to be done (`subtasks`, `goals`, `choices`). Everything else is here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, ClassVar
 
-import numpy as np
-import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import sapien_utils
-from mani_skill.utils.scene_builder.table import TableSceneBuilder
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.scene.stage import Stage
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError, did_you_mean
 
-RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
-"""Joint angles at the start of every episode, and the target of the reset action; radians."""
 DIFFICULTIES = ("easy", "medium", "hard")
 RECOVERY_MODES = ("z", "xy")
-IMAGE_SIZE = 256
-FIELD_OF_VIEW = np.pi / 2
 
 
-class MemoryTask(BaseEnv):
+class MemoryTask(Stage):
     """One RoboMME task as a ManiSkill environment (paper, appendix on tasks).
 
     Args:
@@ -44,13 +33,8 @@ class MemoryTask(BaseEnv):
         UserError: an unknown difficulty or recovery mode, or a negative seed.
     """
 
-    SUPPORTED_REWARD_MODES = ("none", "dense")
-    stick: ClassVar[bool] = False
-    """The robot holds a stick instead of a gripper."""
     shared_draws: ClassVar[bool] = False
     """`plan`, `build` and `start_episode` draw from one generator; otherwise `plan` has one of its own."""
-    spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
-    """From where, and to where, the camera for people looks; no policy sees its pictures."""
     latch_failure: ClassVar[bool] = False
     """A failure lasts; otherwise it is judged anew at each step."""
     recovery_drawn_per_episode: ClassVar[bool] = False
@@ -62,11 +46,8 @@ class MemoryTask(BaseEnv):
         seed: int = 0,
         difficulty: str | None = None,
         recovery: str | None = None,
-        second_tries: bool = True,
         robomme_failure_recovery: bool = False,
         robomme_failure_recovery_mode: str | None = None,
-        robot_uids: str | None = None,
-        control_mode: str = "pd_joint_pos",
         **kwargs: Any,
     ) -> None:
         if seed < 0:
@@ -79,29 +60,16 @@ class MemoryTask(BaseEnv):
                 raise UserError(f"robomme_failure_recovery needs a robomme_failure_recovery_mode of {RECOVERY_MODES}.")
         if recovery is not None and recovery not in RECOVERY_MODES:
             raise UserError(f"Unknown recovery mode {recovery!r}. {did_you_mean(str(recovery), RECOVERY_MODES)}")
-        self.seed = seed
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
-        self.second_tries = second_tries
         self.recording = False
         """A demonstrator is recording: `dropped` is judged as it was when the official data were recorded."""
         self.observe: Callable[[dict[str, Any]], None] | None = None
         """Called in every step when the moment has come to observe: after the evaluation, whose info it gets, and
         before `after_step`."""
-        self.reset_in_progress = False
-        """The arm is being driven back between the conditioning video and the execution."""
-        self.after_video = False
-        """The arm has begun to be driven back after the conditioning video."""
-        self.stored_qpos: np.ndarray | None = None
-        """Joint angles [7] at the end of the stick's first approach, where its execution begins."""
         self.failed_pick: int | None = None
         """Index, among the picks of the execution, of the one that a recovery demonstration fails first."""
-        super().__init__(
-            *args,
-            robot_uids=robot_uids or (STICK if self.stick else WRISTCAM),
-            control_mode=control_mode,
-            **kwargs,
-        )
+        super().__init__(*args, seed=seed, **kwargs)
 
     # What a task supplies -----------------------------------------------------------------------------------------
 
@@ -143,18 +111,8 @@ class MemoryTask(BaseEnv):
 
     # The scene ----------------------------------------------------------------------------------------------------
 
-    def add[T: Thing](self, thing: T) -> T:
-        """Count an object as part of the scene, so that a reset brings it back."""
-        self.things.append(thing)
-        return thing
-
-    def _load_agent(self, options: dict) -> None:
-        super()._load_agent(options, sapien.Pose(ROBOT_BASE))
-
     def _load_scene(self, options: dict) -> None:
-        self.table = TableSceneBuilder(self, robot_init_qpos_noise=0)
-        self.table.build()
-        self.things: list[Thing] = []
+        self.set_up()
         draws = Draws(self.seed)
         self.plan(draws)
         if not self.shared_draws:
@@ -163,12 +121,7 @@ class MemoryTask(BaseEnv):
         self.draws, self._drawn = draws, draws.state()
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
-        self.table.initialize(env_idx)
-        fingers = [] if self.stick else [0.04, 0.04]
-        self.agent.reset(np.concatenate([RESET_QPOS, fingers]).astype(np.float32))
-        self.agent.robot.set_pose(sapien.Pose(ROBOT_BASE))
-        self.reset_in_progress = self.after_video = False
-        self.stored_qpos = None
+        self.tidy(env_idx)
         self.draws.restore(self._drawn)
         # The official construction initialises an episode twice, and what the second one draws counts.
         for attempt in range(2):
@@ -206,56 +159,3 @@ class MemoryTask(BaseEnv):
             "success": torch.tensor([self.success() and not self.progress.failed]),
             "fail": torch.tensor([self.progress.failed]),
         }
-
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
-        """Always zero: the benchmark has no reward."""
-        return torch.zeros(self.num_envs)
-
-    @property
-    def steps_done(self) -> int:
-        """Control steps since the reset."""
-        return int(self._elapsed_steps[0])
-
-    @property
-    def reset_action(self) -> np.ndarray:
-        """The action that holds the arm at its start: [8], or [7] for the stick."""
-        return RESET_QPOS if self.stick else np.append(RESET_QPOS, np.float32(1))
-
-    @property
-    def start_action(self) -> np.ndarray:
-        """The action whose step gives the first observation of the execution."""
-        return self.reset_action if self.stored_qpos is None else self.stored_qpos
-
-    # Robot state --------------------------------------------------------------------------------------------------
-
-    @property
-    def tcp_pose(self) -> sapien.Pose:
-        """Pose of the tool centre point in the world."""
-        return self.agent.tcp.pose.sp
-
-    @property
-    def qpos(self) -> np.ndarray:
-        """Joint positions [9] (seven angles, two fingers), or [7] for the stick."""
-        return self.agent.robot.get_qpos()[0].cpu().numpy()
-
-    @property
-    def fingers(self) -> np.ndarray:
-        """Finger positions [2] in metres; zeros for the stick."""
-        return np.zeros(2) if self.stick else self.qpos[-2:]
-
-    def is_grasping(self, thing: Thing) -> bool:
-        """Whether both fingers press on the object; never for the stick."""
-        return not self.stick and bool(self.agent.is_grasping(thing.entity)[0])
-
-    # Cameras ------------------------------------------------------------------------------------------------------
-
-    @property
-    def _default_sensor_configs(self) -> Sequence[CameraConfig]:
-        pose = sapien_utils.look_at(eye=[0.3, 0, 0.4], target=[0, 0, -0.2])
-        return [CameraConfig("base_camera", pose, IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW, 0.01, 100)]
-
-    @property
-    def _default_human_render_camera_configs(self) -> Sequence[CameraConfig]:
-        eye, target = self.spectator
-        pose = sapien_utils.look_at(eye=eye, target=target)
-        return [CameraConfig("render_camera", pose, 512, 512, 1, 0.01, 100)]

@@ -14,7 +14,7 @@ from mme_vla.envs.robot.kinematics import ARM_JOINTS, Arm
 from mme_vla.envs.robot.planning import plan_free, plan_screw
 
 if TYPE_CHECKING:
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.scene.stage import Stage
 
 OPEN, CLOSE = 1.0, -1.0
 """Gripper commands."""
@@ -43,7 +43,7 @@ class RobotControl:
 
     def __init__(
         self,
-        env: "MemoryTask",
+        env: "Stage",
         step: Callable[[np.ndarray], object],
         on_waypoint: Callable[[sapien.Pose, float], None] | None = None,
     ) -> None:

@@ -1,13 +1,6 @@
 """ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.containers import (
-    add_containers,
-    add_hidden_cubes,
-    container_choices,
-    container_picks,
-    hiding_goal,
-)
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Cover
 from mme_vla.envs.scene.objects import build_button
@@ -16,6 +9,13 @@ from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import MemoryTask
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.containers import (
+    add_containers,
+    add_hidden_cubes,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 from mme_vla.envs.tasks.video_unmask import CONTAINERS, PICKS
 
 LETTERS = ("b", "c")

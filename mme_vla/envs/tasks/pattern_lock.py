@@ -11,11 +11,11 @@ from mme_vla.envs.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.scene.objects import Disc, build_disc
 from mme_vla.envs.scene.placement import SceneError
 from mme_vla.envs.scene.predicates import over
-from mme_vla.envs.scene.stick import back_to_start
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.task import MemoryTask
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stick import back_to_start
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator

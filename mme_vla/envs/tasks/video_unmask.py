@@ -1,19 +1,19 @@
 """VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.containers import (
-    add_containers,
-    add_hidden_cubes,
-    container_choices,
-    container_picks,
-    hiding_goal,
-)
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, Cover
 from mme_vla.envs.scene.predicates import StaticFor
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import MemoryTask
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.containers import (
+    add_containers,
+    add_hidden_cubes,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 
 CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # asked for; in hard episodes as many as fit
 PICKS = {"easy": 1, "medium": 1, "hard": 2}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 REPLAN = 16
 """Frames that pass between two chunks of an episode."""
-_COUNTED = Path(__file__).resolve().parent.parent / "assets" / "cost.csv"
+_COUNTED = Path(__file__).resolve().parents[2] / "assets" / "cost.csv"
 
 
 @dataclass(frozen=True)

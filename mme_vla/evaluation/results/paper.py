@@ -8,7 +8,7 @@ from typing import NamedTuple
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.suites import PAPER_ORDER, TASK_FACTS
 
-FOLDER = Path(__file__).resolve().parent.parent / "assets" / "paper"
+FOLDER = Path(__file__).resolve().parents[2] / "assets" / "paper"
 
 
 class PaperMethod(NamedTuple):

@@ -7,7 +7,7 @@ It says nothing sensible, but it is the real architecture: tests and first runs 
 from pathlib import Path
 from typing import Any
 
-CORPUS = Path(__file__).resolve().parent.parent / "assets" / "tokenizer_corpus.txt"
+CORPUS = Path(__file__).resolve().parents[2] / "assets" / "tokenizer_corpus.txt"
 SPECIAL = (
     "<|endoftext|>", "<|im_start|>", "<|im_end|>", "<|object_ref_start|>", "<|object_ref_end|>", "<|box_start|>",
     "<|box_end|>", "<|vision_start|>", "<|vision_end|>", "<|image_pad|>", "<|video_pad|>",

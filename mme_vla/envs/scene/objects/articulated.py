@@ -10,7 +10,7 @@ from mme_vla.envs.scene.objects.shapes import RGB, XY, Shapes, at
 from mme_vla.envs.scene.things import Thing
 
 if TYPE_CHECKING:
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.scene.stage import Stage
 
 BUTTON_SCALE = 1.5
 BUTTON_BASE = (0.025 * BUTTON_SCALE, 0.025 * BUTTON_SCALE, 0.005 * BUTTON_SCALE)
@@ -99,7 +99,7 @@ class Peg(Thing):
         return self.head.segmentation_ids + self.tail.segmentation_ids
 
 
-def build_button(env: "MemoryTask", xy: XY, name: str = "button") -> Button:
+def build_button(env: "Stage", xy: XY, name: str = "button") -> Button:
     """A button on the table."""
     builder = env.scene.create_articulation_builder()
     base = builder.create_link_builder()
@@ -125,7 +125,7 @@ def build_button(env: "MemoryTask", xy: XY, name: str = "button") -> Button:
 
 
 def build_peg(
-    env: "MemoryTask",
+    env: "Stage",
     name: str,
     length: float,
     radius: float,

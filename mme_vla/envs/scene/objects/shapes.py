@@ -9,7 +9,7 @@ import sapien.render
 from transforms3d.euler import euler2quat
 
 if TYPE_CHECKING:
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.scene.stage import Stage
 
 type RGB = tuple[float, float, float]
 type XY = Sequence[float] | np.ndarray
@@ -35,7 +35,7 @@ class Shapes:
         builder: collects the shapes; by default that of a new actor.
     """
 
-    def __init__(self, env: "MemoryTask", builder: Any = None) -> None:
+    def __init__(self, env: "Stage", builder: Any = None) -> None:
         self._visible = env.scene.can_render()
         self._builder = env.scene.create_actor_builder() if builder is None else builder
 

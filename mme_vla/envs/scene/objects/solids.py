@@ -10,7 +10,7 @@ from mme_vla.envs.scene.objects.shapes import BELOW_TABLE, RGB, UPRIGHT, XY, Sha
 from mme_vla.envs.scene.things import Thing
 
 if TYPE_CHECKING:
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.scene.stage import Stage
 
 H = 0.02
 """Half the edge of a cube, metres."""
@@ -81,25 +81,25 @@ def _rgb(colour: str | RGB) -> RGB:
     return COLOURS[colour] if isinstance(colour, str) else colour
 
 
-def build_cube(env: "MemoryTask", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:
+def build_cube(env: "Stage", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:
     """A cube lying on the table."""
     actor = Shapes(env).solid_box([half_size] * 3, _rgb(colour)).build(name, at(xy, half_size, yaw))
     return Cube(name, actor, colour, half_size)
 
 
-def build_hidden_cube(env: "MemoryTask", name: str, colour: str, xy: XY) -> Cube:
+def build_hidden_cube(env: "Stage", name: str, colour: str, xy: XY) -> Cube:
     """A smaller cube, as it lies under a container."""
     return build_cube(env, name, colour, xy, half_size=HIDDEN_H)
 
 
-def build_moving_cube(env: "MemoryTask", name: str, colour: RGB, xy: XY, z: float) -> Cube:
+def build_moving_cube(env: "Stage", name: str, colour: RGB, xy: XY, z: float) -> Cube:
     """A cube that nothing can touch and that moves only when told to."""
     actor = Shapes(env).box([H] * 3, colour).build(name, at(xy, z), kinematic=True)
     return Cube(name, actor, colour)
 
 
 def build_disc(
-    env: "MemoryTask",
+    env: "Stage",
     name: str,
     radius: float,
     thickness: float,
@@ -124,7 +124,7 @@ def build_disc(
 
 
 def build_highlight(
-    env: "MemoryTask", name: str, radius: float, half_length: float, colour: RGB = WHITE, rings: bool = False
+    env: "Stage", name: str, radius: float, half_length: float, colour: RGB = WHITE, rings: bool = False
 ) -> Disc:
     """A disc that marks something for a while; it waits below the table.
 
@@ -141,12 +141,12 @@ def build_highlight(
     return Disc(name, shapes.build(name, sapien.Pose(BELOW_TABLE, UPRIGHT), kinematic=True), radius)
 
 
-def build_sphere(env: "MemoryTask", name: str, radius: float, colour: RGB = WHITE) -> Thing:
+def build_sphere(env: "Stage", name: str, radius: float, colour: RGB = WHITE) -> Thing:
     """A ball that nothing can touch; it waits below the table."""
     return Thing(name, Shapes(env).sphere(radius, colour).build(name, sapien.Pose(BELOW_TABLE), kinematic=True))
 
 
-def build_container(env: "MemoryTask", name: str, xy: XY, yaw: float = 0.0) -> Container:
+def build_container(env: "Stage", name: str, xy: XY, yaw: float = 0.0) -> Container:
     """A container standing on the table, opening down."""
     wall, lid = CONTAINER_WALL / 2, CONTAINER_LID / 2
     middle = CONTAINER_INNER / 2 + wall
@@ -163,7 +163,7 @@ def build_container(env: "MemoryTask", name: str, xy: XY, yaw: float = 0.0) -> C
     return Container(name, shapes.build(name, pose))
 
 
-def build_board(env: "MemoryTask", xy: XY, yaw: float = 0.0, name: str = "board") -> Board:
+def build_board(env: "Stage", xy: XY, yaw: float = 0.0, name: str = "board") -> Board:
     """The frame with a hole; a black block hides the lower half of the hole."""
     side, hole, height = BOARD_SIDE / 2, BOARD_HOLE / 2, BOARD_HEIGHT / 2
     strip = (side - hole) / 2
@@ -176,7 +176,7 @@ def build_board(env: "MemoryTask", xy: XY, yaw: float = 0.0, name: str = "board"
 
 
 def build_aperture_box(
-    env: "MemoryTask",
+    env: "Stage",
     xy: XY,
     yaw: float,
     inner: float = 0.017,
@@ -204,7 +204,7 @@ def build_aperture_box(
     return Thing(name, shapes.build(name, at(xy, APERTURE_Z, yaw), kinematic=True))
 
 
-def build_obstacle(env: "MemoryTask", name: str, xy: XY, yaw: float, colour: RGB) -> Thing:
+def build_obstacle(env: "Stage", name: str, xy: XY, yaw: float, colour: RGB) -> Thing:
     """An upright block, thin along its y axis, to be circled around."""
     half = [0.03, 0.015, 0.05]
     return Thing(name, Shapes(env).solid_box(half, colour).build(name, at(xy, half[2], yaw), kinematic=True))

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 
 from mme_vla.envs.scene.anchors import ANCHOR_HALF, Point, swaps_in_turn
-from mme_vla.envs.scene.containers import add_hidden_cubes
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
 from mme_vla.envs.scene.objects import Container, H, build_container
 from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_container
 from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.tasks.families.containers import add_hidden_cubes
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
 SWAPS = {"easy": (1, 2), "medium": (1, 2), "hard": (2, 3)}  # fewest and most

@@ -1,8 +1,9 @@
 """What the two stick tasks share."""
 
 from mme_vla.envs.scene.predicates import reset_reached
+from mme_vla.envs.scene.stage import RESET_QPOS
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import RESET_QPOS, MemoryTask
+from mme_vla.envs.task import MemoryTask
 
 
 def back_to_start(env: MemoryTask, steps: int = 30) -> list[SubTask]:

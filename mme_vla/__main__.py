@@ -1,0 +1,26 @@
+"""`mme-vla COMMAND …`, the same as `python -m mme_vla COMMAND …`: the library's commands under one name."""
+
+import sys
+from importlib import import_module
+
+from mme_vla.commands import COMMANDS
+from mme_vla.errors import did_you_mean
+
+
+def main() -> None:
+    """Run the command that the first word names, with the words after it; without one, list the commands."""
+    name, *words = sys.argv[1:] or ["--help"]
+    if name in ("-h", "--help"):
+        width = max(map(len, COMMANDS))
+        lines = "\n".join(f"  {command:<{width}}  {does}" for command, (_, does) in COMMANDS.items())
+        print(f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more of one.")
+        return
+    if name not in COMMANDS:
+        print(f"mme-vla: there is no command {name!r}. {did_you_mean(name, COMMANDS)}", file=sys.stderr)
+        raise SystemExit(2)
+    sys.argv = [f"mme-vla {name}", *words]
+    import_module(f"mme_vla.commands.{COMMANDS[name][0]}").main()
+
+
+if __name__ == "__main__":
+    main()

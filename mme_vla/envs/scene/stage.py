@@ -1,0 +1,139 @@
+"""The stage of a task: robot, table, cameras and the clock, before there is anything to do."""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.scene_builder.table import TableSceneBuilder
+
+from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
+from mme_vla.envs.scene.things import Thing
+
+RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
+"""Joint angles at the start of every episode, and the target of the reset action; radians."""
+IMAGE_SIZE = 256
+FIELD_OF_VIEW = np.pi / 2
+
+
+class Stage(BaseEnv):
+    """A robot at a table under two cameras. What stands on the table, and why, is the script's: `MemoryTask`.
+
+    Args:
+        seed: fixes the scene and the script; the `seed` of `reset` has no effect.
+        second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
+    """
+
+    SUPPORTED_REWARD_MODES = ("none", "dense")
+    stick: ClassVar[bool] = False
+    """The robot holds a stick instead of a gripper."""
+    spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
+    """From where, and to where, the camera for people looks; no policy sees its pictures."""
+
+    def __init__(
+        self,
+        *args: Any,
+        seed: int = 0,
+        second_tries: bool = True,
+        robot_uids: str | None = None,
+        control_mode: str = "pd_joint_pos",
+        **kwargs: Any,
+    ) -> None:
+        self.seed = seed
+        self.second_tries = second_tries
+        self.reset_in_progress = False
+        """The arm is being driven back between the conditioning video and the execution."""
+        self.after_video = False
+        """The arm has begun to be driven back after the conditioning video."""
+        self.stored_qpos: np.ndarray | None = None
+        """Joint angles [7] at the end of the stick's first approach, where its execution begins."""
+        super().__init__(
+            *args,
+            robot_uids=robot_uids or (STICK if self.stick else WRISTCAM),
+            control_mode=control_mode,
+            **kwargs,
+        )
+
+    # The scene ----------------------------------------------------------------------------------------------------
+
+    def add[T: Thing](self, thing: T) -> T:
+        """Count an object as part of the scene, so that a reset brings it back."""
+        self.things.append(thing)
+        return thing
+
+    def _load_agent(self, options: dict) -> None:
+        super()._load_agent(options, sapien.Pose(ROBOT_BASE))
+
+    def set_up(self) -> None:
+        """Put up the table, with nothing on it."""
+        self.table = TableSceneBuilder(self, robot_init_qpos_noise=0)
+        self.table.build()
+        self.things: list[Thing] = []
+
+    def tidy(self, env_idx: torch.Tensor) -> None:
+        """Bring table and robot back to their start."""
+        self.table.initialize(env_idx)
+        fingers = [] if self.stick else [0.04, 0.04]
+        self.agent.reset(np.concatenate([RESET_QPOS, fingers]).astype(np.float32))
+        self.agent.robot.set_pose(sapien.Pose(ROBOT_BASE))
+        self.reset_in_progress = self.after_video = False
+        self.stored_qpos = None
+
+    # The clock ----------------------------------------------------------------------------------------------------
+
+    @property
+    def steps_done(self) -> int:
+        """Control steps since the reset."""
+        return int(self._elapsed_steps[0])
+
+    @property
+    def reset_action(self) -> np.ndarray:
+        """The action that holds the arm at its start: [8], or [7] for the stick."""
+        return RESET_QPOS if self.stick else np.append(RESET_QPOS, np.float32(1))
+
+    @property
+    def start_action(self) -> np.ndarray:
+        """The action whose step gives the first observation of the execution."""
+        return self.reset_action if self.stored_qpos is None else self.stored_qpos
+
+    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict) -> torch.Tensor:
+        """Always zero: the benchmark has no reward."""
+        return torch.zeros(self.num_envs)
+
+    # Robot state --------------------------------------------------------------------------------------------------
+
+    @property
+    def tcp_pose(self) -> sapien.Pose:
+        """Pose of the tool centre point in the world."""
+        return self.agent.tcp.pose.sp
+
+    @property
+    def qpos(self) -> np.ndarray:
+        """Joint positions [9] (seven angles, two fingers), or [7] for the stick."""
+        return self.agent.robot.get_qpos()[0].cpu().numpy()
+
+    @property
+    def fingers(self) -> np.ndarray:
+        """Finger positions [2] in metres; zeros for the stick."""
+        return np.zeros(2) if self.stick else self.qpos[-2:]
+
+    def is_grasping(self, thing: Thing) -> bool:
+        """Whether both fingers press on the object; never for the stick."""
+        return not self.stick and bool(self.agent.is_grasping(thing.entity)[0])
+
+    # Cameras ------------------------------------------------------------------------------------------------------
+
+    @property
+    def _default_sensor_configs(self) -> Sequence[CameraConfig]:
+        pose = sapien_utils.look_at(eye=[0.3, 0, 0.4], target=[0, 0, -0.2])
+        return [CameraConfig("base_camera", pose, IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW, 0.01, 100)]
+
+    @property
+    def _default_human_render_camera_configs(self) -> Sequence[CameraConfig]:
+        eye, target = self.spectator
+        pose = sapien_utils.look_at(eye=eye, target=target)
+        return [CameraConfig("render_camera", pose, 512, 512, 1, 0.01, 100)]

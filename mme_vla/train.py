@@ -1,0 +1,6 @@
+"""`python -m mme_vla.train`: the command is mme_vla/commands/train.py."""
+
+from mme_vla.commands.train import main
+
+if __name__ == "__main__":
+    main()
