@@ -1,9 +1,10 @@
 """Name → class tables. A decorator registers; a Hydra config names the key."""
 
-from collections.abc import Callable, Iterator
+import inspect
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean
 
 
 class Registry[T]:
@@ -42,6 +43,38 @@ class Registry[T]:
             return self._entries[name]
         except KeyError:
             raise UserError(f"Unknown {self.kind} {name!r}. {did_you_mean(str(name), self._entries)}") from None
+
+    def build(self, section: Mapping[str, Any], *args: Any, **fixed: Any) -> Any:
+        """Call the constructor that a section of the configuration names, with the section's other keys as options.
+
+        The options are compared with the constructor's signature before it is called, so that whatever goes wrong
+        inside it keeps its own traceback.
+
+        Args:
+            section: `name`, and the options. args, fixed: what the caller adds; no option may say the same.
+
+        Raises:
+            UserError: no name, an unknown one, an option the constructor does not take, or one that is missing.
+        """
+        options = {key: value for key, value in section.items() if key != "name"}
+        if not isinstance(section.get("name"), str):
+            raise UserError(f"The section of the {self.kind} needs a name. {did_you_mean('', self._entries)}")
+        entry: Any = self[section["name"]]
+        what = f"{self.kind} {section['name']!r}"
+        if twice := sorted(set(options) & set(fixed)):
+            raise UserError(f"{what}: {twice[0]} is not an option; it follows from the other parts.")
+        signature = inspect.signature(entry)
+        try:
+            signature.bind(*args, **fixed, **options)
+        except TypeError as error:
+            kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+            own = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
+            takes = own[len(args) :]
+            unknown = [name for name in options if name not in takes]
+            hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
+            given = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
+            raise UserError(f"{what} does not take these options: {given} ({error}). {hint}") from None
+        return entry(*args, **fixed, **options)
 
     def __contains__(self, name: object) -> bool:
         return name in self._entries

@@ -8,7 +8,7 @@ import torch
 from mme_vla import MMEPolicy, UserError
 from mme_vla.commands.weights import convert
 from mme_vla.config.composition import compose, config_dir
-from mme_vla.policy.finetune import HEADS, apply_finetuning, merge_adapters, part_of
+from mme_vla.policy.finetune import apply_finetuning, merge_adapters
 from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.weights import load_into
 
@@ -51,7 +51,7 @@ def test_full_learns_all_but_the_vision_tower(variant: str) -> None:
 def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None:
     policy = small_policy(variant)
     counts = apply_finetuning(policy, "expert_only")
-    assert {part_of(name) for name in learning(policy)} == {"action", "memory"} - (
+    assert {policy.part_of(name) for name in learning(policy)} == {"action", "memory"} - (
         {"memory"} if variant == "pi05" else set()
     )
     assert counts["vlm"] == counts["vision"] == 0
@@ -69,7 +69,9 @@ def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> 
     counts = apply_finetuning(policy, "lora", rank=4, alpha=8)
     assert torch.equal(chunk(policy), plain)
     assert counts["vision"] == 0
-    assert all(".lora_" in n or part_of(n) == "memory" or n.split(".")[1] in HEADS for n in learning(policy))
+    assert all(
+        ".lora_" in n or policy.part_of(n) == "memory" or n.split(".")[1] in policy.heads for n in learning(policy)
+    )
     frozen = {n: p.clone() for n, p in policy.named_parameters() if not p.requires_grad}
     stir(policy)
     optimizer = torch.optim.SGD([p for p in policy.parameters() if p.requires_grad], lr=0.1)

@@ -9,9 +9,10 @@ from safetensors.torch import load_file
 from torch import nn
 
 from mme_vla.errors import UserError
+from mme_vla.testing.small import small_policy
 from mme_vla.training.ema import EMA
 from mme_vla.training.optim import clip_gradients, learning_rate, make_optimizer
-from mme_vla.training.order import BatchOrder, draw_flow, seed_of
+from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.settings import TrainSettings
 
 
@@ -86,12 +87,13 @@ def test_impossible_batches_are_refused() -> None:
         BatchOrder(30, 4, 0, range(1), processes=3)
 
 
-def test_flow_draws_depend_on_the_key_alone() -> None:
-    noise, time = draw_flow(4, 2, 3, "beta", 1, "train", 7)
+def test_what_a_loss_draws_depends_on_the_key_alone() -> None:
+    policy = small_policy("pi05")
+    first = policy.loss_draws(4, generator_for(1, "train", 7))
     torch.manual_seed(123)
-    again, time_again = draw_flow(4, 2, 3, "beta", 1, "train", 7)
-    assert torch.equal(noise, again)
-    assert torch.equal(time, time_again)
+    again = policy.loss_draws(4, generator_for(1, "train", 7))
+    assert {name: len(value) for name, value in first.items()} == {"noise": 4, "time": 4}
+    assert all(torch.equal(first[name], again[name]) for name in first)
     assert seed_of(1, "train", 7) != seed_of(1, "train", 8)
 
 

@@ -7,6 +7,7 @@ import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.pictures import to_unit_range
 from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
 
 TOLERANCE = 2e-5
@@ -42,10 +43,10 @@ def test_cached_prefix_equals_the_joint_pass(policy):
     batch = random_batch(policy)
     noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(2))
     time_ = torch.full((2,), 0.7)
-    prefix, hook = policy.prefill(batch)
+    prefix, injection = prefill(policy, batch)
     action = policy.backbone.action_block(noise)
     layout = policy.backbone.transformer.layout([action], policy.integration.visibility, prefix)
-    cached = policy.denoise(noise, policy.backbone.time_condition(time_), layout, prefix, hook)
+    cached = policy.backbone.denoise(noise, policy.backbone.time_condition(time_), layout, prefix, injection)
     assert (cached - policy.velocity(batch, noise, time_)).abs().max() < TOLERANCE
 
 
@@ -167,10 +168,17 @@ def test_released_modulator_starts_near_the_memoryless_policy():
     assert 0 < distance < 0.05
 
 
+def prefill(policy, batch):
+    """Keys and values of the prefix, and what the memory injects."""
+    memory = policy.encode_memory(batch.history)
+    images = to_unit_range(batch.images)
+    return policy.backbone.prefill(batch, images, lambda blocks: policy.integration.inject(blocks, memory))
+
+
 @torch.no_grad()
 def prefix_keys(policy, batch):
     """Last-layer keys of the valid image and prompt tokens."""
-    prefix, _ = policy.prefill(batch)
+    prefix, _ = prefill(policy, batch)
     after_memory = slice(policy.memory.budget, None)
     return prefix.layers[-1][0][:, after_memory][prefix.mask[:, after_memory]]
 

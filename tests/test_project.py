@@ -1,6 +1,5 @@
-"""The shell of the project: pins, the two commands, which room may import which, and what must not be in the files."""
+"""The shell of the project: pins, the two commands, and what must not be in the files."""
 
-import ast
 import re
 import subprocess
 import sys
@@ -12,13 +11,6 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PACKAGE = REPOSITORY / "mme_vla"
-
-# From the top: a room imports only from itself and from rooms further down.
-ROOMS = [
-    "play", "loading", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy",
-    "saving", "episode", "subgoal", "finetune", "card", "processing", "integration", "memory", "backbone",
-    "config", "config_errors", "hub", "pretrained", "naming", "types", "registry", "devices", "files", "errors",
-]  # fmt: skip
 
 
 def pyproject() -> dict:
@@ -61,37 +53,6 @@ def test_links_in_the_documentation_lead_to_files() -> None:
             if "://" not in target and not (page.parent / target).exists():
                 broken.append(f"{page.relative_to(REPOSITORY)} → {target}")
     assert broken == []
-
-
-def test_rooms_import_only_from_rooms_below_them() -> None:
-    wrong = []
-    for file in PACKAGE.rglob("*.py"):
-        room = room_of(file.relative_to(PACKAGE).with_suffix("").as_posix())
-        tree = ast.parse(file.read_text())
-        if room == "__init__" or is_command(tree):
-            continue
-        assert room in ROOMS, f"{file} is in no known room: add it to ROOMS in this test, and to docs/architecture.md"
-        for module in imports_at_run_time(tree):
-            if module.startswith("mme_vla."):
-                target = room_of(module.removeprefix("mme_vla.").replace(".", "/"))
-                if target not in ROOMS or ROOMS.index(target) < ROOMS.index(room):
-                    wrong.append(f"{file.relative_to(REPOSITORY)} imports {module}")
-    assert wrong == []
-
-
-def test_memory_and_backbone_do_not_know_each_other() -> None:
-    for room, other in (("memory", "backbone"), ("backbone", "memory")):
-        for file in (PACKAGE / room).rglob("*.py"):
-            named = [m for m in imports_at_run_time(ast.parse(file.read_text())) if m.startswith(f"mme_vla.{other}")]
-            assert named == [], file
-
-
-def test_the_core_does_without_transformers() -> None:
-    for file in PACKAGE.rglob("*.py"):
-        if file.relative_to(PACKAGE).parts[0] == "subgoal":  # language models that predict subgoals
-            continue
-        roots = {module.split(".")[0] for module in imports_at_run_time(ast.parse(file.read_text()))}
-        assert "transformers" not in roots, file
 
 
 def test_no_file_names_a_place_on_somebodys_machine() -> None:
@@ -141,26 +102,6 @@ def run_python(code: str) -> None:
     lines = "\n".join(line.strip() for line in code.strip().splitlines())
     done = subprocess.run([sys.executable, "-c", lines], capture_output=True, text=True, cwd=REPOSITORY)
     assert done.returncode == 0, done.stderr
-
-
-def room_of(path: str) -> str:
-    return path.split("/")[0]
-
-
-def is_command(tree: ast.Module) -> bool:
-    return any(isinstance(node, ast.If) and "__main__" in ast.unparse(node.test) for node in tree.body)
-
-
-def imports_at_run_time(tree: ast.AST) -> Iterator[str]:
-    """Every absolute module imported anywhere in the file, except for type checkers alone."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            continue
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            yield from (f"{node.module}.{a.name}" if node.module == "mme_vla" else node.module for a in node.names)
-        yield from imports_at_run_time(node)
 
 
 def project_files() -> Iterator[Path]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import torch
 
     from mme_vla.evaluation.rollout.evaluation import Evaluation
-    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.policy.base import Policy
     from mme_vla.subgoal import SubgoalPredictor, Usage
 
 # Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
@@ -99,7 +99,7 @@ def choose_device(name: str) -> "torch.device":
 
 
 def choose_subgoals(
-    policy: "MMEPolicy",
+    policy: "Policy",
     section: dict[str, Any] | None,
     mode: str = "inline",
     device: "torch.device | None" = None,

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.memory.base import MemoryModule
+    from mme_vla.policy.base import Policy
 
 
 @cli("inspect")
@@ -53,11 +54,9 @@ def show_checkpoint(folder: Path, console: "Console") -> None:
     folder = resolve_checkpoint(folder)
     policy = MMEPolicy.from_pretrained(folder)
     table = _table(str(folder), "part", "tensors", "parameters", "dtype")
-    for name, part in _parts(policy):
-        tensors = list(part.parameters())
-        if tensors:
-            dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
-            table.add_row(name, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
+    for part, tensors in _parts(policy).items():
+        dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
+        table.add_row(part, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
     total = list(policy.parameters())
     table.add_row("all", str(len(total)), f"{sum(t.numel() for t in total):,}", "", style="bold")
     console.print(table)
@@ -142,11 +141,7 @@ def build_memory(cfg: DictConfig) -> "MemoryModule":
     from mme_vla.registry import MEMORIES
 
     options: Any = OmegaConf.to_container(cfg.memory, resolve=True)
-    name = options.pop("name")
-    try:
-        return MEMORIES[name](d_vision=cfg.backbone.vlm.width, width=cfg.backbone.action.width, **options)
-    except TypeError as error:
-        raise UserError(f"memory {name!r} does not take these options: {options} ({error}).") from error
+    return MEMORIES.build(options, d_vision=cfg.backbone.vlm.width, width=cfg.backbone.action.width)
 
 
 def draw_memory(
@@ -187,18 +182,12 @@ def _no_tokens(frames: int, patches: int) -> Any:
     return torch.zeros(frames, patches, 1)  # selections never look at tokens
 
 
-def _parts(policy: Any) -> list[tuple[str, Any]]:
-    from torch import nn
-
-    experts = {name: nn.ModuleList(block.experts[name] for block in policy.backbone.transformer.layers)
-               for name in policy.backbone.transformer.layers[0].experts}  # fmt: skip
-    return [
-        ("vision tower", policy.backbone.vision),
-        ("word embedding", policy.backbone.embedding),
-        *((f"{name} expert", part) for name, part in experts.items()),
-        ("memory", policy.memory or nn.Module()),
-        ("integration", policy.integration),
-    ]
+def _parts(policy: "Policy") -> dict[str, list[Any]]:
+    """Parameters by the parts that fine-tuning speaks of, in the policy's order."""
+    found: dict[str, list[Any]] = {}
+    for name, parameter in policy.named_parameters():
+        found.setdefault(policy.part_of(name), []).append(parameter)
+    return found
 
 
 def _table(title: str, *columns: str) -> "Table":

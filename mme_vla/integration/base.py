@@ -1,11 +1,11 @@
 """`Integration`: the one room that knows both memory and backbone, through the backbone's two doors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
-from torch import nn
+from torch import Tensor, nn
 
+from mme_vla.backbone.base import Hook, Injection
 from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Block, Visibility
-from mme_vla.backbone.pi05.gemma import Hook
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 from mme_vla.types import MemoryTokens
 
@@ -32,6 +32,8 @@ class Integration(nn.Module):
         extra_experts: experts the backbone has to have besides its own two.
         blocks: the prefix's block list, memory in its place.
         hook: the action expert's per-layer hook for this chunk, with all that depends on memory alone computed now.
+        condition: what becomes of the condition of the action expert's norms (the embedded flow time).
+        beside: blocks that stand beside the actions in every step; `visibility` needs rows for them.
     """
 
     memory_width: int = 0
@@ -48,6 +50,26 @@ class Integration(nn.Module):
 
     def hook(self, memory: MemoryTokens | None) -> Hook | None:
         return None
+
+    def condition(self, memory: MemoryTokens | None) -> Callable[[Tensor], Tensor] | None:
+        return None
+
+    def beside(self, memory: MemoryTokens | None) -> Sequence[Block]:
+        return ()
+
+    def inject(self, observation: Sequence[Block], memory: MemoryTokens | None) -> Injection:
+        """All that enters the backbone for one chunk, from its observation blocks and the memory's tokens."""
+        return Injection(
+            self.blocks(observation, memory), self.visibility, self.hook(memory), self.condition(memory),
+            self.beside(memory),
+        )  # fmt: skip
+
+    def uses(self) -> frozenset[str]:
+        """Which of a backbone's doors (`Backbone.hosts`) this integration goes through: those it overrides."""
+        base, own = Integration, type(self)
+        doors = ("blocks", "hook", "condition", "beside")
+        used = {door for door in doors if getattr(own, door) is not getattr(base, door)}
+        return frozenset(used | ({"expert"} if self.extra_experts() else set()))
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:

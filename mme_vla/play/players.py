@@ -144,11 +144,5 @@ def build_player(config: Mapping[str, Any]) -> Player:
     Raises:
         UserError: an unknown player or option.
     """
-    options = {key: value for key, value in config.items() if key != "name"}
-    player = PLAYERS[str(config.get("name"))]
-    try:
-        return player(**options)
-    except TypeError as error:
-        raise UserError(
-            f"The player {config.get('name')!r} does not take these options: {options} ({error})."
-        ) from error
+    player: Player = PLAYERS.build(config)
+    return player

@@ -1,7 +1,7 @@
 """One running episode: all streaming state lives here, never on the policy."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import torch
@@ -12,13 +12,29 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.types import VIEWS, HistoryTokens
 
 if TYPE_CHECKING:
-    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.memory.base import MemoryModule
+    from mme_vla.processing.processor import Processor
+
+
+class Host(Protocol):
+    """What an episode asks of its policy."""
+
+    @property
+    def memory(self) -> "MemoryModule | None": ...
+
+    def require_memory(self) -> "MemoryModule": ...
+
+    def require_processor(self) -> "Processor": ...
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor: ...
+
+    def sample_draws(self, generator: torch.Generator) -> dict[str, Tensor]: ...
 
 
 class Episode:
     """What the policy knows of one episode: goal, current view and state, and the history of past frames."""
 
-    def __init__(self, policy: "MMEPolicy", goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
         self._policy = policy
         self._generator = torch.Generator().manual_seed(seed)
         self._images: Tensor | None = None
@@ -181,10 +197,9 @@ class Episode:
             raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
         return executed
 
-    def draw_noise(self) -> Tensor:
-        """The next chunk's starting noise [h, a], from this episode's own generator: batching cannot change it."""
-        config = self._policy.backbone.config
-        return torch.randn(config.horizon, config.action_dim, generator=self._generator)
+    def draw(self) -> dict[str, Tensor]:
+        """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
+        return self._policy.sample_draws(self._generator)
 
     def _require_observation(self) -> None:
         if self._state is None:

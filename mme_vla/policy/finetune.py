@@ -1,47 +1,53 @@
 """Which parameters of a policy learn: all of them, the action side, or low-rank adapters (configs/finetune).
 
-Parts of a policy, from the outside in: `vision` (tower and projector), `vlm` (token embedding and VLM expert), `action`
-(action expert, its final norm, action and time heads) and `memory` (memory, integration, and the memory's own expert).
+A policy says which parameters are which part (`Policy.parts`). Of π0.5, from the outside in: `vision` (tower and
+projector), `vlm` (token embedding and VLM expert), `action` (action expert, its final norm, action and time heads) and
+`memory` (memory, integration, and the memory's own expert).
 """
 
 import re
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol
 
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, did_you_mean
 
-if TYPE_CHECKING:
-    from mme_vla.policy.saving import Saved
-
-PARTS = ("vision", "vlm", "action", "memory")
 MODES = ("full", "expert_only", "lora")
 ADAPTER = "default"  # peft's name of the one adapter a policy carries
 
-TARGETS = tuple(
-    f"experts.{expert}.{layer}"
-    for expert in ("vlm", "action")
-    for layer in ("qkv", *(("kv",) if expert == "vlm" else ()), "out", "mlp.gate_up", "mlp.down")
-)
-"""Attention and MLP matrices of both experts; `kv` is what the VLM's last layer has in place of `qkv`."""
 
-HEADS = ("action_in", "action_out", "time_in", "time_out")
+class Tunable(Protocol):
+    """What fine-tuning asks of a policy, which is an `nn.Module` besides; see `Policy` for the words."""
 
-# These are computed in float32 from their weight alone, past any adapter that wraps them.
-_FLOAT32 = re.compile(rf"\.({'|'.join(HEADS)}|\w*norm\.dense)$")
+    config: dict[str, Any]
+    adapted: Sequence[str]
+    heads: Sequence[str]
+    unadaptable: str | None
+
+    def parts(self) -> Mapping[str, str]: ...
+
+    def part_of(self, name: str) -> str: ...
+
+    def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]: ...
+
+    def named_modules(self) -> Iterator[tuple[str, nn.Module]]: ...
+
+    def parameters(self) -> Iterator[nn.Parameter]: ...
+
+    def get_submodule(self, target: str) -> nn.Module: ...
 
 
 def apply_finetuning(
-    policy: "Saved",
+    policy: Tunable,
     mode: str = "full",
     *,
     freeze_vision: bool = True,
     rank: int = 16,
     alpha: float = 16.0,
     dropout: float = 0.0,
-    targets: Sequence[str] = TARGETS,
-    train: Sequence[str] = ("memory", *HEADS),
+    targets: Sequence[str] | None = None,
+    train: Sequence[str] | None = None,
 ) -> dict[str, int]:
     """Set which parameters of a policy receive gradients; in mode `lora`, add the adapters that do.
 
@@ -52,8 +58,10 @@ def apply_finetuning(
             `targets`, and in full what `train` names.
         freeze_vision: leave the vision tower as it is in every mode; needed where a memory reads cached tokens.
         rank, alpha, dropout: of the adapters: W + (alpha / rank)·B·A.
-        targets: linear layers, by the end of their name: `experts.vlm.qkv` is that matrix in every layer.
-        train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`.
+        targets: linear layers, by the end of their name: `experts.vlm.qkv` is that matrix in every layer. By default
+            those the policy names (`Policy.adapted`).
+        train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`. By
+            default the memory and the policy's heads.
 
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
@@ -63,11 +71,12 @@ def apply_finetuning(
     """
     if mode not in MODES:
         raise UserError(f"finetune.mode={mode!r}. {did_you_mean(str(mode), MODES)}")
+    train = ("memory", *policy.heads) if train is None else train
     if mode == "lora":
         in_full = _named(policy, train)  # before anything is changed
         add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, targets=targets)
     for name, parameter in policy.named_parameters():
-        part = part_of(name)
+        part = policy.part_of(name)
         if mode == "full":
             learns = True
         elif mode == "expert_only":
@@ -75,25 +84,14 @@ def apply_finetuning(
         else:
             learns = ".lora_" in name or any(name.startswith(f"{module}.") for module in in_full) or part in train
         parameter.requires_grad_(learns and not (part == "vision" and freeze_vision))
-    counts = dict.fromkeys(PARTS, 0)
+    counts = dict.fromkeys(policy.parts(), 0)
     for name, parameter in policy.named_parameters():
-        counts[part_of(name)] += parameter.numel() if parameter.requires_grad else 0
+        counts[policy.part_of(name)] += parameter.numel() if parameter.requires_grad else 0
     return counts
 
 
-def part_of(name: str) -> str:
-    """The part of a policy that a parameter belongs to."""
-    if name.startswith("backbone.vision."):
-        return "vision"
-    if name.startswith("backbone.embedding.") or ".experts.vlm." in name:
-        return "vlm"
-    if not name.startswith("backbone.") or re.search(r"\.experts\.(?!action\.)", name):
-        return "memory"
-    return "action"
-
-
 def add_adapters(
-    policy: "Saved", *, rank: int, alpha: float, dropout: float = 0.0, targets: Sequence[str] = TARGETS
+    policy: Tunable, *, rank: int, alpha: float, dropout: float = 0.0, targets: Sequence[str] | None = None
 ) -> None:
     """Wrap linear layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
 
@@ -107,17 +105,18 @@ def add_adapters(
         raise UserError(
             f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0, dropout in [0, 1)."
         )
+    targets = list(policy.adapted if targets is None else targets)
     chosen = _targets(policy, targets)
     try:
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
         raise UserError("LoRA needs peft, which is not installed: pip install 'mme-vla[vlm]'.") from None
     config = LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=chosen)  # type: ignore[arg-type]
-    inject_adapter_in_model(config, policy, ADAPTER)
-    policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "targets": list(targets)}
+    inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
+    policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "targets": targets}
 
 
-def merge_adapters(policy: "Saved") -> None:
+def merge_adapters(policy: Tunable) -> None:
     """Fold the adapters into the matrices they wrap: a plain policy again, every parameter trainable."""
     from peft.tuners.tuners_utils import BaseTunerLayer
 
@@ -127,7 +126,8 @@ def merge_adapters(policy: "Saved") -> None:
             parent, _, leaf = name.rpartition(".")
             setattr(policy.get_submodule(parent), leaf, module.get_base_layer())
     policy.config.pop("adapters", None)
-    policy.requires_grad_(True)
+    for parameter in policy.parameters():
+        parameter.requires_grad_(True)
 
 
 def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None) -> dict[str, Tensor]:
@@ -143,23 +143,24 @@ def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | Non
     return merged
 
 
-def _has_adapters(policy: nn.Module) -> bool:
+def _has_adapters(policy: Tunable) -> bool:
     return any(".lora_" in name for name, _ in policy.named_parameters())
 
 
-def _targets(policy: nn.Module, targets: Sequence[str]) -> list[str]:
-    """Full names of the backbone's linear layers that the targets mean (what is the memory's learns in full)."""
+def _targets(policy: Tunable, targets: Sequence[str]) -> list[str]:
+    """Full names of the linear layers that the targets mean (what is the memory's learns in full)."""
     linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear)]
-    layers = [name for name in linear if name.startswith("backbone.") and part_of(f"{name}.") != "memory"]
+    layers = [name for name in linear if policy.part_of(f"{name}.") != "memory"]
     chosen: list[str] = []
     for target in targets:
         matching = [name for name in layers if f".{name}".endswith(f".{target}")]
         if not matching:
             raise UserError(
-                f"finetune.targets: no linear layer of vision, vlm or action ends in {target!r}. "
+                f"finetune.targets: no linear layer of the policy's other parts ends in {target!r}. "
                 + _near(target, layers)
             )
-        unreachable = [name for name in matching if _FLOAT32.search(name)]
+        past = policy.unadaptable
+        unreachable = [name for name in matching if past is not None and re.search(past, name)]
         if unreachable:
             raise UserError(
                 f"finetune.targets: {target!r} means {unreachable[0]}, whose weight is used in float32 past any "
@@ -167,19 +168,23 @@ def _targets(policy: nn.Module, targets: Sequence[str]) -> list[str]:
             )
         chosen += matching
     if not chosen:
-        raise UserError(f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(TARGETS[:2])}.")
+        raise UserError(
+            f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(policy.adapted[:2])}."
+        )
     return sorted(set(chosen))
 
 
-def _named(policy: nn.Module, train: Sequence[str]) -> list[str]:
+def _named(policy: Tunable, train: Sequence[str]) -> list[str]:
     """Full names of the modules that `train` means; parts are left to the caller."""
     modules = [name for name, _ in policy.named_modules() if name]
     chosen: list[str] = []
     for entry in train:
         matching = [name for name in modules if f".{name}".endswith(f".{entry}")]
-        if not matching and entry not in PARTS:
-            raise UserError(f"finetune.train: {entry!r} is no part and no module. {_near(entry, [*PARTS, *modules])}")
-        chosen += [] if entry in PARTS else matching
+        if not matching and entry not in policy.parts():
+            raise UserError(
+                f"finetune.train: {entry!r} is no part and no module. {_near(entry, [*policy.parts(), *modules])}"
+            )
+        chosen += [] if entry in policy.parts() else matching
     return chosen
 
 

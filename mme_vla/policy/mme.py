@@ -9,17 +9,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
-from mme_vla.backbone.pi05 import flow
-from mme_vla.backbone.pi05.backbone import Pi05Backbone, initialise
-from mme_vla.backbone.pi05.gemma import Conditioning, Hook, KVCache, Layout
-from mme_vla.backbone.pi05.sizes import BackboneConfig
-from mme_vla.errors import UserError
+from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import MemoryModule
+from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.saving import Saved
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens
@@ -28,7 +26,7 @@ if TYPE_CHECKING:
     from mme_vla.processing.processor import Processor
 
 
-class MMEPolicy(Saved):
+class MMEPolicy(Policy):
     """One composition of backbone, memory and integration.
 
     The two independent choices meet here and nowhere else; no method asks which variant it is.
@@ -36,7 +34,7 @@ class MMEPolicy(Saved):
 
     def __init__(
         self,
-        backbone: Pi05Backbone,
+        backbone: Backbone,
         memory: MemoryModule | None,
         integration: Integration,
         processor: "Processor | None" = None,
@@ -62,6 +60,8 @@ class MMEPolicy(Saved):
         self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
         self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
+        self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
+        self.adapted, self.heads, self.unadaptable = backbone.adapted, backbone.heads, backbone.unadaptable
 
     @classmethod
     def from_config(
@@ -69,36 +69,36 @@ class MMEPolicy(Saved):
     ) -> Self:
         """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a registry's key.
 
-        With `fresh_backbone=False` no weight of π0.5 itself is drawn: they hold anything until a checkpoint is loaded.
+        With `fresh_backbone=False` no weight of the backbone itself is drawn: a checkpoint is to be loaded.
 
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
         """
-        sizes = dict(config["backbone"])
-        backbone_cls = BACKBONES[sizes.pop("name")]
-        backbone_config = BackboneConfig.from_dict(sizes)
-        integration = _construct(INTEGRATIONS, config.get("integration"), backbone_config) or Integration(
-            backbone_config
-        )
+        section = dict(config["backbone"])
+        backbone_cls: type[Backbone] = BACKBONES[section.pop("name")]
+        sizes = backbone_cls.Config.from_dict(section)
+        chosen = config.get("integration")
+        integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
+        if chosen and (unhosted := integration.uses() - backbone_cls.hosts):
+            raise UserError(
+                f"The backbone {config['backbone']['name']!r} has no place for {listed(sorted(unhosted))} of the "
+                f"integration {chosen['name']!r}; it hosts {listed(sorted(backbone_cls.hosts))}. Choose another "
+                "integration or backbone."
+            )
         experts = integration.extra_experts()
         with nullcontext() if fresh_backbone else torch.device("meta"):
-            backbone = backbone_cls(backbone_config, experts)
+            backbone = backbone_cls(sizes, experts)
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())
-            for block in backbone.transformer.layers:
-                for expert in experts:
-                    initialise(block.experts[expert])
-        memory = _construct(
-            MEMORIES, config.get("memory"), d_vision=backbone_config.vlm.width, width=integration.memory_width
-        )
+            backbone.draw_experts(list(experts))
+        memory: MemoryModule | None = None
+        if config.get("memory"):
+            widths = {"d_vision": backbone.vision_width, "width": integration.memory_width}
+            memory = MEMORIES.build(config["memory"], **widths)
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
         return cls(backbone, memory, integration, processor, config, **config.get("policy", {}))
-
-    @property
-    def device(self) -> torch.device:
-        return self.backbone.device
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
@@ -107,34 +107,37 @@ class MMEPolicy(Saved):
 
     # Training
 
+    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
+        return self.backbone.loss_draws(count, generator)
+
     def forward(
         self,
         batch: Batch,
-        noise: Tensor | None = None,
+        draws: Mapping[str, Tensor] | Tensor | None = None,
         time: Tensor | None = None,
         memory: MemoryTokens | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The flow-matching loss of a batch.
+        """The mean loss of a batch, and metrics to log (detached).
 
         Args:
             batch: with `actions`.
-            noise [b, h, a], time [b]: drawn when not given.
+            draws: as `loss_draws` makes them; of a flow also its noise [b, h, a] alone, with the times beside it.
+            time: flow times [b], where `draws` is the noise.
             memory: memory tokens encoded beforehand; by default they are made from `batch.history`.
 
         Returns:
-            The mean loss, and metrics to log (detached); the memory's own begin with `memory/`, and are there while
-            `memory.reporting` is True.
+            The loss and its metrics; the memory's own begin with `memory/` and are there while `memory.reporting`.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        actions = batch.actions.float()
-        noise = torch.randn_like(actions) if noise is None else noise
-        if time is None:
-            time = flow.sample_time(len(actions), self.backbone.config.time_distribution, actions.device)
-        x_t, target = flow.interpolate(actions, noise, time)
+        given = named_draws(draws, time=time)
+        if set(self.loss_draws(0, torch.default_generator)) - set(given):
+            given = self.loss_draws(len(batch.actions), torch.default_generator) | given
+        drawn = map_draws(given, lambda value: value.to(self.device))
         with self.autocast():
             memory = self.encode_memory(batch.history) if memory is None else memory
-        losses = flow.step_loss(self.velocity(batch, x_t, time, memory), target)  # b h
+            losses = self.backbone.loss(batch, self._views(batch), self._inject(memory), drawn)  # b h
         if batch.action_mask is None:
             loss = losses.mean()
         else:
@@ -145,16 +148,21 @@ class MMEPolicy(Saved):
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
-        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
+        """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
         with self.autocast():
             memory = self.encode_memory(batch.history) if memory is None else memory
-            blocks = self.integration.blocks(self.backbone.observation_blocks(batch, self._views(batch)), memory)
-            blocks = [*blocks, self.backbone.action_block(x_t)]
-            transformer = self.backbone.transformer
-            layout = transformer.layout(blocks, self.integration.visibility)
-            condition = self.backbone.time_condition(time)
-            answer, _ = transformer(blocks, layout, condition, self.integration.hook(memory))
-            return self.backbone.velocity(answer)
+            return self.backbone.velocity(batch, self._views(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
+
+    def recompute(self, wanted: bool) -> None:
+        """Compute activations again in the backward pass instead of keeping them, or keep them."""
+        self.backbone.recompute(wanted)
+
+    def compile(self, **options: Any) -> None:
+        """Compile the backbone's tower and layers in place, each by itself."""
+        self.backbone.compile(**options)
+
+    def _inject(self, memory: MemoryTokens | None) -> Inject:
+        return lambda observation: self.integration.inject(observation, memory)
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
         """Memory tokens of a selection, or None for a policy without memory."""
@@ -172,62 +180,44 @@ class MMEPolicy(Saved):
 
     # Sampling
 
+    def sample_draws(self, generator: torch.Generator) -> Draws:
+        """What one chunk of the backbone draws: of π0.5 the starting `noise` [h, a]."""
+        return self.backbone.sample_draws(generator)
+
     @torch.no_grad()
     def sample_actions(
         self,
         batch: Batch,
-        noise: Tensor | None = None,
-        steps: int = 10,
+        draws: Mapping[str, Tensor] | Tensor | None = None,
+        steps: int | None = None,
         generator: torch.Generator | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
-        """Integrate the flow from noise to a normalised chunk [b, h, a].
+        """A normalised chunk [b, h, a].
 
-        All that does not depend on the flow time runs once: memory, prefix keys and values, the modulator's keys and
-        values, and every layer's time modulation. A step runs the action block alone.
+        Args:
+            draws: as `sample_draws` makes them, with a batch axis; of a flow also its noise [b, h, a] alone.
+            steps: Euler steps of a flow; 10 by default, as released.
+            generator: where fresh draws come from (on the CPU). memory: memory tokens encoded beforehand.
         """
-        config = self.backbone.config
-        if noise is None:
-            shape = (len(batch.prompt), config.horizon, config.action_dim)
-            noise = torch.randn(shape, device=self.device, generator=generator)
+        if draws is None:
+            source = torch.default_generator if generator is None else generator
+            draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
+        drawn = map_draws(named_draws(draws), lambda value: value.to(self.device))
         with self.autocast():
-            transformer = self.backbone.transformer
-            prefix, hook = self.prefill(batch, memory)
-            layout = transformer.layout([self.backbone.action_block(noise)], self.integration.visibility, prefix)
-            times = flow.euler_times(steps, self.device)
-            conditions = transformer.conditioning(self.backbone.time_condition(times))
-            return flow.euler(noise, steps, lambda x, i: self.denoise(x, conditions.at(i), layout, prefix, hook))
-
-    def prefill(self, batch: Batch, memory: MemoryTokens | None = None) -> tuple[KVCache, Hook | None]:
-        """Run what a chunk's steps share: keys and values of the prefix, and the memory's hook."""
-        memory = self.encode_memory(batch.history) if memory is None else memory
-        blocks = self.integration.blocks(self.backbone.observation_blocks(batch, self._views(batch)), memory)
-        layout = self.backbone.transformer.layout(blocks, self.integration.visibility)
-        _, prefix = self.backbone.transformer(blocks, layout, keep=True)
-        return prefix, self.integration.hook(memory)
-
-    def denoise(
-        self, x_t: Tensor, condition: Tensor | Conditioning, layout: Layout, prefix: KVCache, hook: Hook | None
-    ) -> Tensor:
-        """The velocity at one flow time, from the cached prefix: what one Euler step costs."""
-        block = self.backbone.action_block(x_t)
-        answer, _ = self.backbone.transformer([block], layout, condition, hook, past=prefix)
-        return self.backbone.velocity(answer)
+            memory = self.encode_memory(batch.history) if memory is None else memory
+            return self.backbone.sample(batch, self._views(batch), self._inject(memory), drawn, steps)
 
     # Episodes
 
-    def start_episode(self, goal: str, seed: int = 0) -> Episode:
-        """Begin an episode: its memory, its noise and its current view live in the returned object alone."""
-        return Episode(self, goal, seed)
-
-    def act(self, episodes: Sequence[Episode], steps: int = 10) -> np.ndarray:
+    def act(self, episodes: Sequence[Episode], steps: int | None = None) -> np.ndarray:
         """Choose the next chunk for many episodes in one batch, adding nothing to their memories.
 
         Returns:
             float32 [n, h, 8]: absolute joint targets and gripper commands.
         """
         if not episodes:
-            return np.zeros((0, self.backbone.config.horizon, 8), np.float32)
+            return np.zeros((0, self.horizon, 8), np.float32)
         processor = self.require_processor()
         processor.require_stats()  # before any episode's noise or memory moves on
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
@@ -238,12 +228,12 @@ class MMEPolicy(Saved):
             prompt_mask=torch.stack(masks),
         )
         batch = batch.without_prompt_padding().to(self.device)
-        noise = torch.stack([e.draw_noise() for e in episodes]).to(self.device)
+        draws = stack_draws([e.draw() for e in episodes])
         was_training = self.training
         self.eval()
         try:
             memory = self._remember(episodes)
-            chunk = self.sample_actions(batch, noise, steps, memory=memory).float().cpu()
+            chunk = self.sample_actions(batch, draws, steps, memory=memory).float().cpu()
         finally:
             self.train(was_training)
         actions = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy()
@@ -269,7 +259,7 @@ class MMEPolicy(Saved):
                 tokens = self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
             encoded.append(tokens.to(self.history_dtype))
         if not encoded:
-            width = self.backbone.config.vlm.width
+            width = self.backbone.vision_width
             return torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
         return torch.cat(encoded)
 
@@ -281,29 +271,14 @@ class MMEPolicy(Saved):
             digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
-    def require_memory(self) -> MemoryModule:
-        """Return the memory, or say that there is none."""
-        if self.memory is None:
-            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
-        return self.memory
-
-    def require_processor(self) -> "Processor":
-        """Return the processor, or say what it takes to have one."""
-        if self.processor is None:
-            raise UserError(
-                "This policy was built without a processor, so it can run batches but no raw data: build it with "
-                "build_policy() or load it with MMEPolicy.from_pretrained()."
-            )
-        return self.processor
+    def parts(self) -> Mapping[str, str]:
+        """The backbone's parts; the memory and its integration are the part `memory`."""
+        return {"memory": r"memory\.|integration\.", **{
+            part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items() if part != "memory"
+        }}  # fmt: skip
 
 
-def _construct(registry: Any, section: Mapping[str, Any] | None, *args: Any, **fixed: Any) -> Any:
-    """Call the constructor a section names with the section's other keys, or return None for an empty section."""
-    if not section:
-        return None
-    options = dict(section)
-    name = options.pop("name")
-    try:
-        return registry[name](*args, **fixed, **options)
-    except TypeError as error:
-        raise UserError(f"{registry.kind} {name!r} does not take these options: {options} ({error}).") from error
+def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:
+    """Draws by name; a bare tensor is a flow's `noise`."""
+    named = {"noise": draws} if isinstance(draws, Tensor) else dict(draws or {})
+    return named | {name: value for name, value in more.items() if value is not None}

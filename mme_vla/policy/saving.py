@@ -96,7 +96,7 @@ class Saved(nn.Module):
         with torch.device("meta"):
             loaded = cls.from_config(config)
             if config.get("adapters"):
-                add_adapters(loaded, **config["adapters"])
+                add_adapters(loaded, **config["adapters"])  # type: ignore[arg-type]  # whoever is saved is a Policy
         assign_tensors(loaded, load_tensors(folder), str(source), kind)
         loaded.processor = Processor.load(folder)
         return loaded.to(device).eval()

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.mme import MMEPolicy
 from mme_vla.serving.counters import ServerStats
 
 
@@ -38,7 +38,7 @@ class Engine:
         flow_steps: Euler steps a chunk.
     """
 
-    def __init__(self, policy: MMEPolicy, max_batch: int = 16, flow_steps: int = 10, stats: ServerStats | None = None):
+    def __init__(self, policy: Policy, max_batch: int = 16, flow_steps: int = 10, stats: ServerStats | None = None):
         self.policy = policy
         self.max_batch, self.flow_steps = max_batch, flow_steps
         self.stats = stats or ServerStats()

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from typing import Any, cast
 
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.serving.codec import pack
 from mme_vla.serving.counters import ServerStats
 from mme_vla.serving.engine import Engine
@@ -43,7 +43,7 @@ class PolicyServer:
         name: what metadata call the policy. trained: False says that its weights are fresh.
     """
 
-    def __init__(self, policy: MMEPolicy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
+    def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
         policy.require_processor().require_stats()
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
@@ -226,7 +226,7 @@ def _peer(ws: ServerConnection) -> str:
     return f"{address[0]}:{address[1]}" if address else "client"
 
 
-def _metadata(policy: MMEPolicy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
+def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
     """What a client is told when it connects."""
     limits = settings.limits
     return {
@@ -236,8 +236,8 @@ def _metadata(policy: MMEPolicy, settings: ServeSettings, name: str, trained: bo
         "trained": trained,
         "action_space": settings.action_space,
         "action_dim": 8,
-        "horizon": policy.backbone.config.horizon,
-        "execute": min(settings.execute, policy.backbone.config.horizon),
+        "horizon": policy.horizon,
+        "execute": min(settings.execute, policy.horizon),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),
         "schemas": ["mme_vla", "robomme_challenge"],

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.serving.settings import ServeSettings
 
 SIDE = 256  # pixels; what RoboMME's cameras give
 
 
-def warm_up(policy: MMEPolicy, settings: ServeSettings) -> None:
+def warm_up(policy: Policy, settings: ServeSettings) -> None:
     """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
     frames = np.zeros((settings.encode_chunk, SIDE, SIDE, 3), np.uint8)
     episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]

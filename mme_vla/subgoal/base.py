@@ -194,14 +194,8 @@ def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None
     """
     if not config or config.get("name") in (None, "none"):
         return None
-    options = dict(config)
-    name = options.pop("name")
-    predictor = SUBGOALS[name]
-    try:
-        built: SubgoalPredictor = predictor(**options)
-    except TypeError as error:
-        raise UserError(f"The subgoal predictor {name!r} does not take these options: {options} ({error}).") from error
-    built.settings = {key: value for key, value in options.items() if isinstance(value, _PLAIN)}
+    built: SubgoalPredictor = SUBGOALS.build(config)
+    built.settings = {key: value for key, value in config.items() if key != "name" and isinstance(value, _PLAIN)}
     return built
 
 

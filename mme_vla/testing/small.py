@@ -61,7 +61,7 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
     if policy.memory is None:
         return None
     generator = torch.Generator().manual_seed(seed)
-    patches, d = policy.memory.storage.grid**2, policy.backbone.config.vlm.width
+    patches, d = policy.memory.storage.grid**2, policy.backbone.vision_width
     if policy.memory.pad_left:
         valid = -(-valid // patches) * patches
     n = policy.memory.padded_length(valid)
@@ -75,8 +75,7 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
 def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:
     """A batch of noise pictures, short prompts and random actions."""
     generator = torch.Generator().manual_seed(seed)
-    config = policy.backbone.config
-    size, length = config.vision.image_size, 16
+    size, length = policy.backbone.image_size, 16
     prompt_mask = torch.zeros(batch, length, dtype=torch.bool)
     prompt_mask[:, : length // 2] = True
     return Batch(
@@ -85,7 +84,7 @@ def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int 
         prompt=torch.randint(4, 100, (batch, length), generator=generator) * prompt_mask,
         prompt_mask=prompt_mask,
         history=random_history(policy, batch, valid, seed),
-        actions=torch.randn(batch, config.horizon, config.action_dim, generator=generator),
+        actions=torch.randn(batch, policy.horizon, policy.action_dim, generator=generator),
     )
 
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import load_tensors, replace_folder
 from mme_vla.training.ema import EMA
 from mme_vla.training.settings import KeepRule
@@ -42,7 +42,7 @@ def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
 def save_checkpoint(
     folder: Path,
     step: int,
-    policy: MMEPolicy,
+    policy: Policy,
     ema: EMA,
     optimizer: torch.optim.Optimizer,
     config: Mapping[str, Any],
@@ -73,7 +73,7 @@ def save_checkpoint(
     return target
 
 
-def restore(folder: Path, policy: MMEPolicy, ema: EMA, optimizer: torch.optim.Optimizer) -> None:
+def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optimizer) -> None:
     """Put everything back as it was when `folder` was written.
 
     Raises:
@@ -155,7 +155,7 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
-def check_disk(folder: Path, policy: MMEPolicy, keep: KeepRule) -> None:
+def check_disk(folder: Path, policy: Policy, keep: KeepRule) -> None:
     """Refuse to begin a run whose first checkpoints would not fit on the disk.
 
     Raises:

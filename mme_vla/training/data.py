@@ -11,7 +11,7 @@ from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
 from mme_vla.processing.subgoal_text import SubgoalText
@@ -26,7 +26,7 @@ class SplitData:
 
 
 def prepare_data(
-    policy: MMEPolicy,
+    policy: Policy,
     data: Mapping[str, Any],
     seed: int,
     stats_from: Path | None = None,
@@ -85,7 +85,7 @@ def prepare_data(
     return prepared
 
 
-def check_frozen(policy: MMEPolicy, freeze_vision: bool) -> None:
+def check_frozen(policy: Policy, freeze_vision: bool) -> None:
     """Refuse to train the vision tower under a memory, whose cached tokens would not follow it.
 
     Raises:

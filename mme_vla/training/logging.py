@@ -167,11 +167,7 @@ def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Lo
     folder.mkdir(parents=True, exist_ok=True)
     loggers: list[Logger] = []
     if section:
-        name = section.pop("name")
-        try:
-            loggers.append(LOGGERS[name](folder, config, first_step=first_step, **section))
-        except TypeError as error:
-            raise UserError(f"logger {name!r} does not take these options: {section} ({error}).") from error
+        loggers.append(LOGGERS.build(section, folder, config, first_step=first_step))
     return Loggers([JsonLines(folder, first_step), *loggers])
 
 

@@ -11,13 +11,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.memory.base import MemoryModule
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, trainable
 from mme_vla.training.console import ProgressLine, memory_gib
 from mme_vla.training.ema import EMA
 from mme_vla.training.logging import Loggers
 from mme_vla.training.optim import clip_gradients, learning_rate, make_optimizer
-from mme_vla.training.order import BatchOrder, draw_flow, generator_for, seed_of
+from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.stopping import leave_signals_alone, stop_asked
@@ -43,7 +43,7 @@ class Trainer:
 
     def __init__(
         self,
-        policy: MMEPolicy,
+        policy: Policy,
         samples: Samples,
         collate: Collate,
         validation: Validation | None,
@@ -79,9 +79,9 @@ class Trainer:
             generator=generator_for(settings.seed, "workers"),
         )
         self.policy = policy.to(accelerator.device).train()
-        policy.backbone.transformer.gradient_checkpointing = settings.gradient_checkpointing
+        policy.recompute(settings.gradient_checkpointing)
         if settings.compile:
-            policy.backbone.compile()
+            policy.compile()
         parameters = trainable(policy)
         self.optimizer = make_optimizer(parameters.values(), settings)
         self.ema = EMA(parameters, settings.ema)
@@ -131,14 +131,11 @@ class Trainer:
 
     def update(self, step: int, batches: Iterator[Any], window: Window) -> dict[str, Tensor]:
         """One optimizer update from the next `accumulate` pieces of `batches`; its metrics, detached."""
-        settings, device, config = self.settings, self.accelerator.device, self.policy.backbone.config
+        settings, device = self.settings, self.accelerator.device
         rate = learning_rate(step, settings.lr, settings.warmup)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        noise, time = draw_flow(
-            settings.batch_size, config.horizon, config.action_dim, config.time_distribution,
-            settings.seed, "train", step,
-        )  # fmt: skip
+        draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():
@@ -148,7 +145,7 @@ class Trainer:
             torch.manual_seed(seed_of(settings.seed, "model", step, piece, self.accelerator.process_index))
             last = piece == settings.accumulate - 1
             with nullcontext() if last else self.accelerator.no_sync(self.model):
-                loss, metrics = self.model(batch, noise[rows].to(device), time[rows].to(device))
+                loss, metrics = self.model(batch, {name: value[rows].to(device) for name, value in draws.items()})
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate

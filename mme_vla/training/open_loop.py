@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from mme_vla.backbone.base import stack_draws
 from mme_vla.data.dataset import TrainingDataset, collate
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
 
 JOINTS = (*(f"joint {i}" for i in range(1, 8)), "gripper")
@@ -50,7 +51,7 @@ class OpenLoop:
         }
 
 
-def open_loop(policy: MMEPolicy, samples: TrainingDataset, chunks: int, seed: int, held_out: bool = True) -> OpenLoop:
+def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, held_out: bool = True) -> OpenLoop:
     """Predict chunks that tile the first of the samples' episodes, at most `chunks` of them.
 
     Args:
@@ -58,7 +59,7 @@ def open_loop(policy: MMEPolicy, samples: TrainingDataset, chunks: int, seed: in
         samples: the held-out steps; or the training steps, where there are none (`held_out` False says so).
     """
     processor = policy.require_processor()
-    horizon = policy.backbone.config.horizon
+    horizon = policy.horizon
     source, episode, first = samples.locate(0)
     count = int(samples.sources[source].lengths[episode]) - first
     starts = np.arange(0, count, horizon)
@@ -68,8 +69,8 @@ def open_loop(policy: MMEPolicy, samples: TrainingDataset, chunks: int, seed: in
     for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
         batch = collate([samples[i] for i in place])
         assert batch.state is not None
-        noise = torch.randn(len(place), horizon, policy.backbone.config.action_dim, generator=generator)
-        chunk = policy.sample_actions(batch.to(policy.device), noise.to(policy.device)).float().cpu()
+        draws = stack_draws([policy.sample_draws(generator) for _ in place], policy.device)
+        chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()
         predicted.append(processor.absolute_actions(chunk, batch.state))
     recorded = [samples.step(i) for i in starts]
     stats = processor.stats

@@ -4,9 +4,7 @@ import hashlib
 from collections.abc import Iterator
 
 import torch
-from torch import Tensor
 
-from mme_vla.backbone.pi05 import flow
 from mme_vla.errors import UserError
 
 
@@ -18,13 +16,6 @@ def seed_of(*key: int | str) -> int:
 def generator_for(*key: int | str) -> torch.Generator:
     """A CPU generator for whatever the key names: the same numbers whatever device trains."""
     return torch.Generator().manual_seed(seed_of(*key))
-
-
-def draw_flow(count: int, horizon: int, width: int, distribution: str, *key: int | str) -> tuple[Tensor, Tensor]:
-    """Noise [count, horizon, width] and flow times [count] of one update."""
-    generator = generator_for(*key)
-    noise = torch.randn(count, horizon, width, generator=generator)
-    return noise, flow.sample_time(count, distribution, torch.device("cpu"), generator)
 
 
 class BatchOrder:

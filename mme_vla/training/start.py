@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.training.checkpoint import checkpoints_in, resolve_checkpoint
 from mme_vla.weights import transfer
 
 
-def start_from(policy: MMEPolicy, source: str) -> str:
+def start_from(policy: Policy, source: str) -> str:
     """Copy every weight that `source` holds into a freshly built policy; only its memory's own may be new.
 
     Args:

@@ -1,4 +1,4 @@
-"""The loss on held-out steps, with noise and times that belong to the sample: numbers of different steps compare."""
+"""The loss on held-out steps, with random numbers that belong to the sample: losses of different steps compare."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -6,8 +6,8 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from mme_vla.policy.mme import MMEPolicy
-from mme_vla.training.order import draw_flow
+from mme_vla.policy.base import Policy
+from mme_vla.training.order import generator_for
 from mme_vla.types import Batch
 
 
@@ -33,24 +33,18 @@ class Validation:
         self._batches: list[Batch] = []
 
     @torch.no_grad()
-    def loss(self, policy: MMEPolicy) -> float:
-        """The mean flow-matching loss, without augmentation; the policy's mode is put back."""
-        config = policy.backbone.config
+    def loss(self, policy: Policy) -> float:
+        """The mean loss, without augmentation; the policy's mode is put back."""
         was_training = policy.training
         policy.eval()
-        total, places = (
-            0.0,
-            [self.indices[i : i + self._batch_size] for i in range(0, len(self.indices), self._batch_size)],
-        )
+        total = 0.0
+        places = [self.indices[i : i + self._batch_size] for i in range(0, len(self.indices), self._batch_size)]
         for number, place in enumerate(places):
             if number == len(self._batches):
                 self._batches.append(self._collate([self._samples[i] for i in place]))
-            draws = [
-                draw_flow(1, config.horizon, config.action_dim, config.time_distribution, self._seed, "validation", i)
-                for i in place
-            ]
-            noise, time = (torch.cat(parts).to(policy.device) for parts in zip(*draws, strict=True))
-            loss, _ = policy(self._batches[number].to(policy.device), noise, time)
+            rows = [policy.loss_draws(1, generator_for(self._seed, "validation", i)) for i in place]
+            draws = {name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]}
+            loss, _ = policy(self._batches[number].to(policy.device), draws)
             total += float(loss) * len(place)
         policy.train(was_training)
         return total / len(self.indices)

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from mme_vla.backbone.pi05.backbone import Pi05Backbone
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import check_fit
 from mme_vla.weights.name_tables import Derived, NameTable, Unread, check, read, write
 
@@ -66,11 +67,21 @@ class Adapter:
         return read(self.table, found)
 
 
-def memory_parameters(policy: MMEPolicy) -> set[str]:
+def pi05_of(policy: Policy) -> Pi05Backbone:
+    """The policy's backbone, where it is π0.5: the only one these formats hold.
+
+    Raises:
+        UserError: it is another.
+    """
+    backbone = getattr(policy, "backbone", None)
+    if not isinstance(backbone, Pi05Backbone):
+        raise UserError(
+            f"Checkpoints of LeRobot's π0.5, openpi and the released trees hold π0.5; this policy's backbone is "
+            f"{type(backbone or policy).__name__}."
+        )
+    return backbone
+
+
+def memory_parameters(policy: Policy) -> set[str]:
     """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the memory's own expert."""
-    extra = tuple(f".experts.{name}." for name in policy.integration.extra_experts())
-    return {
-        name
-        for name in policy.state_dict()
-        if name.startswith(("memory.", "integration.")) or any(part in name for part in extra)
-    }
+    return {name for name in policy.state_dict() if policy.part_of(name) == "memory"}

@@ -6,12 +6,13 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from mme_vla.errors import UserError
+from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
-from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
@@ -20,7 +21,7 @@ from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
 from mme_vla.weights.source import Source, open_source
 
-ADAPTERS: dict[str, Callable[[MMEPolicy], Adapter]] = {
+ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "lerobot": port_adapter,
     "openpi": port_adapter,
     "released": released_adapter,
@@ -32,13 +33,13 @@ _MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
 
 
 def load_into(
-    policy: MMEPolicy,
+    policy: Policy,
     source: str | Path,
     *,
     dtype: str = "float32",
     revision: str | None = None,
     token: str | None = None,
-) -> MMEPolicy:
+) -> Policy:
     """Fill a policy with a checkpoint of the same variant, in any format this library knows.
 
     The policy may lie on the meta device, so that no weight is drawn only to be replaced. A checkpoint that
@@ -75,7 +76,7 @@ def load_into(
     return policy
 
 
-def read_as(policy: MMEPolicy, source: Source) -> dict[str, Tensor]:
+def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     """Read a checkpoint in the names of a policy of its own variant.
 
     Raises:
@@ -104,7 +105,7 @@ class Start:
         return sentence + (f", {len(self.left)} left behind ({_groups(self.left)})" if self.left else "")
 
 
-def start_from(policy: MMEPolicy, source: str | Path, *, revision: str | None = None) -> list[str]:
+def start_from(policy: Policy, source: str | Path, *, revision: str | None = None) -> list[str]:
     """Copy into a built policy all that a checkpoint holds of it, and return the names of what stays new.
 
     The source may be memoryless π0.5 in any format, or another variant. Only parameters of the memory (its integration
@@ -116,7 +117,7 @@ def start_from(policy: MMEPolicy, source: str | Path, *, revision: str | None = 
     return transfer(policy, source, revision=revision).new
 
 
-def transfer(policy: MMEPolicy, source: str | Path, *, revision: str | None = None) -> Start:
+def transfer(policy: Policy, source: str | Path, *, revision: str | None = None) -> Start:
     """Do what `start_from` says, and tell in full what was taken, what is new and what was left behind."""
     if policy.device.type == "meta":
         raise UserError("Build the policy on a real device to start from a checkpoint: its memory needs fresh values.")
@@ -138,7 +139,7 @@ def transfer(policy: MMEPolicy, source: str | Path, *, revision: str | None = No
     return Start(sorted(ours), sorted(set(state) - set(ours)), left)
 
 
-def _check_tokenizer(policy: MMEPolicy, folder: Path) -> None:
+def _check_tokenizer(policy: Policy, folder: Path) -> None:
     """Refuse a start from weights whose token ids mean other words."""
     file = folder / CONFIG_FILE
     if policy.processor is None or not file.is_file():

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.weights.adapter import Adapter
+from mme_vla.weights.adapter import Adapter, pi05_of
 from mme_vla.weights.name_tables import prefixed
 from mme_vla.weights.names import torch_backbone as names
 
@@ -30,8 +30,8 @@ _PI0 = re.compile(r"^(state_proj|action_time_mlp_(in|out))\.")
 
 def port_adapter(policy: MMEPolicy) -> Adapter:
     """The tensors of a memoryless policy, or the memoryless part of another, in the ports' names (without `model.`)."""
-    table = prefixed("backbone", names.torch_names(policy.backbone))
-    return Adapter(table, names.torch_unread(policy.backbone), names.TIED)
+    table = prefixed("backbone", names.torch_names(pi05_of(policy)))
+    return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
 
 
 def is_port(tensor_names: list[str]) -> bool:

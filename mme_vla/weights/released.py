@@ -5,6 +5,7 @@ Leaves are named without the leading `params/` and the trailing `/value`; layers
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor
 
@@ -14,7 +15,7 @@ import mme_vla.weights.names.jax_memory as memory_names
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors
-from mme_vla.weights.adapter import Adapter
+from mme_vla.weights.adapter import Adapter, pi05_of
 from mme_vla.weights.name_tables import Derived, NameTable, Unread, prefixed
 
 
@@ -27,7 +28,7 @@ def released_adapter(policy: MMEPolicy) -> Adapter:
     return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
 
 
-def partial_adapter(policy: MMEPolicy) -> Adapter:
+def partial_adapter(policy: Any) -> Adapter:
     """The released tree as far as it has names for this policy: a memory of one's own is left out."""
     table = _backbone_table(policy) | (_memory_table(policy) or {})
     return Adapter(table, released_unread(policy), derived=released_derived(policy))
@@ -46,7 +47,7 @@ def released_table(policy: MMEPolicy) -> NameTable:
 
 
 def _backbone_table(policy: MMEPolicy) -> NameTable:
-    table = prefixed("backbone", backbone_names.released_names(policy.backbone))
+    table = prefixed("backbone", backbone_names.released_names(pi05_of(policy)))
     return table | prefixed("integration", integration_names.released_names(policy.integration))
 
 
@@ -59,7 +60,7 @@ def _memory_table(policy: MMEPolicy) -> NameTable | None:
 
 def released_unread(policy: MMEPolicy) -> list[Unread]:
     """Released leaves, or layers of them, that no action reads and this library does not hold."""
-    return backbone_names.released_unread(policy.backbone) + memory_names.released_unread(policy.memory)
+    return backbone_names.released_unread(pi05_of(policy)) + memory_names.released_unread(policy.memory)
 
 
 def released_derived(policy: MMEPolicy) -> list[Derived]:

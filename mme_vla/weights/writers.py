@@ -45,8 +45,7 @@ def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: No
 
     LeRobot's own processors write the state into the prompt, and know no RoboMME statistics: they are not part of this.
     """
-    config = policy.backbone.config
-    size = config.vision.image_size
+    size = policy.backbone.image_size
     features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in VIEWS}
     width = 8 if stats is None else len(stats.actions)
     about = {
@@ -56,10 +55,10 @@ def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: No
         "output_features": {"action": {"type": "ACTION", "shape": [width]}},
         **_SIZES,
         "dtype": _name(dtype),
-        "chunk_size": config.horizon,
-        "n_action_steps": config.horizon,
-        "max_state_dim": config.action_dim,
-        "max_action_dim": config.action_dim,
+        "chunk_size": policy.horizon,
+        "n_action_steps": policy.horizon,
+        "max_state_dim": policy.action_dim,
+        "max_action_dim": policy.action_dim,
         "image_resolution": [size, size],
         # Joints against the current state, the gripper as it is: what these weights answer with.
         "use_relative_actions": True,
@@ -73,8 +72,7 @@ def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: No
 
 def write_openpi(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """Weights, `config.json` and statistics as openpi's PyTorch training writes them."""
-    config = policy.backbone.config
-    about = {"action_dim": config.action_dim, "action_horizon": config.horizon, **_SIZES, "precision": _name(dtype)}
+    about = {"action_dim": policy.action_dim, "action_horizon": policy.horizon, **_SIZES, "precision": _name(dtype)}
     _write_json(folder / "config.json", about)
     tensors = to_openpi(policy, policy.state_dict())
     del tensors[EMBEDDING]  # of a tied pair, safetensors' save_model keeps the first name; its load_model wants no more

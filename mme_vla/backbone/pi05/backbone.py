@@ -1,30 +1,58 @@
 """π0.5: what turns images, prompt, noisy actions and flow time into blocks, and the answer into a velocity."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.base import Backbone, Draws, Inject, Injection
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.layers.precision import float32_linear
-from mme_vla.backbone.pi05.flow import time_embedding
-from mme_vla.backbone.pi05.gemma import JointTransformer
+from mme_vla.backbone.pi05 import flow
+from mme_vla.backbone.pi05.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
+EULER_STEPS = 10  # as released
+
 
 @BACKBONES.register("pi05")
-class Pi05Backbone(nn.Module):
-    """Vision tower, VLM expert and action expert. It knows nothing of memory: extra experts are just more columns."""
+class Pi05Backbone(Backbone):
+    """Vision tower, VLM expert and action expert under joint attention; chunks by flow matching.
+
+    It knows nothing of memory: extra experts are just more columns.
+    """
+
+    Config = BackboneConfig
+    hosts = frozenset({"blocks", "expert", "hook", "condition", "beside"})
+    heads = ("action_in", "action_out", "time_in", "time_out")
+    # `kv` is what the VLM's last layer has in place of `qkv`.
+    adapted = tuple(
+        f"experts.{expert}.{layer}"
+        for expert in ("vlm", "action")
+        for layer in ("qkv", *(("kv",) if expert == "vlm" else ()), "out", "mlp.gate_up", "mlp.down")
+    )
+    # These are computed in float32 from their weight alone, past any adapter that wraps them.
+    unadaptable = rf"\.({'|'.join(heads)}|\w*norm\.dense)$"
+    PARTS: ClassVar[Mapping[str, str]] = {
+        "vision": r"vision\.",
+        "vlm": r"embedding\.|.*\.experts\.vlm\.",
+        "memory": r".*\.experts\.(?!action\.)",
+        "action": "",
+    }
 
     def __init__(self, config: BackboneConfig, extra_experts: Mapping[str, ExpertConfig] | None = None) -> None:
-        super().__init__()
+        super().__init__(config, extra_experts)
         self.config = config
-        width = config.action.width
+        self.vision_width = self.token_width = config.vlm.width
+        self.answer_width = width = config.action.width
+        self.depth, self.head_dim = config.depth, config.head_dim
+        self.image_size, self.grid = config.vision.image_size, config.vision.image_size // config.vision.patch_size
+        self.horizon, self.action_dim = config.horizon, config.action_dim
         # The vision tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
         self.vision = VisionTower(config.vision, config.vlm.width)
         initialise(self.vision)
@@ -38,9 +66,11 @@ class Pi05Backbone(nn.Module):
         for module in (self.embedding, self.transformer, self.action_in, self.action_out, self.time_in, self.time_out):
             initialise(module)
 
-    @property
-    def device(self) -> torch.device:
-        return self.embedding.weight.device
+    def draw_experts(self, names: Sequence[str]) -> None:
+        """Give these experts fresh weights in every layer."""
+        for block in self.transformer.layers:
+            for name in names:
+                initialise(block.experts[name])  # type: ignore[index, arg-type]
 
     def compile(self, **options: Any) -> None:
         """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still."""
@@ -82,14 +112,88 @@ class Pi05Backbone(nn.Module):
 
     def time_condition(self, time: Tensor) -> Tensor:
         """Condition [b, d_action] of the adaptive norms for flow times [b], in float32."""
-        x = time_embedding(time, self.config.action.width)
+        x = flow.time_embedding(time, self.config.action.width)
         for layer in (self.time_in, self.time_out):
             x = nn.functional.silu(float32_linear(layer, x))
         return x
 
-    def velocity(self, answer: Tensor) -> Tensor:
-        """Read the velocity [b, h, a] off the action block's output, in float32."""
-        return float32_linear(self.action_out, answer)
+    def read_velocity(self, answer: Tensor) -> Tensor:
+        """Read the velocity [b, h, a] off the answer [b, n, d], whose last h tokens are the actions; in float32."""
+        return float32_linear(self.action_out, answer[:, -self.horizon :])
+
+    # Training
+
+    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """`noise` [n, h, a] and flow times `time` [n]."""
+        noise = torch.randn(count, self.horizon, self.action_dim, generator=generator)
+        return {"noise": noise, "time": flow.sample_time(count, self.config.time_distribution, noise.device, generator)}
+
+    def loss(self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor]) -> Tensor:
+        """The flow-matching loss [b, h]."""
+        assert batch.actions is not None
+        x_t, target = flow.interpolate(batch.actions.float(), draws["noise"], draws["time"])
+        return flow.step_loss(self.velocity(batch, images, inject, x_t, draws["time"]), target)
+
+    def velocity(self, batch: Batch, images: Tensor, inject: Inject, x_t: Tensor, time: Tensor) -> Tensor:
+        """Predicted velocity [b, h, a] at noisy chunks x_t [b, h, a] and times [b], in one joint pass."""
+        injection = inject(self.observation_blocks(batch, images))
+        blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
+        layout = self.transformer.layout(blocks, injection.visibility)
+        condition = self._condition(time, injection)
+        answer, _ = self.transformer(blocks, layout, condition, injection.hook)
+        return self.read_velocity(answer)
+
+    def recompute(self, wanted: bool) -> None:
+        """Recompute layers in the backward pass (activation checkpointing)."""
+        self.transformer.gradient_checkpointing = wanted
+
+    # Sampling
+
+    def sample_draws(self, generator: torch.Generator) -> Draws:
+        """The starting `noise` [h, a]."""
+        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+
+    @torch.no_grad()
+    def sample(
+        self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """Integrate the flow from noise to a chunk, in `steps` Euler steps (10 by default).
+
+        All that does not depend on the flow time runs once: memory, prefix keys and values, the modulator's keys and
+        values, and every layer's time modulation. A step runs the action block alone.
+        """
+        noise, steps = draws["noise"], EULER_STEPS if steps is None else steps
+        prefix, injection = self.prefill(batch, images, inject)
+        blocks = [*injection.beside, self.action_block(noise)]
+        layout = self.transformer.layout(blocks, injection.visibility, prefix)
+        times = flow.euler_times(steps, noise.device)
+        conditions = self.transformer.conditioning(self._condition(times, injection))
+        return flow.euler(noise, steps, lambda x, i: self.denoise(x, conditions.at(i), layout, prefix, injection))
+
+    def prefill(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[KVCache, Injection]:
+        """Run what a chunk's steps share: keys and values of the prefix, and what the memory injects."""
+        injection = inject(self.observation_blocks(batch, images))
+        layout = self.transformer.layout(injection.blocks, injection.visibility)
+        _, prefix = self.transformer(injection.blocks, layout, keep=True)
+        return prefix, injection
+
+    def denoise(
+        self, x_t: Tensor, condition: Tensor | Conditioning, layout: Layout, prefix: KVCache, injection: Injection
+    ) -> Tensor:
+        """The velocity at one flow time, from the cached prefix: what one Euler step costs."""
+        blocks = [*injection.beside, self.action_block(x_t)]
+        answer, _ = self.transformer(blocks, layout, condition, injection.hook, past=prefix)
+        return self.read_velocity(answer)
+
+    def _condition(self, time: Tensor, injection: Injection) -> Tensor:
+        condition = self.time_condition(time)
+        return condition if injection.condition is None else injection.condition(condition)
+
+    # Parts
+
+    def parts(self) -> Mapping[str, str]:
+        """Tower and projector; embedding and VLM expert; experts that an integration asked for; all else acts."""
+        return self.PARTS
 
 
 def initialise(module: nn.Module) -> None:

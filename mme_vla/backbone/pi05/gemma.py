@@ -11,15 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from mme_vla.backbone.base import Hook
 from mme_vla.backbone.layers.attention import additive_mask, attend
 from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, token_positions
 from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.layers.rope import Rotation, rotate, rotation
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
-
-Hook = Callable[[int, Tensor], Tensor]
-"""The backbone's second door: (layer, residual stream [b, n, d]) → what the answering expert's MLP reads instead."""
 
 KeyValue = tuple[Tensor, Tensor]
 

@@ -70,7 +70,7 @@ class AttentionWatch:
     _handles: list[Any] = field(default_factory=list)
 
     def __enter__(self) -> Self:
-        transformer = self.policy.backbone.transformer
+        transformer: Any = self.policy.backbone.transformer
         self._handles = [transformer.register_forward_pre_hook(self._begin, with_kwargs=True)]
         for i, layer in enumerate(transformer.layers):
             self._handles.append(layer.register_forward_pre_hook(partial(self._layer, i), with_kwargs=True))

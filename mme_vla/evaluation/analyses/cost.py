@@ -69,11 +69,10 @@ def on_meta(model: str, budget: int | None = None, backbone: str = "pi05") -> tu
 
 def full_batch(policy: MMEPolicy, prompt: int, device: str = "cpu") -> Batch:
     """A batch of one without content: two views, `prompt` tokens without padding, and a memory that is full."""
-    config, history = policy.backbone.config, None
-    size = config.vision.image_size
+    size, history = policy.backbone.image_size, None
     if policy.memory is not None:
         n = policy.memory.padded_length(policy.memory.capacity)
-        features = torch.zeros(1, n, config.vlm.width, device=device)
+        features = torch.zeros(1, n, policy.backbone.vision_width, device=device)
         mask = torch.ones(1, n, dtype=torch.bool, device=device)
         history = HistoryTokens(features, torch.zeros(1, n, 3, device=device), mask)
     return Batch(
@@ -82,7 +81,7 @@ def full_batch(policy: MMEPolicy, prompt: int, device: str = "cpu") -> Batch:
         prompt=torch.full((1, prompt), 5, device=device),
         prompt_mask=torch.ones(1, prompt, dtype=torch.bool, device=device),
         history=history,
-        actions=torch.zeros(1, config.horizon, config.action_dim, device=device),
+        actions=torch.zeros(1, policy.horizon, policy.action_dim, device=device),
     )
 
 
@@ -111,7 +110,7 @@ def _streamed(policy: MMEPolicy, batch: Batch) -> int | None:
 def _frames(policy: MMEPolicy) -> int:
     if policy.memory is None:
         return 0
-    size = policy.backbone.config.vision.image_size
+    size = policy.backbone.image_size
     image = torch.empty(1, 3, size, size, device="meta")
     wanted = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
     return wanted * flops(lambda: policy.backbone.encode_images(image))

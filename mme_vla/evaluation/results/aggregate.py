@@ -24,7 +24,7 @@ USUAL_BUDGET = 512
 class Figure:
     """One number of a table, in percent.
 
-    mean, std: over the complete runs; None without one (`std` needs two). interval: see `mme_vla.evaluation.results.intervals`.
+    mean, std: over the complete runs; None without one (`std` needs two). interval: see `intervals.py`.
     runs, complete: runs there are, and those that have every episode of this figure.
     done, expected: episodes of all runs. partial: rate of the episodes that are done, if no run is complete.
     paper: what the paper reports here.

@@ -18,7 +18,7 @@ from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
 from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.serving.session import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
@@ -35,7 +35,7 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    policy: MMEPolicy,
+    policy: Policy,
     jobs: Sequence[Job],
     output: Path,
     facts: RunFacts,
@@ -80,7 +80,7 @@ def evaluate(
 
 
 def _run(
-    policy: MMEPolicy,
+    policy: Policy,
     jobs: list[Job],
     output: Path,
     facts: RunFacts,
@@ -106,7 +106,7 @@ def _run(
 
 
 def run_settings(
-    policy: MMEPolicy,
+    policy: Policy,
     facts: RunFacts,
     settings: RolloutSettings,
     subgoals: SubgoalPredictor | None = None,
@@ -142,7 +142,7 @@ def _end_of(place: str | None) -> str | None:
     return None if place is None else "/".join(Path(place).parts[-4:])
 
 
-def check_subgoals(policy: MMEPolicy, subgoals: SubgoalPredictor | None) -> None:
+def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
     """Refuse a predictor that says what this policy was not trained to read.
 
     Raises:
@@ -167,7 +167,7 @@ def checkpoint_label(source: str | None) -> int | str:
     return int(step[1]) if step else name
 
 
-def memory_budget(policy: MMEPolicy) -> int | None:
+def memory_budget(policy: Policy) -> int | None:
     """Memory tokens, where they are not the usual 512."""
     budget = None if policy.memory is None else policy.memory.budget
     return None if budget == USUAL_BUDGET else budget

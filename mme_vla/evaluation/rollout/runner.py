@@ -22,7 +22,7 @@ from mme_vla.evaluation.rollout.running_episode import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_score import EXTRA
 from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
 GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
@@ -81,7 +81,7 @@ class Rollout:
         subgoal_folder: where every subgoal is written down with its picture; None keeps the scores alone.
     """
 
-    policy: MMEPolicy
+    policy: Policy
     envs: Environments
     facts: RunFacts
     settings: RolloutSettings

@@ -11,7 +11,7 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
 
 
@@ -33,7 +33,7 @@ class RunningEpisode:
 
     def __init__(
         self,
-        policy: MMEPolicy,
+        policy: Policy,
         job: Job,
         seed: int,
         subgoals: SubgoalPredictor | None = None,

@@ -1,0 +1,160 @@
+"""`Backbone`: what a policy asks of a network that turns pictures, words and memory into actions."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.layers.blocks import Block, Visibility
+from mme_vla.types import Batch
+
+Hook = Callable[[int, Tensor], Tensor]
+"""`hook(layer, x)`: what the answering expert's MLP of a layer reads instead of its residual stream x [b, h, d]."""
+
+Draws = dict[str, Tensor]
+"""Random numbers by name, one row a sample: drawn by the caller, so that batching and sharding cannot change them."""
+
+
+@dataclass(frozen=True)
+class Injection:
+    """How memory enters a backbone for one chunk: what an integration hands over (`Integration.inject`).
+
+    blocks: the prefix in sequence order, the observation's own blocks among them.
+    visibility: which block may look at which; rows for these blocks, for those beside the actions and for `action`.
+    hook: see `Hook`. condition: what becomes of the condition [m, c] of the answering expert's norms.
+    beside: blocks that run with the actions, before them, in every step.
+    """
+
+    blocks: Sequence[Block]
+    visibility: Visibility
+    hook: Hook | None = None
+    condition: Callable[[Tensor], Tensor] | None = None
+    beside: Sequence[Block] = ()
+
+
+Inject = Callable[[Sequence[Block]], Injection]
+"""An integration with the chunk's memory already bound: observation blocks → `Injection`."""
+
+
+class Backbone(nn.Module):
+    """A vision tower, a language model and a head that answers with actions. It knows nothing of memory.
+
+    A subclass is made from its sizes and the experts that an integration asks for, and sets:
+        Config: the class of its sizes; `Config.from_dict(section)` reads them, and integrations are built from them.
+        vision_width: width d_vision of the tokens a memory stores. token_width: of the tokens in the prefix.
+        answer_width: of the residual stream that a hook changes (0: there is none).
+        depth: layers of that stream. head_dim: width of one attention head.
+        grid: side of a view's token grid.
+        horizon, action_dim: of the chunk [h, a] it answers with.
+        image_size: side of the square pictures it reads.
+        hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition` and `beside`.
+
+    and implements the methods below. Losses and samples are its own affair (a flow, a regression, a diffusion): whoever
+    trains or evaluates hands back the numbers it asked for in `loss_draws` and `sample_draws`.
+    """
+
+    Config: ClassVar[type[Any]]
+    vision_width: int
+    token_width: int
+    answer_width: int = 0
+    depth: int
+    head_dim: int
+    grid: int
+    horizon: int
+    action_dim: int
+    image_size: int
+    hosts: frozenset[str] = frozenset({"blocks"})
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def __init__(self, config: Any, extra_experts: Mapping[str, Any] | None = None) -> None:
+        super().__init__()
+
+    def draw_experts(self, names: Sequence[str]) -> None:
+        """Give the experts that an integration asked for fresh weights; all others wait for a checkpoint."""
+        if names:
+            raise NotImplementedError(f"{type(self).__name__} hosts no further experts.")
+
+    # Observation
+
+    vision: nn.Module
+    """The vision tower: its weights decide what a cache of its tokens holds."""
+
+    def encode_images(self, images: Tensor) -> Tensor:
+        """Pictures [n, 3, s, s] in [−1, 1] → the tower's tokens [n, grid², d_vision]."""
+        raise NotImplementedError
+
+    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
+        """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, grid², d_vision] as memories store them."""
+        raise NotImplementedError
+
+    def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
+        """Blocks of the current views [b, v, 3, s, s] in [−1, 1] and of the batch's prompt."""
+        raise NotImplementedError
+
+    # Training
+
+    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
+        return {}
+
+    def loss(self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor]) -> Tensor:
+        """The loss [b, h] of every step of every chunk, under the caller's autocast.
+
+        Args:
+            batch: with `actions`. images: its views [b, v, 3, s, s] in [−1, 1], augmented where they shall be.
+            inject: the memory's way in. draws: as `loss_draws` made them, on the batch's device.
+        """
+        raise NotImplementedError
+
+    def recompute(self, wanted: bool) -> None:
+        """Keep no activations inside layers in training, and compute them again in the backward pass; or keep them."""
+        raise NotImplementedError
+
+    # Sampling
+
+    def sample_draws(self, generator: torch.Generator) -> Draws:
+        """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
+        return {}
+
+    def sample(
+        self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """A normalised chunk [b, h, a], under the caller's autocast.
+
+        Args:
+            draws: as `sample_draws` made them, with a batch axis, on the batch's device.
+            steps: of an iterative head; its own number by default. Heads that answer at once take no notice.
+        """
+        raise NotImplementedError
+
+    # Parts
+
+    def parts(self) -> Mapping[str, str]:
+        """Part → pattern of its parameters' names inside this module, in order; the first that matches decides.
+
+        The names are what fine-tuning speaks of: `vision`, `vlm`, `action`, and `memory` for the experts that an
+        integration asked for.
+        """
+        raise NotImplementedError
+
+    adapted: Sequence[str] = ()
+    """Linear layers that LoRA wraps unless told otherwise, by the end of their name."""
+    heads: Sequence[str] = ()
+    """Modules that learn in full beside the adapters, by the end of their name."""
+    unadaptable: str | None = None
+    """Pattern of linear layers whose weight is read past any adapter that wraps them."""
+
+
+def stack_draws(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Draws:
+    """Single draws (`sample_draws`) as those of a batch."""
+    return {name: torch.stack([row[name] for row in rows]).to(device) for name in (rows[0] if rows else {})}
+
+
+def map_draws(draws: Mapping[str, Tensor], change: Callable[[Tensor], Any]) -> Draws:
+    """Every value through `change`: rows of a batch, another device."""
+    return {name: change(value) for name, value in draws.items()}

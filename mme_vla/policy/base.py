@@ -1,0 +1,138 @@
+"""`Policy`: what training, evaluation, serving and weights speak to, whatever is inside."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.base import Draws
+from mme_vla.errors import UserError
+from mme_vla.memory.base import MemoryModule
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.saving import Saved
+from mme_vla.types import Batch
+
+if TYPE_CHECKING:
+    from mme_vla.processing.processor import Processor
+
+
+class Policy(Saved):
+    """A policy: a loss to train, chunks to sample, episodes to act in, parts to freeze or adapt, a folder to live in.
+
+    A subclass sets `memory` (or None), `processor`, `config`, `horizon` and `action_dim`, and implements what raises
+    NotImplementedError. Random numbers come from outside (`loss_draws`, `sample_draws`), so that training resumes and
+    episodes repeat bit for bit whatever they are batched with; only the policy knows what they mean.
+    """
+
+    memory: MemoryModule | None
+    processor: "Processor | None"
+    config: dict[str, Any]
+    horizon: int
+    """Steps of a chunk."""
+    action_dim: int
+    """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    # Training
+
+    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
+        return {}
+
+    def forward(self, batch: Batch, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of a batch, and metrics to log (detached).
+
+        Args:
+            batch: with `actions`. draws: as `loss_draws` makes them, on the policy's device; fresh ones by default.
+        """
+        raise NotImplementedError
+
+    def recompute(self, wanted: bool) -> None:
+        """Compute activations again in the backward pass instead of keeping them, or keep them."""
+        raise NotImplementedError
+
+    # Sampling
+
+    def sample_draws(self, generator: torch.Generator) -> Draws:
+        """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
+        return {}
+
+    def sample_actions(
+        self, batch: Batch, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+    ) -> Tensor:
+        """A normalised chunk [b, h, a].
+
+        Args:
+            draws: as `sample_draws` makes them, with a batch axis, on the policy's device; fresh ones by default.
+            steps: of an iterative head; its own number by default.
+        """
+        raise NotImplementedError
+
+    # Episodes
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode: its memory, its noise and its current view live in the returned object alone."""
+        return Episode(self, goal, seed)
+
+    def act(self, episodes: Sequence[Episode], steps: int | None = None) -> np.ndarray:
+        """Choose the next chunk for many episodes in one batch, adding nothing to their memories.
+
+        Returns:
+            float32 [n, h, width]: actions as the embodiment executes them.
+        """
+        raise NotImplementedError
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor:
+        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them.
+
+        Only policies with a memory that stores vision tokens are asked.
+        """
+        raise NotImplementedError
+
+    def vision_fingerprint(self) -> str:
+        """A hash of what the tokens of `encode_frames` depend on, and a cache of them."""
+        raise NotImplementedError
+
+    # Parts
+
+    adapted: Sequence[str] = ()
+    """Linear layers that LoRA wraps unless told otherwise, by the end of their name."""
+    heads: Sequence[str] = ()
+    """Modules that learn in full beside the adapters, by the end of their name."""
+    unadaptable: str | None = None
+    """Pattern of linear layers whose weight is read past any adapter that wraps them."""
+
+    def parts(self) -> Mapping[str, str]:
+        """Part → pattern of its parameters' names, in order; the first that matches decides.
+
+        Fine-tuning, `inspect` and reports speak of these: `vision`, `vlm`, `action`, `memory`.
+        """
+        raise NotImplementedError
+
+    def part_of(self, name: str) -> str:
+        """The part that a parameter belongs to."""
+        for part, pattern in self.parts().items():
+            if re.match(pattern, name):
+                return part
+        raise ValueError(f"No part of {type(self).__name__} holds {name!r}; the last pattern must match the rest.")
+
+    def require_memory(self) -> MemoryModule:
+        """Return the memory, or say that there is none."""
+        if self.memory is None:
+            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
+        return self.memory
+
+    def require_processor(self) -> "Processor":
+        """Return the processor, or say what it takes to have one."""
+        if self.processor is None:
+            raise UserError(
+                "This policy was built without a processor, so it can run batches but no raw data: build it with "
+                "build_policy() or load it with from_pretrained()."
+            )
+        return self.processor
