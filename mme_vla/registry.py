@@ -88,3 +88,25 @@ INTEGRATIONS: Registry[Any] = Registry("integration")
 BACKBONES: Registry[Any] = Registry("backbone")
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")
+PLAYERS: Registry[Any] = Registry("player")
+REGISTRIES = {
+    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "subgoal": SUBGOALS, "task": TASKS,
+    "player": PLAYERS,
+}  # fmt: skip
+
+
+def register(kind: str, name: str) -> Callable[[Any], Any]:
+    """Return a decorator that files a part of one's own under `name`, for YAML files and command lines to call it by.
+
+    Args:
+        kind: `memory`, `integration`, `backbone`, `subgoal` (a predictor), `task` or `player`.
+
+    Raises:
+        UserError: an unknown kind, or the name is taken.
+
+    >>> @register("memory", "nothing")  # doctest: +SKIP
+    ... class Nothing(Memory): ...
+    """
+    if kind not in REGISTRIES:
+        raise UserError(f"There are no parts of kind {kind!r} to register. {did_you_mean(kind, REGISTRIES)}")
+    return REGISTRIES[kind].register(name)

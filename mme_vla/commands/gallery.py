@@ -16,7 +16,7 @@ from mme_vla.errors import UserError, did_you_mean
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.task import Task
 
 TILE, GAP, CAPTION = 176, 6, 18  # pixels
 VIDEO_RED, INK = (200, 33, 33), (60, 60, 60)
@@ -34,7 +34,7 @@ class Snapshot:
     video: bool
 
 
-def demonstrate_with_pictures(task: "MemoryTask", every: int = EVERY) -> tuple[list[Snapshot], bool]:
+def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
     """Demonstrate a task and look at it every few steps; also returns whether it succeeded."""
     from mme_vla.envs.observations import Include, Observer
     from mme_vla.envs.recording.demonstration import demonstrate
@@ -124,7 +124,7 @@ def run(cfg: "DictConfig") -> None:
     print(f"{folder / 'README.md'}: {len(entries)} tasks.")
 
 
-def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["MemoryTask", list[Snapshot]]:
+def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
     """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
     from mme_vla.envs.scene.placement import SceneError
 

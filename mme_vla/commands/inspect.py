@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.memory.base import MemoryModule
+    from mme_vla.memory.base import Memory
     from mme_vla.policy.base import Policy
 
 
@@ -129,7 +129,7 @@ def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tupl
     return episode, step
 
 
-def build_memory(cfg: DictConfig) -> "MemoryModule":
+def build_memory(cfg: DictConfig) -> "Memory":
     """The memory the configuration names, of any width: it is only asked to select.
 
     Raises:
@@ -148,7 +148,7 @@ def draw_memory(
     source: "EpisodeSource",
     episode: int,
     step: int,
-    memory: "MemoryModule",
+    memory: "Memory",
     name: str,
     folder: Path,
     console: "Console",

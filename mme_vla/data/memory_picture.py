@@ -15,7 +15,7 @@ def contact_sheet(
     """Draw what is remembered at `step`.
 
     Args:
-        frames: [step + 1, H, W, 3] uint8. selected: [n, 2] of (frame, patch), as `MemoryModule.select` returns.
+        frames: [step + 1, H, W, 3] uint8. selected: [n, 2] of (frame, patch), as `Memory.select` returns.
         grid: side of a frame's patch grid. exec_start: first execution frame. title: one line above.
 
     Returns:

@@ -19,7 +19,7 @@ DIFFICULTIES = ("easy", "medium", "hard")
 RECOVERY_MODES = ("z", "xy")
 
 
-class MemoryTask(Stage):
+class Task(Stage):
     """One RoboMME task as a ManiSkill environment (paper, appendix on tasks).
 
     Args:

@@ -8,9 +8,7 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.play.game import SIDE, ChoiceSession
-from mme_vla.registry import Registry
-
-PLAYERS: Registry[Any] = Registry("player")
+from mme_vla.registry import PLAYERS
 
 
 class NoChoiceError(Exception):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mme_vla.backbone.base import Draws
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.saving import Saved
 from mme_vla.types import Batch
@@ -27,7 +27,7 @@ class Policy(Saved):
     episodes repeat bit for bit whatever they are batched with; only the policy knows what they mean.
     """
 
-    memory: MemoryModule | None
+    memory: Memory | None
     processor: "Processor | None"
     config: dict[str, Any]
     horizon: int
@@ -122,7 +122,7 @@ class Policy(Saved):
                 return part
         raise ValueError(f"No part of {type(self).__name__} holds {name!r}; the last pattern must match the rest.")
 
-    def require_memory(self) -> MemoryModule:
+    def require_memory(self) -> Memory:
         """Return the memory, or say that there is none."""
         if self.memory is None:
             raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")

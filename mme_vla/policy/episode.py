@@ -12,7 +12,7 @@ from mme_vla.memory.history import OnlineHistory
 from mme_vla.types import VIEWS, HistoryTokens
 
 if TYPE_CHECKING:
-    from mme_vla.memory.base import MemoryModule
+    from mme_vla.memory.base import Memory
     from mme_vla.processing.processor import Processor
 
 
@@ -20,9 +20,9 @@ class Host(Protocol):
     """What an episode asks of its policy."""
 
     @property
-    def memory(self) -> "MemoryModule | None": ...
+    def memory(self) -> "Memory | None": ...
 
-    def require_memory(self) -> "MemoryModule": ...
+    def require_memory(self) -> "Memory": ...
 
     def require_processor(self) -> "Processor": ...
 

@@ -15,7 +15,7 @@ import mme_vla.memory  # noqa: F401  (importing the rooms registers what they sh
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
 from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
@@ -35,7 +35,7 @@ class MMEPolicy(Policy):
     def __init__(
         self,
         backbone: Backbone,
-        memory: MemoryModule | None,
+        memory: Memory | None,
         integration: Integration,
         processor: "Processor | None" = None,
         config: Mapping[str, Any] | None = None,
@@ -91,7 +91,7 @@ class MMEPolicy(Policy):
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())
             backbone.draw_experts(list(experts))
-        memory: MemoryModule | None = None
+        memory: Memory | None = None
         if config.get("memory"):
             widths = {"d_vision": backbone.vision_width, "width": integration.memory_width}
             memory = MEMORIES.build(config["memory"], **widths)

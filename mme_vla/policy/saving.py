@@ -88,7 +88,7 @@ class Saved(nn.Module):
         if not isinstance(config, dict) or "backbone" not in config:
             raise UserError(
                 f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
-                "are read by mme_vla.weights.load_into() and converted by python -m mme_vla.weights.convert."
+                "are read by mme_vla.weights.load_weights() and converted by python -m mme_vla.weights.convert."
             )
         if dtype == "bfloat16":
             policy = {"compute_dtype": "bfloat16", **policy}

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
@@ -38,6 +38,13 @@ def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
     policy.require_processor().stats = unit_stats()
     open_gates(policy)
     return policy
+
+
+def tiny_sections(model: str, backbone: str = "tiny") -> dict[str, Any]:
+    """The plain sections of a model at a small backbone's size, for `MMEPolicy.from_config`."""
+    plain = OmegaConf.to_container(_composed(*policy_words(model, {"backbone": backbone})), resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): plain[key] for key in ("backbone", "memory", "integration", "policy")}
 
 
 @cache

@@ -32,7 +32,7 @@ _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)"
 _MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
 
 
-def load_into(
+def load_weights(
     policy: Policy,
     source: str | Path,
     *,
@@ -80,7 +80,7 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     """Read a checkpoint in the names of a policy of its own variant.
 
     Raises:
-        UserError: as `load_into`.
+        UserError: as `load_weights`.
     """
     tensors = source.tensors()
     if source.format == "ours":

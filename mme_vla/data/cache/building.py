@@ -16,7 +16,7 @@ from mme_vla.data.cache.store import DTYPES, FINGERPRINT, MEMORY_VIEW, check_fin
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 
 Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
 
@@ -51,7 +51,7 @@ def clear_cache(folder: Path) -> None:
 
 def build_cache(
     source: EpisodeSource,
-    memory: MemoryModule,
+    memory: Memory,
     encode: Encode,
     folder: Path,
     expected: dict[str, Any],
@@ -84,7 +84,7 @@ def build_cache(
 
 
 def estimate(
-    source: EpisodeSource, memory: MemoryModule, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
+    source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
 ) -> Estimate:
     """Measure a few batches of the first episode and extrapolate to the dataset."""
     spec = memory.storage
@@ -113,7 +113,7 @@ class _Chunk:
     score_values: list[np.ndarray]
 
 
-def _chunks(source: EpisodeSource, episode: int, memory: MemoryModule, batch_size: int) -> Iterator[_Chunk]:
+def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
     spec, length, scorer = memory.storage, int(source.lengths[episode]), memory.make_scorer()
     kept = spec.kept_frames(length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
@@ -137,7 +137,7 @@ def _chunks(source: EpisodeSource, episode: int, memory: MemoryModule, batch_siz
 def _build_episode(
     source: EpisodeSource,
     episode: int,
-    memory: MemoryModule,
+    memory: Memory,
     encode: Encode,
     folder: Path,
     dtype: str,

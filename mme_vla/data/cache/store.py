@@ -20,7 +20,7 @@ import torch
 from mme_vla.config.devices import find_device
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
 
 def ensure_cache(
     source: EpisodeSource,
-    memory: MemoryModule,
+    memory: Memory,
     encode: "Encode",
     encoder: str,
     *,

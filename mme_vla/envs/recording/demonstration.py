@@ -7,10 +7,10 @@ from mme_vla.envs.robot.demonstrator import Demonstrator
 
 if TYPE_CHECKING:
     from mme_vla.envs.subtasks import SubTask
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.task import Task
 
 
-def demonstrate(env: "MemoryTask", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
+def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
     """Perform the sub-tasks of a task that has just been reset, evaluating before and after each one.
 
     The demonstrator's view of where the episode stands, `env.progress.planned`, moves at these evaluations only. In a
@@ -45,7 +45,7 @@ def demonstrate(env: "MemoryTask", demonstrator: Demonstrator, subtasks: Sequenc
     return env.success() and not env.progress.failed
 
 
-def _ended(env: "MemoryTask") -> bool:
+def _ended(env: "Task") -> bool:
     """Evaluate once, as a recorder does between sub-tasks; whether the episode is over."""
     env.evaluate()
     env.progress.planned = env.progress.index

@@ -12,7 +12,7 @@ from mme_vla.envs.observations import INTRINSIC
 
 if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import RecordedStep
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.task import Task
 
 _BYTES = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
 
@@ -26,7 +26,7 @@ class EpisodeWriter:
         task: what is demonstrated; its seed, difficulty, goals and options go into `setup`.
     """
 
-    def __init__(self, path: Path, index: int, task: "MemoryTask") -> None:
+    def __init__(self, path: Path, index: int, task: "Task") -> None:
         self._file = h5py.File(path, "w")
         self._episode = self._file.create_group(f"episode_{index}")
         self._steps = 0

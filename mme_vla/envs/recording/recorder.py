@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import sapien
 
     from mme_vla.envs.subtasks import SubTask
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.task import Task
 
 MAX_STEPS = 2000
 """Control steps after which a recording is given up."""
@@ -72,7 +72,7 @@ class Recorder:
     """
 
     def __init__(
-        self, task: "MemoryTask", render: bool = True, on_step: Callable[[RecordedStep], None] | None = None
+        self, task: "Task", render: bool = True, on_step: Callable[[RecordedStep], None] | None = None
     ) -> None:
         self._task, self._render, self._on_step = task, render, on_step
         pictures = {"include_front_depth": render, "include_wrist_depth": render}

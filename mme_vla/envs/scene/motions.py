@@ -11,7 +11,7 @@ from mme_vla.envs.scene.objects import COLOURS, Disc, build_highlight, build_sph
 from mme_vla.envs.scene.things import AWAY, Thing, distance_xy
 
 if TYPE_CHECKING:
-    from mme_vla.envs.task import MemoryTask
+    from mme_vla.envs.task import Task
 
 UNCOVERED_STEPS = 32
 """The first half of the covering window: containers are away and the cubes lie open."""
@@ -144,7 +144,7 @@ class Highlight:
             self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
 
 
-def build_mark(env: "MemoryTask", name: str, radius: float, half_length: float) -> Disc:
+def build_mark(env: "Task", name: str, radius: float, half_length: float) -> Disc:
     """Red rings that cover a target's own, for `Mark`; metres."""
     return build_highlight(env, name, radius, half_length, COLOURS["red"], rings=True)
 
@@ -181,7 +181,7 @@ class Trace:
 
     STEPS, RADIUS, HEIGHT, BELOW = 40, 0.005, 0.01, 0.1
 
-    def __init__(self, env: "MemoryTask") -> None:
+    def __init__(self, env: "Task") -> None:
         self._env = env
         self._dots = [build_sphere(env, f"trace_{i}", self.RADIUS) for i in range(self.STEPS)]
 

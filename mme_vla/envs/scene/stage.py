@@ -21,7 +21,7 @@ FIELD_OF_VIEW = np.pi / 2
 
 
 class Stage(BaseEnv):
-    """A robot at a table under two cameras. What stands on the table, and why, is the script's: `MemoryTask`.
+    """A robot at a table under two cameras. What stands on the table, and why, is the script's: `Task`.
 
     Args:
         seed: fixes the scene and the script; the `seed` of `reset` has no effect.

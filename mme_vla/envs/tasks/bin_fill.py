@@ -14,7 +14,7 @@ from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_c
 from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 # Both bounds belong to the range.
@@ -29,7 +29,7 @@ IN_BIN = sapien.Pose((10.0, 10.0, 0.0))
 
 
 @register_task
-class BinFill(MemoryTask):
+class BinFill(Task):
     """Any cube counts towards its colour; the counts are judged at the button."""
 
     shared_draws = True

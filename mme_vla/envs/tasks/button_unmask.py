@@ -7,7 +7,7 @@ from mme_vla.envs.scene.objects import build_button
 from mme_vla.envs.scene.placement import draw_button
 from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (
     add_containers,
@@ -22,7 +22,7 @@ LETTERS = ("b", "c")
 
 
 @register_task
-class ButtonUnmask(MemoryTask):
+class ButtonUnmask(Task):
     """Containers cover three cubes while the robot presses a button."""
 
     def build(self, draws: Draws) -> None:

@@ -21,7 +21,7 @@ from mme_vla.envs.scene.placement import SceneError
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, reset_reached
 from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 
 @register_task
-class InsertPeg(MemoryTask):
+class InsertPeg(Task):
     """The first peg is the one; places are drawn per episode and the difficulty changes nothing."""
 
     shared_draws = True

@@ -13,7 +13,7 @@ from mme_vla.envs.scene.objects.shapes import at
 from mme_vla.envs.scene.placement import Region, SceneError, draw_cube, draw_disc
 from mme_vla.envs.scene.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ MORE_TRIES = 2  # where the cube did not stay on the target
 
 
 @register_task
-class MoveCube(MemoryTask):
+class MoveCube(Task):
     """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty changes nothing."""
 
     shared_draws = True

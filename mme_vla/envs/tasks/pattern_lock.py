@@ -13,7 +13,7 @@ from mme_vla.envs.scene.placement import SceneError
 from mme_vla.envs.scene.predicates import over
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.stick import back_to_start
 
@@ -35,7 +35,7 @@ REACH = 0.2  # how far away the disc a direction means may lie
 
 
 @register_task
-class PatternLock(MemoryTask):
+class PatternLock(Task):
     """Rows of the grid run along x, columns along y."""
 
     stick = True

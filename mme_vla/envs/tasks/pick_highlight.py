@@ -8,7 +8,7 @@ from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 CUBES = {"easy": 3, "medium": 4, "hard": 6}
@@ -18,7 +18,7 @@ RELEASE_Z = 0.01
 
 
 @register_task
-class PickHighlight(MemoryTask):
+class PickHighlight(Task):
     """Success needs every highlighted cube to have been picked up once, in any order."""
 
     latch_failure = True

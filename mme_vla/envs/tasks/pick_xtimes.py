@@ -7,7 +7,7 @@ from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
 from mme_vla.envs.scene.predicates import any_picked_up, dropped_onto, picked_up, pressed
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 COLOURS = ("red", "blue", "green")
@@ -18,7 +18,7 @@ TARGET_RADIUS, TARGET_THICKNESS = 0.04, 0.005
 
 
 @register_task
-class PickXtimes(MemoryTask):
+class PickXtimes(Task):
     """One cube is picked up and placed on the target again and again, as often as the goal says."""
 
     latch_failure = True

@@ -12,7 +12,7 @@ from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
 from mme_vla.envs.scene.predicates import over
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.stick import back_to_start
 
@@ -31,7 +31,7 @@ SIDES: tuple[tuple[str, Turn], ...] = (
 
 
 @register_task
-class RouteStick(MemoryTask):
+class RouteStick(Task):
     """Five discs in a row with an obstacle between each two; left is the larger y."""
 
     stick = True

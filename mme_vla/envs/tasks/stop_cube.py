@@ -15,7 +15,7 @@ from mme_vla.envs.scene.placement import draw_button
 from mme_vla.envs.scene.predicates import hovering, pressed
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ CHECKPOINT = 100
 
 
 @register_task
-class StopCube(MemoryTask):
+class StopCube(Task):
     """The difficulty changes nothing."""
 
     latch_failure = True

@@ -9,7 +9,7 @@ from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_c
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
@@ -44,7 +44,7 @@ class Swings:
 
 
 @register_task
-class SwingXtimes(MemoryTask):
+class SwingXtimes(Task):
     """The cube goes right, then left, `repetitions` times."""
 
     latch_failure = True

@@ -11,7 +11,7 @@ from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
 
 
 @register_task
-class VideoRepick(MemoryTask):
+class VideoRepick(Task):
     """Three cubes of one colour that change places, or fifteen that do not."""
 
     shared_draws = True

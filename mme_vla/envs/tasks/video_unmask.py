@@ -5,7 +5,7 @@ from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, Cover
 from mme_vla.envs.scene.predicates import StaticFor
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (
     add_containers,
@@ -20,7 +20,7 @@ PICKS = {"easy": 1, "medium": 1, "hard": 2}
 
 
 @register_task
-class VideoUnmask(MemoryTask):
+class VideoUnmask(Task):
     """Containers cover three cubes during the conditioning video."""
 
     def build(self, draws: Draws) -> None:

@@ -33,6 +33,12 @@ class Evaluation(NamedTuple):
     records: list[EpisodeRecord]
     workload: Workload
 
+    @property
+    def success_rate(self) -> float:
+        """Share of successes, 0 to 1; an episode that ended in an error is none. NaN without episodes."""
+        won = [record.outcome == "success" for record in self.records]
+        return sum(won) / len(won) if won else float("nan")
+
 
 def evaluate(
     policy: Policy,

@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor, nn
 
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 from mme_vla.memory.perceptual import PerceptualMemory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.memory.rmt import RMTLayer, angles
@@ -14,7 +14,7 @@ ENCODER = "mem_encoder/feature_encoder"
 LAYER = "mem_encoder/recur_layer"
 
 
-def released_names(memory: MemoryModule) -> NameTable | None:
+def released_names(memory: Memory) -> NameTable | None:
     """The table of a memory, or None where no released checkpoint has one (a memory of one's own)."""
     if isinstance(memory, PerceptualMemory):
         return _encoder("encoder_static")
@@ -24,7 +24,7 @@ def released_names(memory: MemoryModule) -> NameTable | None:
     return None
 
 
-def released_unread(memory: MemoryModule | None) -> list[Unread]:
+def released_unread(memory: Memory | None) -> list[Unread]:
     """Of a recurrent memory: a layer norm that the released code has and never applies."""
     if not isinstance(memory, RecurrentMemory):
         return []
@@ -32,7 +32,7 @@ def released_unread(memory: MemoryModule | None) -> list[Unread]:
     return [Unread(f"mem_encoder/pre_norm/{leaf}", width) for leaf in ("scale", "bias")]
 
 
-def released_derived(memory: MemoryModule | None) -> list[Derived]:
+def released_derived(memory: Memory | None) -> list[Derived]:
     """Constants that released recurrent memories store: TTT's rate constant, RMT's rotary table."""
     if not isinstance(memory, RecurrentMemory):
         return []

@@ -8,10 +8,10 @@ from mme_vla.envs.scene.objects import Container, Cube, H, build_container, buil
 from mme_vla.envs.scene.placement import Avoid, Region, draw_container
 from mme_vla.envs.scene.predicates import container_picked_up, container_put_down
 from mme_vla.envs.subtasks import SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 
 
-def add_containers(env: MemoryTask, draws: Draws, count: int, avoid: Sequence[Avoid] = ()) -> list[Container]:
+def add_containers(env: Task, draws: Draws, count: int, avoid: Sequence[Avoid] = ()) -> list[Container]:
     """Place containers in the middle of the table until there are `count` or one finds no place."""
     containers: list[Container] = []
     while len(containers) < count:
@@ -22,7 +22,7 @@ def add_containers(env: MemoryTask, draws: Draws, count: int, avoid: Sequence[Av
     return containers
 
 
-def add_hidden_cubes(env: MemoryTask, colours: Sequence[str], containers: Sequence[Container]) -> list[Cube]:
+def add_hidden_cubes(env: Task, colours: Sequence[str], containers: Sequence[Container]) -> list[Cube]:
     """Put a small cube of each colour under the container of the same index."""
     return [
         env.add(build_hidden_cube(env, f"cube_{colour}", colour, container.position[:2]))
@@ -31,7 +31,7 @@ def add_hidden_cubes(env: MemoryTask, colours: Sequence[str], containers: Sequen
 
 
 def container_picks(
-    env: MemoryTask,
+    env: Task,
     wanted: Sequence[tuple[str, Container]],
     containers: Sequence[Container],
     letters: tuple[str, str] = ("a", "b"),
@@ -66,7 +66,7 @@ def pick_up_container(colour: str, container: Container, containers: Sequence[Co
     )
 
 
-def put_down_container(env: MemoryTask, container: Container, containers: Sequence[Container], choice: str) -> SubTask:
+def put_down_container(env: Task, container: Container, containers: Sequence[Container], choice: str) -> SubTask:
     """The sub-task of putting a lifted container back; lifting another one fails."""
     return SubTask(
         "put down the container",

@@ -3,10 +3,10 @@
 from mme_vla.envs.scene.predicates import reset_reached
 from mme_vla.envs.scene.stage import RESET_QPOS
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 
 
-def back_to_start(env: MemoryTask, steps: int = 30) -> list[SubTask]:
+def back_to_start(env: Task, steps: int = 30) -> list[SubTask]:
     """From the video to the execution: the arm goes home, then to where its first approach ended."""
     return [
         SubTask(

@@ -7,7 +7,7 @@ from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
 from mme_vla.envs.scene.objects import Container, H, build_container
 from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_container
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.families.containers import add_hidden_cubes
 
 CONTAINERS = {"easy": 3, "medium": 4, "hard": 4}
@@ -15,7 +15,7 @@ SWAPS = {"easy": (1, 2), "medium": (1, 2), "hard": (2, 3)}  # fewest and most
 PICKS = {"easy": (1, 2), "medium": (1, 1), "hard": (2, 2)}
 
 
-class UnmaskSwap(MemoryTask):
+class UnmaskSwap(Task):
     """Where the containers stand, and what comes before the picks, is for the task to say."""
 
     def plan(self, draws: Draws) -> None:

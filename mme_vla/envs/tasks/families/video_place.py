@@ -20,7 +20,7 @@ from mme_vla.envs.scene.predicates import (
     reset_reached,
 )
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
-from mme_vla.envs.task import MemoryTask
+from mme_vla.envs.task import Task
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -33,7 +33,7 @@ GO_HOME_STEPS, SWAP_STAGE_STEPS = 20, 60
 SWAP_LANE = 0.1
 
 
-class VideoPlace(MemoryTask):
+class VideoPlace(Task):
     """The cube visits targets, then a spot of the table; in hard episodes two targets then change places."""
 
     spot_radius: ClassVar[float]

@@ -1,0 +1,105 @@
+"""`check_integration`: does memory reach the action through an integration, and only as it should?"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import open_gates, random_batch, tiny_sections
+from mme_vla.types import Batch, MemoryTokens
+
+TOLERANCE = 1e-4
+
+
+def check_integration(name: str, memory: str = "framesamp", backbone: str = "tiny", **options: Any) -> None:
+    """Run every check on the integration that is registered under `name`, with a memory and a small backbone.
+
+    Args:
+        name: the key in `INTEGRATIONS`. memory: the key of a memory to bring in. backbone: a file of configs/backbone.
+        options: the integration's own, as its YAML would give them.
+
+    Raises:
+        AssertionError: says which promise does not hold, and what was found.
+        UserError: an unknown integration, memory or option, or a backbone that has no place for it.
+    """
+    sections = tiny_sections(f"{memory}_context", backbone)
+    policy = build_small(sections | {"integration": {"name": name, **options}})
+    if policy.integration.memory_width < 1:
+        raise UserError(f"The integration {name!r} takes no memory: its memory_width is 0.")
+    batch = random_batch(policy, batch=2, valid=64)
+    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    assert batch.history is not None
+    with torch.no_grad():
+        found = policy.encode_memory(batch.history)
+        assert found is not None
+        before = _loss(policy, batch, draws, found)
+        check_reach(policy, batch, draws, found, before)
+        check_rows(policy, batch, draws, found, before)
+        check_sampling(policy, batch, found)
+    check_gradients(policy, batch, draws)
+
+
+def build_small(sections: dict[str, Any]) -> MMEPolicy:
+    """A policy from plain sections, its gates open so that every part reaches the action."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        policy = MMEPolicy.from_config(sections)
+    open_gates(policy)
+    with torch.no_grad():
+        for parameter in policy.integration.parameters():  # near zero, or zero, where it starts as the identity
+            parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(1)))
+    return policy.eval()
+
+
+def _loss(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens) -> Tensor:
+    """The loss [b] of each sample."""
+    assert batch.actions is not None
+    rows = []
+    for row in (slice(i, i + 1) for i in range(len(batch.prompt))):
+        seen = (batch.images[row], batch.image_mask[row], batch.prompt[row], batch.prompt_mask[row])
+        one = Batch(*seen, history=None, actions=batch.actions[row])
+        mine = MemoryTokens(memory.tokens[row], memory.mask[row])
+        rows.append(policy(one, {name: value[row] for name, value in draws.items()}, memory=mine)[0])
+    return torch.stack(rows)
+
+
+def check_reach(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], found: MemoryTokens, before: Tensor) -> None:
+    """Other memories give other losses; what stands where the mask is False gives none."""
+    other = _loss(policy, batch, draws, MemoryTokens(-found.tokens, found.mask))
+    assert (other - before).abs().min() > 0, "memory does not reach the action: other tokens, the same loss."
+    padded = MemoryTokens(found.tokens.masked_fill(~found.mask[..., None], 1e3), found.mask)
+    assert (~found.mask).any(), "the check needs padding among the memory tokens"
+    error = float((_loss(policy, batch, draws, padded) - before).abs().max())
+    assert error <= TOLERANCE, f"what stands in the memory's padding changed the loss by {error:.2g}."
+
+
+def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], found: MemoryTokens, before: Tensor) -> None:
+    """Samples do not see each other."""
+    together, _ = policy(batch, draws, memory=found)
+    error = float((together - before.mean()).abs())
+    assert error <= TOLERANCE, f"samples of one batch see each other: alone their loss differs by {error:.2g}."
+
+
+def check_sampling(policy: MMEPolicy, batch: Batch, found: MemoryTokens) -> None:
+    """What runs once a chunk and what runs in every step add up to the pass that training makes."""
+    draws = {k: torch.stack([v, v]) for k, v in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    chunk = policy.sample_actions(batch, draws, steps=1, memory=found)
+    assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
+    if "noise" in draws:  # one Euler step from noise is noise − velocity at time 1
+        joint = draws["noise"] - policy.velocity(batch, draws["noise"], torch.ones(2), found)
+        error = float((chunk - joint).abs().max())
+        assert error <= TOLERANCE, f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
+
+
+def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -> None:
+    """Every parameter of integration and memory learns."""
+    policy.requires_grad_(True)
+    loss, _ = policy(batch, draws)
+    loss.backward()
+    idle = [
+        name for name, parameter in policy.named_parameters()
+        if policy.part_of(name) == "memory" and (parameter.grad is None or not parameter.grad.any())
+    ]  # fmt: skip
+    assert not idle, f"no gradient reaches {', '.join(idle)}."

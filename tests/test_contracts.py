@@ -1,0 +1,105 @@
+"""What the library asks of a user's parts it asks of its own: every registered one passes its check."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.layers.blocks import PI05_VISIBILITY
+from mme_vla.backbone.pi05.backbone import Pi05Backbone
+from mme_vla.integration.context import Context
+from mme_vla.memory.framesamp import FrameSamp
+from mme_vla.memory.history import History
+from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
+from mme_vla.testing import check_backbone, check_integration, check_memory, check_task
+from mme_vla.testing.small import tiny_sections
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+SIZES: dict[str, dict[str, Any]] = {
+    "framesamp": {"budget": 256}, "tokendrop": {"budget": 256},
+    "ttt": {"budget": 16, "max_steps": 8, "max_video": 4}, "rmt": {"budget": 16, "max_steps": 8, "max_video": 4},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["framesamp", "tokendrop", "ttt", "rmt"])
+def test_every_memory_of_the_library_keeps_a_memorys_promises(name: str) -> None:
+    check_memory(name, **SIZES[name])
+
+
+@pytest.mark.parametrize("name", ["context", "modulator", "expert"])
+def test_every_integration_of_the_library_keeps_an_integrations_promises(name: str) -> None:
+    check_integration(name)
+
+
+def test_the_backbone_of_the_library_keeps_a_backbones_promises() -> None:
+    check_backbone("pi05", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})
+
+
+def test_a_task_of_the_library_keeps_a_tasks_promises() -> None:
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    check_task("StopCube", difficulty="easy")
+
+
+# A check that cannot fail checks nothing: each is shown a part that breaks one promise.
+
+
+class _LooksAhead(FrameSamp):
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        return super().select(history, len(history) - 1, rng)
+
+
+class _Dices(FrameSamp):
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        chosen = super().select(history, step, rng)
+        return chosen[np.sort(np.random.default_rng().permutation(len(chosen))[: max(len(chosen) // 2, 1)])]
+
+
+class _ReadsPadding(FrameSamp):
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        found = super().forward(history)
+        return MemoryTokens(found.tokens + history.features.mean(), found.mask)
+
+
+class _Forgets(FrameSamp):
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        found = super().forward(history)
+        return MemoryTokens(torch.ones_like(found.tokens), found.mask)
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [(_LooksAhead, "later"), (_Dices, "same choice"), (_ReadsPadding, "padding"), (_Forgets, "does not read")],
+)
+def test_a_broken_memory_is_told_which_promise_it_breaks(
+    broken: type, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(MEMORIES._entries, "broken", broken)
+    with pytest.raises(AssertionError, match=words):
+        check_memory("broken", budget=256)
+
+
+class _Unread(Context):
+    """Memory stands in the prefix and nobody may look at it."""
+
+    def __init__(self, backbone: Any) -> None:
+        super().__init__(backbone)
+        self.visibility = {**PI05_VISIBILITY, "memory": {"memory"}}
+
+
+def test_an_integration_that_loses_memory_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(INTEGRATIONS._entries, "broken", _Unread)
+    with pytest.raises(AssertionError, match="does not reach the action"):
+        check_integration("broken")
+
+
+class _Random(Pi05Backbone):
+    def loss(self, *args: Any, **kwargs: Any) -> Tensor:
+        return super().loss(*args, **kwargs) + torch.rand(())
+
+
+def test_a_backbone_whose_loss_does_not_repeat_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(BACKBONES._entries, "broken", _Random)
+    with pytest.raises(AssertionError, match="same draws must give the same loss"):
+        check_backbone("broken", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})
