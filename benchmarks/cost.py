@@ -16,10 +16,10 @@ from timing import alternate, machine
 from variants import chunk, training_step
 
 from mme_vla import build_policy
-from mme_vla.config import compose
+from mme_vla.config.composition import compose
 from mme_vla.evaluation.analyses.cost import count_model
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import ALL_MODELS, NEURAL, random_batch
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import ALL_MODELS, NEURAL, random_batch
 from mme_vla.types import Batch
 
 TERA, MIB = 1e12, 2**20

@@ -44,10 +44,10 @@ def measure(root: Path, model: str, items: int, caches: Path) -> tuple[int, floa
     import torch
 
     from mme_vla import build_policy
-    from mme_vla.data.cache import ensure_cache
+    from mme_vla.data.cache.store import ensure_cache
     from mme_vla.data.dataset import TrainingDataset
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.data.stats import compute_norm_stats
+    from mme_vla.data.statistics import compute_norm_stats
 
     torch.set_num_threads(2)
     policy, source = build_policy(model), EpisodeSource(root)

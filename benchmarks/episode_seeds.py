@@ -16,9 +16,9 @@ from typing import Any
 
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import SPLITS, EpisodeSpec, episodes, formula, generate, write
-from mme_vla.envs.names import TASK_NAMES
-from mme_vla.envs.placement import SceneError
-from mme_vla.envs.recorder import Recorder
+from mme_vla.envs.recording.recorder import Recorder
+from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.task_names import TASK_NAMES
 
 MOST_TRIES = 20
 PUBLISHED = {

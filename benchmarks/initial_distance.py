@@ -8,7 +8,7 @@ hide everything); only the memory's own parameters are as initialised. Mean over
 
 import torch
 
-from mme_vla.testing import NEURAL, random_batch, random_history, small_policy
+from mme_vla.testing.small import NEURAL, random_batch, random_history, small_policy
 
 
 @torch.no_grad()

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 
 from timing import machine
 
-from mme_vla.envs.vector import VecEnv
-from mme_vla.envs.vector_jobs import Job
+from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import VecEnv
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout import Rollout, RunFacts
-from mme_vla.evaluation.rollout_env import make_rollout_env
-from mme_vla.evaluation.rollout_settings import RolloutSettings
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import small_policy
+from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import small_policy
 
 TASKS = ("PickXtimes", "StopCube", "BinFill", "SwingXtimes")  # none with a video: all steps are the policy's
 

@@ -28,7 +28,7 @@ from timing import machine
 
 from mme_vla.errors import UserError
 from mme_vla.serving import Client, pack, unpack
-from mme_vla.testing import moving_frames, small_policy
+from mme_vla.testing.small import moving_frames, small_policy
 
 CLIENTS, EPISODES, ROUNDS, MESSAGE_MIB = 8, 4, 3, 32
 LONG = 1000  # frames of a long first message

@@ -9,7 +9,7 @@ tower; activations come on top.
 import argparse
 
 from mme_vla import build_policy
-from mme_vla.testing import MODELS
+from mme_vla.testing.small import MODELS
 
 GIB = 2**30
 

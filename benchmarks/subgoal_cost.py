@@ -22,11 +22,11 @@ import torch
 from cost import TERA, check_attention_is_counted, flops, full_size, sampling
 
 from mme_vla.subgoal import Gemini, Memer, QwenVL
-from mme_vla.subgoal.build import Demonstration, open_input
-from mme_vla.subgoal.labels import Labels, keyframes
-from mme_vla.subgoal.parsing import mark_points, write_boxes
-from mme_vla.subgoal.prompts import memer_answer
-from mme_vla.subgoal.vlm import VLM, Answer, Question
+from mme_vla.subgoal.finetuning.collecting import Demonstration, open_input
+from mme_vla.subgoal.finetuning.labels import Labels, keyframes
+from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
+from mme_vla.subgoal.words.parsing import mark_points, write_boxes
+from mme_vla.subgoal.words.prompts import memer_answer
 
 RUN = 16  # actions executed of a chunk
 PICTURE, SECOND = 258, 258  # Gemini's tokens of a picture, and of a second of video

@@ -13,7 +13,7 @@ import torch
 from timing import alternate, machine
 
 from mme_vla import build_policy
-from mme_vla.testing import MODELS, random_batch
+from mme_vla.testing.small import MODELS, random_batch
 
 
 def training_step(policy, batch):

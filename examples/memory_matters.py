@@ -28,8 +28,8 @@ import torch
 from mme_vla import build_policy
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import NEURAL, cached_history
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import NEURAL, cached_history
 from mme_vla.types import Batch
 
 COLOURS = np.array([[220, 40, 40], [40, 200, 60], [50, 70, 230], [230, 210, 40]], np.uint8)

@@ -8,11 +8,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mme_vla.build import build_policy
     from mme_vla.errors import UserError
-    from mme_vla.memory.base import MemoryModule
+    from mme_vla.memory.base import Memory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
-    from mme_vla.policy import Episode, MMEPolicy
+    from mme_vla.policy.build import build_policy
+    from mme_vla.policy.mme import Episode, MMEPolicy
     from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, SUBGOALS, TASKS
     from mme_vla.types import Batch, HistoryTokens, MemoryTokens
 
@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 # Names are loaded on first use, so that importing the package costs nothing and needs no optional dependency.
 _HOME = {
-    "build_policy": "mme_vla.build",
-    "MMEPolicy": "mme_vla.policy",
-    "Episode": "mme_vla.policy",
-    "MemoryModule": "mme_vla.memory.base",
+    "build_policy": "mme_vla.policy.build",
+    "MMEPolicy": "mme_vla.policy.mme",
+    "Episode": "mme_vla.policy.mme",
+    "Memory": "mme_vla.memory.base",
     "History": "mme_vla.memory.history",
     "StorageSpec": "mme_vla.memory.history",
     "OnlineHistory": "mme_vla.memory.history",
@@ -51,7 +51,7 @@ __all__ = [
     "History",
     "HistoryTokens",
     "MMEPolicy",
-    "MemoryModule",
+    "Memory",
     "MemoryTokens",
     "OnlineHistory",
     "StorageSpec",

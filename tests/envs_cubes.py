@@ -7,13 +7,13 @@ import pytest
 import sapien
 from envs_unmask import wait
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.demonstration import demonstrate
-from mme_vla.envs.demonstrator import Demonstrator
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import Button, Cube, Disc, H
-from mme_vla.envs.placement import TRIALS, Region
-from mme_vla.envs.things import Thing
+from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import Button, Cube, Disc, H
+from mme_vla.envs.scene.placement import TRIALS, Region
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.task import Task
 
 Flags = tuple[bool, bool]
 """Success and failure after a step."""
@@ -23,7 +23,7 @@ COLOURS = ("red", "blue", "green")
 class Hand:
     """Counts as grasping whatever it was told to carry, and puts it where it is told."""
 
-    def __init__(self, env: MemoryTask, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, env: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         self._env, self._held = env, None
         monkeypatch.setattr(env, "is_grasping", lambda thing: thing is self._held)
 
@@ -75,7 +75,7 @@ def least_distance(things: Sequence[Thing]) -> float:
     return float(distances[np.triu_indices(len(things), 1)].min(initial=np.inf))
 
 
-def steps_of_demonstration(env: MemoryTask) -> int | None:
+def steps_of_demonstration(env: Task) -> int | None:
     """Demonstrate a task that was just reset; the control steps it took, None if it failed."""
     done = demonstrate(env, Demonstrator(env, lambda action: env.step(np.asarray(action, np.float32))))
     return env.steps_done if done else None

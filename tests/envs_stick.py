@@ -9,10 +9,10 @@ import sapien
 import torch
 from envs_testing import recorded, setup
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.primitives_stick import arc
-from mme_vla.envs.things import Thing
+from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.task import Task
 
 Flags = tuple[bool, bool]
 """Success and failure at an evaluation."""
@@ -22,7 +22,7 @@ Z = 0.07
 class Tip:
     """Stands in for the tool centre point; an evaluation stands for a step."""
 
-    def __init__(self, env: MemoryTask, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, env: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         self._env, self._place = env, [0.4, 0.4, Z]
         monkeypatch.setattr(type(env), "tcp_pose", property(lambda _: sapien.Pose(self._place)))
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.draws import Draws
+from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 
 
-class Scene(MemoryTask):
+class Scene(Task):
     """A task without a goal: whatever `fill` puts on the table, in physics alone unless told otherwise."""
 
     def __init__(self, fill: Callable[["Scene"], None], stick: bool = False, **settings: object) -> None:

@@ -5,40 +5,40 @@ from collections.abc import Sequence
 import numpy as np
 import sapien
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import Button, Container
-from mme_vla.envs.placement import CONTAINER_HALF, TRIALS, Region
-from mme_vla.envs.things import Thing
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import Button, Container
+from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Region
+from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.task import Task
 
 
-def make(task: type[MemoryTask], seed: int, difficulty: str, **settings: object) -> MemoryTask:
+def make(task: type[Task], seed: int, difficulty: str, **settings: object) -> Task:
     """The task in physics alone, reset."""
     env = task(seed=seed, difficulty=difficulty, obs_mode="none", render_backend="none", **settings)
     env.reset()
     return env
 
 
-def wait(env: MemoryTask, steps: int = 1) -> tuple[bool, bool]:
+def wait(env: Task, steps: int = 1) -> tuple[bool, bool]:
     """Stand still; success and failure of the last step."""
     for _ in range(steps):
         *_, info = env.step(env.reset_action)
     return bool(info["success"]), bool(info["fail"])
 
 
-def lift(env: MemoryTask, container: Thing) -> tuple[bool, bool]:
+def lift(env: Task, container: Thing) -> tuple[bool, bool]:
     """Put a container up in the air and do a step."""
     container.move_to(sapien.Pose([*container.position[:2], 0.25], container.pose.q))
     return wait(env)
 
 
-def push_down(env: MemoryTask, button: Button) -> tuple[bool, bool]:
+def push_down(env: Task, button: Button) -> tuple[bool, bool]:
     """Press a button's cap into its base and do a step, after which it is still down."""
     button.articulation.set_qpos(np.full((1, 1), -0.1, np.float32))
     return wait(env)
 
 
-def released(env: MemoryTask, button: Button) -> None:
+def released(env: Task, button: Button) -> None:
     """Let a button come up again."""
     button.restore()
     wait(env)
@@ -73,12 +73,12 @@ def under(things: Sequence[Thing], containers: Sequence[Thing]) -> bool:
     return all(np.linalg.norm(a.position[:2] - b.position[:2]) < 2e-3 and a.position[2] < 0.02 for a, b in pairs)
 
 
-def texts(env: MemoryTask) -> list[tuple[str, str, str]]:
+def texts(env: Task) -> list[tuple[str, str, str]]:
     """Text, grounded text and choice of every sub-task."""
     return [(step.text, step.grounded_text, step.choice) for step in env.progress.subtasks]
 
 
-def same_twice(task: type[MemoryTask], seed: int, difficulty: str, steps: int) -> bool:
+def same_twice(task: type[Task], seed: int, difficulty: str, steps: int) -> bool:
     """Whether two environments made alike are in the same state, to the bit, after a number of steps."""
     states = []
     for _ in range(2):

@@ -11,14 +11,14 @@ from typing import Any
 
 from rollout_scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 
-from mme_vla.envs.vector_jobs import Job, Reply
+from mme_vla.envs.vector.jobs import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout import Rollout, RunFacts
-from mme_vla.evaluation.rollout_env import ChunkEnv, make_rollout_env
-from mme_vla.evaluation.rollout_run import Evaluation, evaluate
-from mme_vla.evaluation.rollout_settings import RolloutSettings
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import SMALL_VISION, small_policy
+from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
+from mme_vla.evaluation.rollout.evaluation import Evaluation, evaluate
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import SMALL_VISION, small_policy
 
 FACTS = RunFacts("tiny", "untrained", 42, max_steps=24)
 JOBS = [Job(task, "test", episode) for task in ("PickXtimes", "VideoUnmask") for episode in range(3)]

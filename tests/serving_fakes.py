@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.serving import Client, PolicyServer, ServeSettings
-from mme_vla.testing import SMALL_VISION, moving_frames, small_policy
+from mme_vla.testing.small import SMALL_VISION, moving_frames, small_policy
 
 GOAL = "pick up the cube"
 

@@ -11,12 +11,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
-from mme_vla.config import compose
+from mme_vla.commands.train import train
+from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.sources import open_sources
-from mme_vla.pretrained import load_tensors
-from mme_vla.testing import ALL_MODELS, NEURAL, RECURRENT
-from mme_vla.train import train
+from mme_vla.policy.tensor_files import load_tensors
+from mme_vla.testing.small import ALL_MODELS, NEURAL, RECURRENT
 from mme_vla.training import data as training_data
 from mme_vla.training.logging import read_metrics
 

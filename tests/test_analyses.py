@@ -12,19 +12,19 @@ from PIL import Image
 from torch import Tensor
 
 from mme_vla import UserError, build_policy
-from mme_vla.analyse import main
-from mme_vla.backbone import gemma
+from mme_vla.backbone.pi05 import gemma
+from mme_vla.commands.analyse import main
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.previews import write_film
-from mme_vla.evaluation.analyses.attention import AttentionWatch
+from mme_vla.evaluation.analyses.attention_mass import AttentionWatch
 from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.evaluation.analyses.modulation import ModulationWatch
 from mme_vla.evaluation.analyses.recurrence import recurrence_curves
 from mme_vla.evaluation.analyses.recurrence_plot import recurrence_plot
 from mme_vla.evaluation.analyses.replay import replay
 from mme_vla.evaluation.analyses.rerun_log import RerunLog
-from mme_vla.evaluation.cost_table import counted
-from mme_vla.testing import random_batch, small_policy, unit_stats
+from mme_vla.evaluation.results.cost_table import counted
+from mme_vla.testing.small import random_batch, small_policy, unit_stats
 
 
 @pytest.fixture(scope="module")

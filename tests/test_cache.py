@@ -9,8 +9,9 @@ import torch
 from fakes import WIDTH, LastFrames, encode
 from h5_files import write_file
 
-from mme_vla.data import cache_build
-from mme_vla.data.cache import (
+from mme_vla.data.cache import building as cache_build
+from mme_vla.data.cache.building import build_cache, clear_cache, estimate
+from mme_vla.data.cache.store import (
     FINGERPRINT,
     CacheMissingError,
     VisionCache,
@@ -20,8 +21,7 @@ from mme_vla.data.cache import (
     score_file,
     token_file,
 )
-from mme_vla.data.cache_build import build_cache, clear_cache, estimate
-from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError

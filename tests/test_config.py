@@ -10,7 +10,7 @@ from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from mme_vla.config import check_overrides, cli, compose, config_dir, import_plugins
+from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
@@ -153,7 +153,7 @@ def test_a_misspelt_model_of_the_library_is_answered() -> None:
 
 APP = """
     from pathlib import Path
-    from mme_vla.config import cli
+    from mme_vla.config.composition import cli
     from mme_vla.errors import UserError
 
     @cli("demo", Path({tree!r}))

@@ -11,16 +11,16 @@ from fakes import LastFrames, encode, same
 from h5_files import Recorded, write_file
 from torch.utils.data import DataLoader
 
-from mme_vla.data.cache import VisionCache, ensure_cache
-from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.cache.store import VisionCache, ensure_cache
+from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset, collate
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.splits import split_episodes
-from mme_vla.data.stats import compute_norm_stats
+from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.processing.processor import Processor
-from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.processing.subgoal_text import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
 
 PNG = ConvertOptions(images="png")

@@ -11,7 +11,7 @@ import sapien
 from envs_cubes import COLOURS, Flags, Hand, steps_of_demonstration
 from envs_unmask import make, push_down, texts, wait
 
-from mme_vla.envs.objects import Cube
+from mme_vla.envs.scene.objects import Cube
 from mme_vla.envs.tasks.bin_fill import BinFill
 
 SCENE = 1  # seed of a scene whose cubes are all there from the start

@@ -10,8 +10,8 @@ import numpy as np
 from envs_cubes import COLOURS, least_distance, read_button, read_cube
 from envs_unmask import make, wait
 
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.placement import Region
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.placement import Region
 from mme_vla.envs.tasks.bin_fill import BinFill
 
 STREAMING, STATIC = 4, 1  # seeds

@@ -12,11 +12,11 @@ import sapien
 from envs_testing import Scene, recorded
 from scipy.spatial.transform import Rotation
 
-from mme_vla.envs.base import MemoryTask
-from mme_vla.envs.demonstration import demonstrate
-from mme_vla.envs.demonstrator import Demonstrator, PlanningError
-from mme_vla.envs.grasping import failing_offset, grasp_orientation
-from mme_vla.envs.objects import (
+from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError
+from mme_vla.envs.robot.grasping import failing_offset, grasp_orientation
+from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.scene.objects import (
     PEG_COLOUR,
     build_aperture_box,
     build_board,
@@ -26,12 +26,12 @@ from mme_vla.envs.objects import (
     build_disc,
     build_peg,
 )
-from mme_vla.envs.primitives_stick import arc
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.pattern_lock import PatternLock
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.tasks.video_unmask import VideoUnmask
-from mme_vla.envs.things import distance_xy
 
 PHYSICS = {"obs_mode": "none", "render_backend": "none"}
 
@@ -39,7 +39,7 @@ PHYSICS = {"obs_mode": "none", "render_backend": "none"}
 class Log:
     """A demonstrator that notes its steps and its waypoints."""
 
-    def __init__(self, env: MemoryTask) -> None:
+    def __init__(self, env: Task) -> None:
         self.env = env
         self.actions: list[np.ndarray] = []
         self.waypoints: list[np.ndarray] = []
@@ -79,7 +79,7 @@ def pick_and_place(env: Scene) -> None:
     env.add(build_disc(env, "target", 0.04, 0.005, "purple", (0.0, -0.1)))
 
 
-def carried_over(task: type[MemoryTask], seed: int, **settings: object) -> tuple[Log, bool, list[bool]]:
+def carried_over(task: type[Task], seed: int, **settings: object) -> tuple[Log, bool, list[bool]]:
     env = task(seed=seed, difficulty="easy", **PHYSICS, **settings)
     env.reset()
     log = Log(env)
@@ -98,7 +98,7 @@ def carried_over(task: type[MemoryTask], seed: int, **settings: object) -> tuple
 )
 def test_demonstrations_repeat_the_recorded_ones_step_by_step(
     h5_folder: Path,
-    task: type[MemoryTask],
+    task: type[Task],
     episode: int,
     seed: int,
     settings: dict,

@@ -16,7 +16,7 @@ h5py = pytest.importorskip("h5py")
 from mme_vla.envs import make, make_env, rendering_check  # noqa: E402
 from mme_vla.envs.grounding import Grounding, centroid, ground, project  # noqa: E402
 from mme_vla.envs.observations import AngleTrack, front_extrinsic  # noqa: E402
-from mme_vla.envs.robot_control import PlanningError  # noqa: E402
+from mme_vla.envs.robot.control import PlanningError  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 
 STILL = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
@@ -209,7 +209,7 @@ def test_one_unplanned_video_motion_does_not_stop_the_video(
     def fail(*_: Any) -> None:
         raise PlanningError("no way")
 
-    monkeypatch.setattr("mme_vla.envs.robot_control.RobotControl.hold", fail)
+    monkeypatch.setattr("mme_vla.envs.robot.control.RobotControl.hold", fail)
     observation, info = env.reset()
     assert len(observation["joint_state_list"]) == 1
     assert info["status"] == "ongoing"

@@ -10,7 +10,7 @@ import pytest
 
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import episode, episodes, formula, generate, write
-from mme_vla.envs.names import TASK_NAMES
+from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError
 
 

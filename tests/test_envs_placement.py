@@ -10,9 +10,9 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from envs_testing import Scene
 
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import H, build_board, build_button, build_container, build_cube, build_disc
-from mme_vla.envs.placement import (
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import H, build_board, build_button, build_container, build_cube, build_disc
+from mme_vla.envs.scene.placement import (
     CONTAINER_HALF,
     TRIALS,
     Box2D,

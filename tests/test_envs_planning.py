@@ -13,11 +13,11 @@ import sapien
 from envs_testing import Scene, recorded
 from scipy.spatial.transform import Rotation
 
-from mme_vla.envs.base import RESET_QPOS
-from mme_vla.envs.kinematics import Arm, pose_distance
-from mme_vla.envs.planning import CONTROL_STEP, plan_free, plan_screw, twist_of
-from mme_vla.envs.robot_control import LIMITS
-from mme_vla.envs.sampling import Obstacles, sample_path
+from mme_vla.envs.robot.control import LIMITS
+from mme_vla.envs.robot.kinematics import Arm, pose_distance
+from mme_vla.envs.robot.path_search import Obstacles, sample_path
+from mme_vla.envs.robot.planning import CONTROL_STEP, plan_free, plan_screw, twist_of
+from mme_vla.envs.task import RESET_QPOS
 
 EPISODES = [("PickXtimes", 8), ("VideoUnmask", 4), ("PatternLock", 8)]
 # Where planned motions begin in the recordings, and how many steps they take.

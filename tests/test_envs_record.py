@@ -10,12 +10,13 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
 
-from mme_vla.config import compose
+from mme_vla.commands import gallery as show
+from mme_vla.commands import record
+from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.envs import record, show
 from mme_vla.envs.make import make_task
-from mme_vla.envs.recorder import Recorder
+from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
 

@@ -12,8 +12,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from envs_stick import Ear, Flags, Tip, circle, read_route, say
 from envs_unmask import make, texts, wait
 
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.primitives_stick import arc
+from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.tasks.route_stick import RouteStick
 
 MOVES = {"easy": ((2, 3), False), "medium": ((4, 5), False), "hard": ((4, 7), True)}

@@ -17,7 +17,9 @@ from envs_testing import Scene, recorded, setup
 
 from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
-from mme_vla.envs.objects import (
+from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.robot.robots import description
+from mme_vla.envs.scene.objects import (
     build_aperture_box,
     build_board,
     build_button,
@@ -31,8 +33,6 @@ from mme_vla.envs.objects import (
     build_peg,
     build_sphere,
 )
-from mme_vla.envs.rendering_check import render_backend
-from mme_vla.envs.robots import description
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.errors import UserError
 
@@ -235,7 +235,7 @@ def test_what_waits_under_the_floor_is_left_out_of_the_pictures_until_it_is_show
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    from mme_vla.envs.motions import Mark, build_mark
+    from mme_vla.envs.scene.motions import Mark, build_mark
 
     def fill(env: Scene) -> None:
         env.add(build_disc(env, "target", 0.04, 0.005, "gray", (0.0, 0.0)))

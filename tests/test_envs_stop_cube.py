@@ -10,10 +10,10 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from envs_cubes import Flags, read_button, steps_of_demonstration
 from envs_unmask import make, push_down, texts, wait
 
-from mme_vla.envs.demonstrator import Demonstrator
-from mme_vla.envs.draws import Draws
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.stop_cube import StopCube
-from mme_vla.envs.things import distance_xy
 
 
 def a_seed(interval: int, visit: int) -> int:

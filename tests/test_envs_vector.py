@@ -10,7 +10,7 @@ import pytest
 from envs_stand_ins import FRAME, make_light_env
 
 from mme_vla.envs import VecEnv, make_vec_env
-from mme_vla.envs.vector_jobs import Job, Reply
+from mme_vla.envs.vector.jobs import Job, Reply
 from mme_vla.errors import UserError
 
 
@@ -160,7 +160,7 @@ def test_closing_ends_all_processes_even_busy_ones() -> None:
 def test_unknown_names_are_refused_before_any_process_starts(
     monkeypatch: pytest.MonkeyPatch, arguments: dict[str, Any], words: str
 ) -> None:
-    monkeypatch.setattr("mme_vla.envs.vector.require_simulator", lambda: None)
+    monkeypatch.setattr("mme_vla.envs.vector.pool.require_simulator", lambda: None)
     with pytest.raises(UserError, match=words):
         make_vec_env(**arguments)
 

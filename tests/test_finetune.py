@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.config import compose, config_dir
-from mme_vla.finetune import HEADS, apply_finetuning, merge_adapters, part_of
-from mme_vla.testing import random_batch, small_policy
-from mme_vla.weights import load_into
-from mme_vla.weights.convert import convert
+from mme_vla.commands.weights import convert
+from mme_vla.config.composition import compose, config_dir
+from mme_vla.policy.finetune import HEADS, apply_finetuning, merge_adapters, part_of
+from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.weights import load_weights
 
 TOLERANCE = 1e-4  # ten steps with the sum of two products in place of the product of a sum
 VARIANTS = ["pi05", "framesamp_context", "tokendrop_modul", "framesamp_expert"]
@@ -89,7 +89,7 @@ def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> 
     assert "adapters" not in loaded.config
     assert (chunk(loaded) - taught).abs().max() < TOLERANCE
     # Elsewhere, adapters are folded in as they are read.
-    assert (chunk(load_into(small_policy(variant), tmp_path / "apart")) - taught).abs().max() < TOLERANCE
+    assert (chunk(load_weights(small_policy(variant), tmp_path / "apart")) - taught).abs().max() < TOLERANCE
     convert(tmp_path / "apart", tmp_path / "plain")
     assert (chunk(MMEPolicy.from_pretrained(tmp_path / "plain")) - taught).abs().max() < TOLERANCE
 

@@ -6,7 +6,7 @@ import math
 import pytest
 
 from mme_vla import build_policy
-from mme_vla.naming import write
+from mme_vla.weights.name_tables import write
 from mme_vla.weights.released import released_derived, released_table, released_unread
 
 VARIANTS = {

@@ -8,10 +8,7 @@ from PIL import Image
 from rich.console import Console
 
 from mme_vla import UserError, build_policy
-from mme_vla.config import compose
-from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.pictures import MARGIN, TILE, contact_sheet
-from mme_vla.inspect import (
+from mme_vla.commands.inspect import (
     build_memory,
     check_place,
     draw_memory,
@@ -20,6 +17,9 @@ from mme_vla.inspect import (
     show_dataset,
     show_episode,
 )
+from mme_vla.config.composition import compose
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.memory_picture import MARGIN, TILE, contact_sheet
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.processing.actions import JOINTS, pad_width, to_absolute, to_deltas
-from mme_vla.processing.normalize import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats, normalize, unnormalize
 
 
 def golden_stats(tensors: dict[str, Tensor]) -> NormStats:

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from mme_vla import UserError
-from mme_vla.testing import small_policy
-from mme_vla.weights import detect_format, load_into, open_source, read_stats
+from mme_vla.testing.small import small_policy
+from mme_vla.weights import detect_format, load_weights, open_source, read_stats
 from mme_vla.weights.orbax import find_params, read_orbax, write_orbax
 
 pytest.importorskip("tensorstore", reason="reading Orbax checkpoints needs the extra 'orbax'")
@@ -67,7 +67,7 @@ def test_a_checkpoint_of_orbax_reproduces_the_golden_outputs(parity: Path) -> No
     policy = golden.policy(tensors, about)
     for parameter in policy.parameters():
         parameter.zero_()
-    load_into(policy, RUN)
+    load_weights(policy, RUN)
     batch, memory = golden.batch(tensors), golden.memory_tokens(policy, tensors)
     velocity = policy.velocity(batch, tensors["out/x_t"], tensors["in/time"], memory)
     assert golden.error(velocity, tensors["out/v_t"]) < 1e-4
@@ -96,7 +96,7 @@ def test_all_leaves_that_do_not_fit_are_listed_together(tmp_path: Path) -> None:
     policy = small_policy("framesamp_modul")
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     with pytest.raises(UserError, match=r"(?s)orbax_plain.*missing.*unexpected:\s+scale.*2 misshapen"):
-        load_into(policy, PLAIN)
+        load_weights(policy, PLAIN)
     assert all(torch.equal(tensor, before[name]) for name, tensor in policy.state_dict().items())
 
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
 
 TOLERANCE = 2e-5
 

@@ -13,10 +13,10 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from mme_vla import UserError, build_policy
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import random_batch, small_policy
-from mme_vla.weights import detect_format, load_into
-from mme_vla.weights.convert import convert
+from mme_vla.commands.weights import convert
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.weights import detect_format, load_weights
 from mme_vla.weights.ports import to_lerobot, to_openpi
 
 EMBEDDING = "paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"
@@ -78,8 +78,8 @@ def same(one: MMEPolicy, other: MMEPolicy) -> bool:
 @pytest.mark.parametrize("spelling", SPELLINGS)
 def test_every_spelling_loads_the_same_policy(spelling: str, pi05: MMEPolicy, tmp_path: Path) -> None:
     folder = saved(SPELLINGS[spelling](to_openpi(pi05, pi05.state_dict())), tmp_path / "source")
-    assert same(load_into(empty_pi05(), folder), pi05)
-    assert same(load_into(empty_pi05(), folder / "model.safetensors"), pi05)
+    assert same(load_weights(empty_pi05(), folder), pi05)
+    assert same(load_weights(empty_pi05(), folder / "model.safetensors"), pi05)
 
 
 def test_format_is_told_from_names_and_config(pi05: MMEPolicy, tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_bfloat16_becomes_float32_masters_or_stays(pi05: MMEPolicy, tmp_path: Pa
         for name, tensor in to_openpi(pi05, pi05.state_dict()).items()
     }
     folder = saved(mixed, tmp_path / "mixed")
-    wide, narrow = load_into(empty_pi05(), folder), load_into(empty_pi05(), folder, dtype="bfloat16")
+    wide, narrow = load_weights(empty_pi05(), folder), load_weights(empty_pi05(), folder, dtype="bfloat16")
     assert {p.dtype for p in wide.parameters()} == {torch.float32}
     assert {p.dtype for p in narrow.parameters()} == {torch.bfloat16}
     for name, tensor in pi05.state_dict().items():
@@ -141,7 +141,7 @@ def test_lerobots_own_policy_loads_our_export_and_answers_the_same(
     assert (chunk - pi05.sample_actions(batch, noise)).abs().max() < 1e-4
 
     saved(loaded.state_dict(), tmp_path / "back")
-    assert same(load_into(empty_pi05(backbone={"num_heads": 8}), tmp_path / "back"), pi05)
+    assert same(load_weights(empty_pi05(backbone={"num_heads": 8}), tmp_path / "back"), pi05)
 
 
 def test_openpis_strict_reader_finds_one_name_of_the_tied_pair(pi05: MMEPolicy, tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_all_that_does_not_fit_is_listed_together(pi05: MMEPolicy, tmp_path: Pat
     tensors["action_out_proj.bias"] = torch.zeros(7)
     tensors["surprise"] = torch.zeros(1)
     with pytest.raises(UserError) as caught:
-        load_into(empty_pi05(), saved(tensors, tmp_path / "bad"))
+        load_weights(empty_pi05(), saved(tensors, tmp_path / "bad"))
     said = str(caught.value)
     assert re.search(r"2 missing:\s+action_in_proj.weight\s+time_mlp_in.bias", said)
     assert re.search(r"1 unexpected:\s+surprise", said)
@@ -171,7 +171,7 @@ def test_all_that_does_not_fit_is_listed_together(pi05: MMEPolicy, tmp_path: Pat
 def test_another_size_is_refused(pi05: MMEPolicy, tmp_path: Path) -> None:
     folder = saved(to_lerobot(pi05, pi05.state_dict()), tmp_path / "small")
     with pytest.raises(UserError, match=r"(?s)\d+ misshapen"):
-        load_into(empty_pi05(backbone={"vlm": {"width": 128}}), folder)
+        load_weights(empty_pi05(backbone={"vlm": {"width": 128}}), folder)
 
 
 def test_pi0_is_told_from_pi05_by_its_tensors(pi05: MMEPolicy, tmp_path: Path) -> None:
@@ -179,21 +179,21 @@ def test_pi0_is_told_from_pi05_by_its_tensors(pi05: MMEPolicy, tmp_path: Path) -
     tensors = to_openpi(pi05, pi05.state_dict())
     plain = {n.replace(".dense.weight", ".weight"): t for n, t in tensors.items() if not n.endswith(".dense.bias")}
     with pytest.raises(UserError, match="no time-conditioned norms, as π0"):
-        load_into(empty_pi05(), saved(plain, tmp_path / "pi05_plain"))
+        load_weights(empty_pi05(), saved(plain, tmp_path / "pi05_plain"))
     with pytest.raises(UserError, match="a state projection, as π0"):
-        load_into(empty_pi05(), saved({**tensors, "state_proj.bias": torch.zeros(4)}, tmp_path / "pi05_state"))
+        load_weights(empty_pi05(), saved({**tensors, "state_proj.bias": torch.zeros(4)}, tmp_path / "pi05_state"))
 
 
 def test_a_tensor_that_is_there_twice_is_refused(pi05: MMEPolicy, tmp_path: Path) -> None:
     tensors = to_openpi(pi05, pi05.state_dict())
     tensors["model.time_mlp_in.bias"] = tensors["time_mlp_in.bias"]
     with pytest.raises(UserError, match="the same tensor twice"):
-        load_into(empty_pi05(), saved(tensors, tmp_path / "twice"))
+        load_weights(empty_pi05(), saved(tensors, tmp_path / "twice"))
 
 
 def test_a_policy_with_memory_has_no_place_in_the_ports(pi05: MMEPolicy, tmp_path: Path) -> None:
     memory = small_policy("framesamp_expert")
     with pytest.raises(UserError, match="has a memory, whose weights would stay unset"):
-        load_into(memory, saved(to_openpi(pi05, pi05.state_dict()), tmp_path / "base"))
+        load_weights(memory, saved(to_openpi(pi05, pi05.state_dict()), tmp_path / "base"))
     with pytest.raises(UserError, match="have no name in this format"):
         to_lerobot(memory, memory.state_dict())

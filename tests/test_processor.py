@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mme_vla.errors import UserError
-from mme_vla.processing.normalize import NormStats, QuantileStats
+from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 

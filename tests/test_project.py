@@ -114,7 +114,7 @@ def test_importing_the_package_needs_torch_and_einops_only() -> None:
         for name in {heavy}: sys.modules[name] = None  # importing it raises ImportError
         import mme_vla
         from mme_vla import HistoryTokens, MemoryTokens, Batch, UserError, MEMORIES, INTEGRATIONS, BACKBONES
-        from mme_vla import MemoryModule, History, StorageSpec, OnlineHistory, CachedHistory
+        from mme_vla import Memory, History, StorageSpec, OnlineHistory, CachedHistory
     """)
 
 

@@ -11,7 +11,7 @@ from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.memory.rmt import RMT
 from mme_vla.memory.sampling import jittered, recurrent_frames
 from mme_vla.memory.ttt import TTT
-from mme_vla.testing import moving_frames, random_batch, small_policy
+from mme_vla.testing.small import moving_frames, random_batch, small_policy
 from mme_vla.types import HistoryTokens
 from mme_vla.weights.released import from_released, to_released
 

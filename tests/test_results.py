@@ -10,20 +10,20 @@ import numpy as np
 import pytest
 
 from mme_vla import UserError
-from mme_vla.evaluation import paper
-from mme_vla.evaluation.aggregate import Results, aggregate
-from mme_vla.evaluation.compare import compare, compare_all
-from mme_vla.evaluation.cost_table import chunk_flops
-from mme_vla.evaluation.demo import demo_records
-from mme_vla.evaluation.intervals import bootstrap, effective_trials, holm, mean_std, sign_test, wilson
+from mme_vla.commands.results import main
 from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.aggregate import Results, aggregate
+from mme_vla.evaluation.results.compare import compare, compare_all
+from mme_vla.evaluation.results.cost_table import chunk_flops
+from mme_vla.evaluation.results.demo import demo_records
+from mme_vla.evaluation.results.intervals import bootstrap, effective_trials, holm, mean_std, sign_test, wilson
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.submission import policy_facts, training_details
+from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
 from mme_vla.evaluation.run_file import claim_run
-from mme_vla.evaluation.scopes import Protocol
-from mme_vla.evaluation.submission import policy_facts, training_details
-from mme_vla.evaluation.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
-from mme_vla.evaluation.tasks import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES
-from mme_vla.results import main
+from mme_vla.evaluation.suites import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES
 
 # Where the paper's suite and group tables differ from the means of its own per-task table.
 MISPRINTS = {("pi_0.5", "Short-Horizon Video Reasoning"), ("RMT+Expert", "Reference"), ("RMT+Expert", "average"),

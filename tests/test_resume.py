@@ -15,8 +15,8 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.config import compose
-from mme_vla.train import main
+from mme_vla.commands.train import main
+from mme_vla.config.composition import compose
 from mme_vla.training.logging import read_metrics
 
 STEPS, SAVE_EVERY = 9, 4

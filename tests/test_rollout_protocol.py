@@ -6,11 +6,11 @@ import torch
 from rollout_scripted_env import VIDEO, make_far_env
 from rollout_stand_ins import JOBS, InlineEnvs, quick_policy, roll
 
-from mme_vla.envs.vector_jobs import Job
-from mme_vla.evaluation.rollout_episode import RunningEpisode, episode_seed
-from mme_vla.policy import MMEPolicy
+from mme_vla.envs.vector.jobs import Job
+from mme_vla.evaluation.rollout.running_episode import RunningEpisode, episode_seed
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal import build_predictor
-from mme_vla.testing import cached_history
+from mme_vla.testing.small import cached_history
 
 UNMASK = Job("VideoUnmask", "test", 0)
 MEMORIES = ["framesamp_modul", "tokendrop_expert", "ttt_modul"]
@@ -104,7 +104,8 @@ def test_memory_holds_at_every_inference_what_training_would_select(name, encode
 def test_conditioning_frames_are_marked_and_the_current_one_is_not(monkeypatch):
     policy, calls = quick_policy("framesamp_context"), []
     monkeypatch.setattr(
-        "mme_vla.episode.Episode._take", lambda self, front, demo, executed: calls.append((len(front), int(demo.sum())))
+        "mme_vla.policy.episode.Episode._take",
+        lambda self, front, demo, executed: calls.append((len(front), int(demo.sum()))),
     )
     running = RunningEpisode(policy, UNMASK, 0, piece=8)
     picture = np.zeros((64, 64, 3), np.uint8)

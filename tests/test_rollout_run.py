@@ -16,17 +16,17 @@ from rollout_scripted_env import make_far_env, make_mortal_env
 from rollout_stand_ins import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
 
 from mme_vla import UserError
-from mme_vla.envs.vector_jobs import Job
-from mme_vla.evaluate import choose_device
+from mme_vla.commands.evaluate import choose_device
+from mme_vla.envs.vector.jobs import Job
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout_plan import Shard, choose_episodes, choose_shard, take_share
-from mme_vla.evaluation.rollout_progress import RolloutProgress
-from mme_vla.evaluation.rollout_run import checkpoint_label, default_output, memory_budget
-from mme_vla.evaluation.rollout_settings import RolloutSettings
-from mme_vla.evaluation.rollout_video import BORDER, RED, compose_frame
-from mme_vla.policy import MMEPolicy
-from mme_vla.testing import random_batch
+from mme_vla.evaluation.rollout.evaluation import checkpoint_label, default_output, memory_budget
+from mme_vla.evaluation.rollout.film import BORDER, RED, compose_frame
+from mme_vla.evaluation.rollout.plan import Shard, choose_episodes, choose_shard, take_share
+from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing.small import random_batch
 
 TESTS = Path(__file__).resolve().parent
 
@@ -103,7 +103,7 @@ def test_a_dying_worker_is_an_error_that_is_tried_again(tmp_path: Path, monkeypa
 
 
 def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.evaluation.rollout_run as module
+    import mme_vla.evaluation.rollout.evaluation as module
 
     monkeypatch.setattr(module, "VecEnv", inline)
     whole_run(quick_policy("pi05"), tmp_path, jobs=JOBS[:1])
@@ -114,7 +114,7 @@ def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monke
 
 
 def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.evaluation.rollout_run as module
+    import mme_vla.evaluation.rollout.evaluation as module
 
     monkeypatch.setattr(module, "VecEnv", inline)
     policy = quick_policy("pi05")
@@ -133,7 +133,7 @@ def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monk
 
 
 def test_shards_side_by_side_make_the_whole_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    import mme_vla.evaluation.rollout_run as module
+    import mme_vla.evaluation.rollout.evaluation as module
 
     monkeypatch.setattr(module, "VecEnv", inline)
     policy, settings = quick_policy("pi05"), RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
@@ -208,7 +208,7 @@ def test_impossible_settings_are_refused_by_name() -> None:
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job):
-            from mme_vla.envs.vector_jobs import Reply
+            from mme_vla.envs.vector.jobs import Reply
 
             self._replies.append(Reply.of_failure(worker, job, True, self.kind, "no scene"))
 
@@ -291,4 +291,4 @@ def test_the_command_evaluates_a_checkpoint_in_the_simulator(checkpoint: Path, t
     assert (record.model, record.checkpoint, record.model_seed) == ("framesamp_modul", 3, 7)
     assert (record.outcome, record.steps, record.memory_budget) == ("timeout", 17, 64)
     assert record.seconds.sim > 0 and record.seconds.policy > 0
-    assert "timeout" in done.stdout and "mme_vla.results" in done.stderr
+    assert "timeout" in done.stdout and "mme_vla.commands.results" in done.stderr

@@ -11,9 +11,9 @@ from huggingface_hub.errors import LocalEntryNotFoundError
 from safetensors.torch import load_file
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.pretrained import load_tensors, save_tensors
-from mme_vla.testing import random_batch, small_policy
-from mme_vla.weights import load_into
+from mme_vla.policy.tensor_files import load_tensors, save_tensors
+from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.weights import load_weights
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_push_and_load_by_name(policy: MMEPolicy, tmp_path: Path, monkeypatch: p
     loaded = MMEPolicy.from_pretrained("group/modul", revision="v1", token="secret")
     assert asked == {"repo_id": "group/modul", "revision": "v1", "token": "secret"}
     assert all(torch.equal(tensor, loaded.state_dict()[name]) for name, tensor in policy.state_dict().items())
-    load_into(small_policy("framesamp_modul"), "group/modul")
+    load_weights(small_policy("framesamp_modul"), "group/modul")
     with pytest.raises(UserError, match="owner/name"):
         policy.push_to_hub("no-owner")
 

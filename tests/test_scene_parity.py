@@ -19,7 +19,7 @@ from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes
 from mme_vla.envs import make_env
 from mme_vla.envs.make import make_task
 from mme_vla.envs.observations import Observer
-from mme_vla.envs.recorder import RecordedStep, Recorder
+from mme_vla.envs.recording.recorder import RecordedStep, Recorder
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 from mme_vla.errors import UserError

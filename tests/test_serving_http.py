@@ -18,9 +18,9 @@ import pytest
 from conftest import REPOSITORY
 from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
 
-from mme_vla.config import compose
+from mme_vla.commands.loading import load_policy
+from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
-from mme_vla.loading import load_policy
 from mme_vla.serving import Client, Limits, pack, unpack
 from mme_vla.serving.web import BadRequestError, HttpRequest
 

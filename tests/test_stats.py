@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from h5_files import Recorded, write_file
 
-from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.data.stats import compute_norm_stats
+from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 
 
@@ -50,7 +50,7 @@ def test_only_the_chosen_episodes_count(data) -> None:
 def test_an_incomplete_last_batch_is_left_out_as_released(data, monkeypatch) -> None:
     source, _ = data
     counts = []
-    from mme_vla.data import stats as module
+    from mme_vla.data import statistics as module
 
     update = module.RunningStats.update
     monkeypatch.setattr(module.RunningStats, "update", lambda self, x: (counts.append(len(x)), update(self, x)))

@@ -6,7 +6,7 @@ import torch
 
 from mme_vla import UserError
 from mme_vla.memory.base import stack_history
-from mme_vla.testing import NEURAL, SMALL_VISION, cached_history, moving_frames, online_history, small_policy
+from mme_vla.testing.small import NEURAL, SMALL_VISION, cached_history, moving_frames, online_history, small_policy
 from mme_vla.types import Batch
 
 FRAMES = 90

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla.data.convert import ConvertOptions, convert
+from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
-from mme_vla.subgoal import build as module
-from mme_vla.subgoal.build import build, open_input
-from mme_vla.subgoal.labels import Labels, keyframes, resting_frames, selected_steps, transitions, windows
-from mme_vla.subgoal.media import Clip, read_image, sample_video
-from mme_vla.subgoal.rows import RowOptions, episode_rows
-from mme_vla.subgoal.swift import command, write_arguments
+from mme_vla.subgoal.finetuning import collecting as module
+from mme_vla.subgoal.finetuning.collecting import build, open_input
+from mme_vla.subgoal.finetuning.labels import Labels, keyframes, resting_frames, selected_steps, transitions, windows
+from mme_vla.subgoal.finetuning.media import Clip, read_image, sample_video
+from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
+from mme_vla.subgoal.finetuning.swift import command, write_arguments
 
 SETS = {
     "simple": "qwenvl_simple_subgoal",
@@ -222,7 +222,7 @@ def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
 
 
 def test_settings_that_cannot_work_are_named(tmp_path):
-    from mme_vla.config import compose
+    from mme_vla.config.composition import compose
 
     listed = tmp_path / "list.json"
     listed.write_text("[1]")

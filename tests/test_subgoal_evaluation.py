@@ -13,17 +13,17 @@ from PIL import Image
 from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
 from mme_vla import UserError
-from mme_vla.envs.vector_jobs import Job
-from mme_vla.evaluate import choose_subgoals
-from mme_vla.evaluation.aggregate import aggregate
+from mme_vla.commands.evaluate import choose_subgoals
+from mme_vla.envs.vector.jobs import Job
 from mme_vla.evaluation.record_log import read_records
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.report import html_report
-from mme_vla.evaluation.scopes import Protocol
-from mme_vla.evaluation.subgoal_score import SubgoalScore, point_distances, subgoal_table, total_score
-from mme_vla.evaluation.subgoal_trace import SubgoalTrace
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.report import html_report
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.subgoal_score import SubgoalScore, point_distances, subgoal_table, total_score
+from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
 from mme_vla.subgoal import BackgroundPredictor, Subgoal, SubgoalPredictor, build_predictor
-from mme_vla.subgoal.parsing import points_of
+from mme_vla.subgoal.words.parsing import points_of
 
 UNMASK = Job("VideoUnmask", "test", 0)
 
@@ -248,7 +248,7 @@ def test_a_folder_left_by_another_process_does_not_stop_a_trace(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "VideoUnmask_ep0").mkdir()
-    monkeypatch.setattr("mme_vla.evaluation.subgoal_trace.shutil.rmtree", lambda *_, **__: None)
+    monkeypatch.setattr("mme_vla.evaluation.rollout.subgoal_trace.shutil.rmtree", lambda *_, **__: None)
     SubgoalTrace("simple", tmp_path, "VideoUnmask_ep0")
     assert (tmp_path / "VideoUnmask_ep0.jsonl").read_bytes() == b""
 

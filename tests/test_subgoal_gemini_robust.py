@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from subgoal_fakes import frames, kinds, play, predictor_of, says, started
 
 from mme_vla.errors import UserError
-from mme_vla.subgoal.threads import side_by_side
+from mme_vla.subgoal.models.threads import side_by_side
 
 
 def test_late_tasks_leave_out_what_came_due_before_their_step():
@@ -57,7 +57,7 @@ def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
         encoded.append(pixels.shape)
         return b"clip"
 
-    monkeypatch.setattr("mme_vla.subgoal.api.mp4_bytes", count)
+    monkeypatch.setattr("mme_vla.subgoal.models.api.mp4_bytes", count)
     predictor, client = predictor_of(*[says("a")] * 4)
     play(predictor, started(predictor, video=10), 10)
     assert len(client.asked) == 4 and [shape[0] for shape in encoded] == [10, 48, 48, 48]

@@ -8,9 +8,9 @@ import pytest
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal import Memer, Oracle, QwenVL, build_predictor
-from mme_vla.subgoal.media import Clip
-from mme_vla.subgoal.tiny import save_tiny
-from mme_vla.subgoal.vlm import VLM, Answer, Question
+from mme_vla.subgoal.finetuning.media import Clip
+from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
+from mme_vla.subgoal.models.tiny import save_tiny
 
 pytest.importorskip("transformers", reason="needs the extra vlm")
 
@@ -225,8 +225,8 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
 
     from omegaconf import OmegaConf
 
-    from mme_vla.config import config_dir
-    from mme_vla.subgoal.api import Settings
+    from mme_vla.config.composition import config_dir
+    from mme_vla.subgoal.models.api import Settings
     from mme_vla.subgoal.qwenvl import VLMPredictor
 
     shared = {**dict.fromkeys(("qwenvl", "memer"), VLMPredictor), "gemini": Settings}

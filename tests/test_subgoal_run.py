@@ -7,10 +7,10 @@ import torch
 from rollout_stand_ins import FACTS, JOBS, quick_policy
 
 from mme_vla import UserError
-from mme_vla.evaluate import choose_subgoals, report_usage
+from mme_vla.commands.evaluate import choose_subgoals, report_usage
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout_run import run_settings
-from mme_vla.evaluation.rollout_settings import RolloutSettings
+from mme_vla.evaluation.rollout.evaluation import run_settings
+from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.subgoal import BackgroundPredictor, Oracle, Usage, build_predictor
 
 
@@ -43,7 +43,7 @@ def test_a_model_of_subgoals_is_known_by_the_end_of_its_path() -> None:
 
 
 def test_a_checkpoint_written_as_text_is_the_same_number(tmp_path: Path) -> None:
-    from mme_vla.evaluation.rollout_run import _done
+    from mme_vla.evaluation.rollout.evaluation import _done
 
     facts = FACTS.__class__("tiny", "80000", 42)
     record = EpisodeRecord("tiny", 80000, 42, "PickXtimes", 0, 1, "easy", "success", 5)

@@ -8,8 +8,8 @@ import sys
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla.subgoal.history import SubgoalHistory, hold_until, merge_keyframes, recent_frames
-from mme_vla.subgoal.parsing import (
+from mme_vla.subgoal.answers import SubgoalHistory, hold_until, merge_keyframes, recent_frames
+from mme_vla.subgoal.words.parsing import (
     MalformedAnswer,
     mark_points,
     parse_gemini,
@@ -21,7 +21,7 @@ from mme_vla.subgoal.parsing import (
     to_thousandths,
     write_boxes,
 )
-from mme_vla.subgoal.prompts import (
+from mme_vla.subgoal.words.prompts import (
     memer_answer,
     memer_system,
     memer_user,

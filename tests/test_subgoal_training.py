@@ -6,15 +6,23 @@ import numpy as np
 import pytest
 import torch
 
-from mme_vla.config import compose
+from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.subgoal import build_predictor
-from mme_vla.subgoal.build import build, open_input
-from mme_vla.subgoal.dataset import IGNORED, Collator, RowDataset, hf_dataset, question_of, read_rows, texts_of
-from mme_vla.subgoal.media import read_image
-from mme_vla.subgoal.rows import RowOptions
-from mme_vla.subgoal.train import accumulation, find_checkpoint, run
-from mme_vla.subgoal.vlm import VLM
+from mme_vla.subgoal.finetuning.collecting import build, open_input
+from mme_vla.subgoal.finetuning.examples import (
+    IGNORED,
+    Collator,
+    RowDataset,
+    hf_dataset,
+    question_of,
+    read_rows,
+    texts_of,
+)
+from mme_vla.subgoal.finetuning.media import read_image
+from mme_vla.subgoal.finetuning.rows import RowOptions
+from mme_vla.subgoal.finetuning.training import accumulation, find_checkpoint, run
+from mme_vla.subgoal.models.qwen3vl import VLM
 
 pytest.importorskip("peft", reason="needs the extra vlm")
 SETS = ["simple", "grounded", "memer"]

@@ -14,10 +14,10 @@ from accelerate import Accelerator
 from omegaconf import OmegaConf
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.build import build_from_config
-from mme_vla.config import compose
-from mme_vla.finetune import apply_finetuning
-from mme_vla.processing.normalize import NormStats, QuantileStats
+from mme_vla.config.composition import compose
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.training.checkpoint import check_disk, checkpoints_in, resolve_checkpoint
 from mme_vla.training.console import ProgressLine
 from mme_vla.training.data import check_frozen

@@ -13,10 +13,10 @@ import torch
 from safetensors.torch import save_file
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.testing import PERCEPTUAL, random_batch, small_policy, unit_stats
-from mme_vla.weights import detect_format, load_into, open_source, read_stats, start_from, transfer
+from mme_vla.commands.weights import convert
+from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
+from mme_vla.weights import detect_format, load_weights, open_source, read_stats, start_from, transfer
 from mme_vla.weights.adapter import memory_parameters
-from mme_vla.weights.convert import convert
 from mme_vla.weights.released import released_table
 
 pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
@@ -41,7 +41,7 @@ def equal(one: MMEPolicy, other: MMEPolicy) -> bool:
 @pytest.mark.parametrize("fmt", FORMATS)
 def test_every_format_is_told_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path]) -> None:
     assert detect_format(bases[fmt]) == fmt
-    loaded = load_into(build_policy("pi05", device="meta"), bases[fmt])
+    loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
     assert equal(loaded, MMEPolicy.from_pretrained(bases["ours"]))
     assert all(p.requires_grad for p in loaded.parameters())
 
@@ -49,7 +49,7 @@ def test_every_format_is_told_and_fills_a_policy_on_meta(fmt: str, bases: dict[s
 @pytest.mark.parametrize("fmt", ["ours", "openpi", "released"])
 def test_statistics_of_one_dataset_come_with_the_weights(fmt: str, bases: dict[str, Path]) -> None:
     policy = build_policy("pi05")
-    load_into(policy, bases[fmt])
+    load_weights(policy, bases[fmt])
     assert policy.require_processor().stats is not None
 
 
@@ -170,30 +170,30 @@ def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path
 def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tmp_path: Path) -> None:
     policy = build_policy("pi05")
     with pytest.raises(UserError, match="no such file"):
-        load_into(policy, tmp_path / "nowhere")
+        load_weights(policy, tmp_path / "nowhere")
     with pytest.raises(UserError, match="no checkpoint of a known kind"):
-        load_into(policy, tmp_path)
+        load_weights(policy, tmp_path)
     save_file({"layer.weight": torch.zeros(2)}, tmp_path / "other.safetensors")
     with pytest.raises(UserError, match=r"not a π0\.5 policy.*layer\.weight"):
-        load_into(policy, tmp_path / "other.safetensors")
+        load_weights(policy, tmp_path / "other.safetensors")
     whole = (bases["lerobot"] / "model.safetensors").read_bytes()
     (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(UserError, match="damaged"):
-        load_into(policy, tmp_path / "cut.safetensors")
+        load_weights(policy, tmp_path / "cut.safetensors")
     (tmp_path / "adapter_model.safetensors").write_bytes(b"")
     with pytest.raises(UserError, match="PEFT adapter"):
-        load_into(policy, tmp_path)
+        load_weights(policy, tmp_path)
     (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": 3}')
     with pytest.raises(UserError, match="not an index"):
-        load_into(policy, tmp_path)
+        load_weights(policy, tmp_path)
     (tmp_path / "model.safetensors.index.json").write_text('{"weight_map": {"a": "shard.safetensors"}}')
     with pytest.raises(UserError, match=r"shard\.safetensors"):
-        load_into(policy, tmp_path)
+        load_weights(policy, tmp_path)
 
 
 def test_a_memory_of_ones_own_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
     policy = build_policy("framesamp_context")
-    monkeypatch.setattr("mme_vla.memory.names.released_names", lambda memory: None)
+    monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: None)
     with pytest.raises(UserError, match="no released names"):
         released_table(policy)
     assert set(start_from(policy, bases["released"])) == memory_parameters(policy)
@@ -209,7 +209,7 @@ def test_of_several_datasets_statistics_none_is_taken_and_it_is_said(bases: dict
     unit_stats().save(folder / "assets" / "droid" / "norm_stats.json")
     policy = build_policy("pi05")
     with pytest.warns(UserWarning, match=r"statistics of droid, robomme; none were taken.*read_stats\("):
-        load_into(policy, folder)
+        load_weights(policy, folder)
     assert policy.require_processor().stats is None
 
 

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.data.cache import VisionCache
+from mme_vla.data.cache.store import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule, stack_history
+from mme_vla.memory.base import Memory, stack_history
 from mme_vla.processing.processor import Processor
-from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.processing.subgoal_text import SubgoalText
 from mme_vla.types import VIEWS, Batch
 
 
@@ -51,7 +51,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self,
         sources: Sequence[EpisodeSource],
         processor: Processor,
-        memory: MemoryModule | None = None,
+        memory: Memory | None = None,
         caches: Sequence[VisionCache] | None = None,
         *,
         episodes: Sequence[np.ndarray] | None = None,

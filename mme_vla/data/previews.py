@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from mme_vla.data.hdf5 import EpisodeRef, RawFrame, open_episode
-from mme_vla.data.pictures import fitted, font
+from mme_vla.data.memory_picture import fitted, font
 
 CAPTION, BORDER, FPS = 22, 10, 30  # pixels, pixels, frames a second
 TILES, COLUMNS, TILE = 12, 6, 192

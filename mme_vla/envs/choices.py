@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
-    from mme_vla.envs.things import Thing
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.scene.things import Thing
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import numpy as np
 from mme_vla.envs.observations import INTRINSIC, front_extrinsic
 
 if TYPE_CHECKING:
+    from mme_vla.envs.scene.things import Thing
     from mme_vla.envs.subtasks import SubTask
-    from mme_vla.envs.things import Thing
 
 PLACE = "<>"
 """Stands in a text for the pixel of an object."""

@@ -13,17 +13,17 @@ import gymnasium
 import numpy as np
 import torch
 
-from mme_vla.envs.demonstrator import Demonstrator
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
-from mme_vla.envs.robot_control import PlanningError
+from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
-    from mme_vla.envs.base import MemoryTask
     from mme_vla.envs.subtasks import SubTask
+    from mme_vla.envs.task import Task
 
 log = logging.getLogger(__name__)
 
@@ -76,7 +76,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     def __init__(
         self,
-        task: "MemoryTask",
+        task: "Task",
         action: str = "joint_angle",
         max_steps: int = 1300,
         include: Include | None = None,
@@ -94,7 +94,7 @@ class RoboMMEEnv(gymnasium.Env):
         self.observation_space = observation_space(self._keys)
         self._render = render
         self._grounding = Grounding()
-        self._task: MemoryTask | None = task
+        self._task: Task | None = task
         self._observer = Observer(task, self.include, render)
         self._muted = True
         # Frames are made where the simulator makes observations: after physics and evaluation, before the script.
@@ -183,7 +183,7 @@ class RoboMMEEnv(gymnasium.Env):
             self._task = self._run = None
 
     @property
-    def task(self) -> "MemoryTask":
+    def task(self) -> "Task":
         """The simulated task."""
         return self._open_task()
 
@@ -283,7 +283,7 @@ class RoboMMEEnv(gymnasium.Env):
             raise UserError("step() before reset(): call reset() first.")
         return self._run
 
-    def _open_task(self) -> "MemoryTask":
+    def _open_task(self) -> "Task":
         if self._task is None:
             raise UserError("The environment is closed; make a new one.")
         return self._task

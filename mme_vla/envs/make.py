@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.envs import metadata
-from mme_vla.envs.names import TASK_NAMES
+from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.registry import TASKS
 

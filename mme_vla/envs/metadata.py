@@ -17,7 +17,7 @@ from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
 
-from mme_vla.envs.names import TASK_NAMES
+from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
 
 SPLITS = {"train": 100, "val": 50, "test": 50}

@@ -16,7 +16,7 @@ from mme_vla.errors import UserError, did_you_mean
 if TYPE_CHECKING:
     import sapien
 
-    from mme_vla.envs.base import MemoryTask
+    from mme_vla.envs.task import Task
 
 IMAGE_SIZE = 256
 FOCAL_LENGTH = 128.0  # pixels: 90 degrees over 256 pixels
@@ -99,7 +99,7 @@ class Observer:
         render: take pictures; without it frames hold the robot's state only.
     """
 
-    def __init__(self, task: "MemoryTask", include: Include, render: bool) -> None:
+    def __init__(self, task: "Task", include: Include, render: bool) -> None:
         self.task = task
         self.include = include
         self.render = render

@@ -27,8 +27,8 @@ from mme_vla.envs.observations import IMAGE_SIZE
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
-    from mme_vla.envs.base import MemoryTask
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.task import Task
 
 
 class UnreachableError(RuntimeError):
@@ -39,7 +39,7 @@ class UnreachableError(RuntimeError):
 class Control:
     """What an action space acts with during one episode."""
 
-    task: "MemoryTask"
+    task: "Task"
     step: Callable[[np.ndarray], Any]
     """Does one control step with an action [8], or [7] for the stick."""
     demonstrator: "Demonstrator"

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
-    from mme_vla.envs.things import Thing
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.scene.things import Thing
 
 NO_RECORD = "NO RECORD"
 """Text of the stretches that belong to no sub-task: their frames are neither stored nor shown."""

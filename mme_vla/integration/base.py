@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 from torch import nn
 
-from mme_vla.backbone.blocks import PI05_VISIBILITY, Block, Visibility
-from mme_vla.backbone.config import BackboneConfig, ExpertConfig
-from mme_vla.backbone.gemma import Hook
+from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Block, Visibility
+from mme_vla.backbone.pi05.gemma import Hook
+from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 from mme_vla.types import MemoryTokens
 
 MEMORY_VISIBILITY: Visibility = {

@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import additive_mask, attend
-from mme_vla.backbone.config import BackboneConfig
-from mme_vla.backbone.gemma import Hook
-from mme_vla.backbone.norms import EPS, RMSNorm, rms_normalise
-from mme_vla.backbone.precision import compute_dtype
-from mme_vla.backbone.rope import rotate, rotation
+from mme_vla.backbone.layers.attention import additive_mask, attend
+from mme_vla.backbone.layers.norms import EPS, RMSNorm, rms_normalise
+from mme_vla.backbone.layers.precision import compute_dtype
+from mme_vla.backbone.layers.rope import rotate, rotation
+from mme_vla.backbone.pi05.gemma import Hook
+from mme_vla.backbone.pi05.sizes import BackboneConfig
 from mme_vla.integration.base import Integration, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens

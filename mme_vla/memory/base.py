@@ -1,4 +1,4 @@
-"""`MemoryModule`: choose stored tokens, then encode them into at most `budget` memory tokens."""
+"""`Memory`: choose stored tokens, then encode them into at most `budget` memory tokens."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,7 +11,7 @@ from mme_vla.memory.history import FrameScorer, History, StorageSpec
 from mme_vla.types import GRID, HistoryTokens, MemoryTokens
 
 
-class MemoryModule(nn.Module):
+class Memory(nn.Module):
     """The interface of every neural memory.
 
     A subclass sets, before use:

@@ -1,12 +1,12 @@
 """What the two perceptual memories share: one selected token in, one memory token out (paper, section 4.2)."""
 
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
-class PerceptualMemory(MemoryModule):
+class PerceptualMemory(Memory):
     """Selected tokens, right-padded to the budget and encoded one by one; subclasses choose."""
 
     def __init__(

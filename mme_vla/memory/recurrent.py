@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule, token_positions, whole_frames
+from mme_vla.memory.base import Memory, token_positions, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.sampling import jittered, recurrent_frames
@@ -69,7 +69,7 @@ class RecurrentStream:
     updates: int = 0
 
 
-class RecurrentMemory(MemoryModule):
+class RecurrentMemory(Memory):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
 
     pad_left = True

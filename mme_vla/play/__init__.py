@@ -1,7 +1,7 @@
 """The tasks as questions with a few answers: clips are shown, the next action is chosen, an oracle planner does it."""
 
+from mme_vla.play.game import ChoiceSession, Decision, EpisodeId, Option, Reveal
 from mme_vla.play.players import PLAYERS, NoChoiceError, OraclePlayer, Player, RandomPlayer, build_player
-from mme_vla.play.session import ChoiceSession, Decision, EpisodeId, Option, Reveal
 from mme_vla.play.vlm_players import GeminiPlayer, QwenPlayer
 
 __all__ = [

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.play.game import ChoiceSession
 from mme_vla.play.run import PlayRun
-from mme_vla.play.session import ChoiceSession
 
 log = logging.getLogger("mme_vla.play")
 QUALITY = 92  # of the JPEG frames

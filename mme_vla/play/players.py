@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.play.session import SIDE, ChoiceSession
+from mme_vla.play.game import SIDE, ChoiceSession
 from mme_vla.registry import Registry
 
 PLAYERS: Registry[Any] = Registry("player")

@@ -9,14 +9,14 @@ from typing import Any, Self
 
 from mme_vla.envs.metadata import SPLITS
 from mme_vla.envs.metadata import episodes as episodes_of
-from mme_vla.envs.names import TASK_NAMES
+from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.evaluation.paper import paper_table
 from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
+from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.run_file import claim_run
-from mme_vla.evaluation.tasks import PAPER_ORDER
-from mme_vla.play.session import ChoiceSession, EpisodeId
+from mme_vla.evaluation.suites import PAPER_ORDER
+from mme_vla.play.game import ChoiceSession, EpisodeId
 
 ALL = "all"
 

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.play import prompts
+from mme_vla.play import questions as prompts
+from mme_vla.play.game import ChoiceSession
 from mme_vla.play.players import PLAYERS, NoChoiceError, Player
-from mme_vla.play.session import ChoiceSession
-from mme_vla.subgoal.api import Api, ApiFailure, Settings
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.media import Clip, sample_video
-from mme_vla.subgoal.parsing import MalformedAnswer
-from mme_vla.subgoal.vlm import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
+from mme_vla.subgoal.finetuning.media import Clip, sample_video
+from mme_vla.subgoal.models.api import Api, ApiFailure, Settings
+from mme_vla.subgoal.models.qwen3vl import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
+from mme_vla.subgoal.words.parsing import MalformedAnswer
 
 
 class ModelPlayer(Player):
@@ -137,7 +137,7 @@ class GeminiPlayer(ModelPlayer):
     Args:
         tries: answers that may be unusable in a row.
         client: an object with google-genai's `client.models.generate_content`; None makes one.
-        settings: keys of `mme_vla.subgoal.api.Settings`.
+        settings: keys of `mme_vla.subgoal.models.api.Settings`.
     """
 
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:

@@ -2,11 +2,11 @@
 
 from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
 from mme_vla.processing.augment import augment_views
-from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
-from mme_vla.processing.normalize import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.prompt import PROMPTS, PromptFormat, PromptInput, encode_prompt
-from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.processing.subgoal_text import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
 
 __all__ = [

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
-from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
-from mme_vla.processing.normalize import NormStats, normalize, unnormalize
+from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
+from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
 from mme_vla.processing.tokenizer import HUB, Tokenizer
 

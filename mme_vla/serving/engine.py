@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mme_vla.episode import Episode
-from mme_vla.policy import MMEPolicy
-from mme_vla.serving.stats import ServerStats
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.serving.counters import ServerStats
 
 
 @dataclass(eq=False)

@@ -9,13 +9,13 @@ from importlib.metadata import version
 from typing import Any, cast
 
 from mme_vla.errors import UserError
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.serving.codec import pack
+from mme_vla.serving.counters import ServerStats
 from mme_vla.serving.engine import Engine
 from mme_vla.serving.http_side import HttpSide
 from mme_vla.serving.session import Session, subgoal_kind
 from mme_vla.serving.settings import ServeSettings
-from mme_vla.serving.stats import ServerStats
 from mme_vla.serving.warmup import warm_up
 from mme_vla.serving.web import Door
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.serving.settings import ServeSettings
 
 SIDE = 256  # pixels; what RoboMME's cameras give

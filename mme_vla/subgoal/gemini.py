@@ -8,11 +8,11 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.api import Api, ApiFailure, Reply, Settings, Shown
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.gemini_prompts import LATE, first_query, gemini_system, next_query
-from mme_vla.subgoal.parsing import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
-from mme_vla.subgoal.threads import side_by_side
+from mme_vla.subgoal.models.api import Api, ApiFailure, Reply, Settings, Shown
+from mme_vla.subgoal.models.threads import side_by_side
+from mme_vla.subgoal.words.gemini_prompts import LATE, first_query, gemini_system, next_query
+from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
 
 CLIP = 4  # frames: fewer are not worth a video
 

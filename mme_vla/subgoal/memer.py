@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 
 from mme_vla.registry import SUBGOALS
+from mme_vla.subgoal.answers import merge_keyframes, recent_frames
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
-from mme_vla.subgoal.history import merge_keyframes, recent_frames
-from mme_vla.subgoal.media import Clip
-from mme_vla.subgoal.parsing import MalformedAnswer, parse_memer
-from mme_vla.subgoal.prompts import memer_system, memer_user
+from mme_vla.subgoal.finetuning.media import Clip
+from mme_vla.subgoal.models.qwen3vl import Question
 from mme_vla.subgoal.qwenvl import VLMPredictor
-from mme_vla.subgoal.vlm import Question
+from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_memer
+from mme_vla.subgoal.words.prompts import memer_system, memer_user
 
 
 class MemerEpisode(SubgoalEpisode):

@@ -8,12 +8,12 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
+from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
-from mme_vla.subgoal.history import SubgoalHistory, hold_until
-from mme_vla.subgoal.media import Clip
-from mme_vla.subgoal.parsing import MalformedAnswer, parse_subgoal, write_boxes
-from mme_vla.subgoal.prompts import subgoal_system, subgoal_user
-from mme_vla.subgoal.vlm import VLM, Answer, Question
+from mme_vla.subgoal.finetuning.media import Clip
+from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
+from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_subgoal, write_boxes
+from mme_vla.subgoal.words.prompts import subgoal_system, subgoal_user
 
 
 class VLMPredictor(SubgoalPredictor):

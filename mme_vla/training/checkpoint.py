@@ -23,8 +23,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.policy import MMEPolicy
-from mme_vla.pretrained import load_tensors, replace_folder
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import load_tensors, replace_folder
 from mme_vla.training.ema import EMA
 from mme_vla.training.settings import KeepRule
 

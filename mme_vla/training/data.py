@@ -5,16 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.cache import COMMAND, ensure_cache
+from mme_vla.data.cache.store import COMMAND, ensure_cache
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes
-from mme_vla.data.stats import compute_norm_stats
+from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
-from mme_vla.policy import MMEPolicy
-from mme_vla.processing.normalize import NormStats
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
-from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.processing.subgoal_text import SubgoalText
 
 
 @dataclass(frozen=True)

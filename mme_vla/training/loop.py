@@ -10,8 +10,8 @@ from accelerate import Accelerator
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
-from mme_vla.memory.base import MemoryModule
-from mme_vla.policy import MMEPolicy
+from mme_vla.memory.base import Memory
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, trainable
 from mme_vla.training.console import ProgressLine, memory_gib
 from mme_vla.training.ema import EMA
@@ -193,7 +193,7 @@ class Trainer:
 
 
 @contextmanager
-def _reporting(memory: MemoryModule | None, wanted: bool) -> Iterator[None]:
+def _reporting(memory: Memory | None, wanted: bool) -> Iterator[None]:
     """Let the memory report numbers about its inside while this is open."""
     if memory is None or not wanted:
         yield

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mme_vla.data.dataset import TrainingDataset, collate
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.training.order import generator_for
 
 JOINTS = (*(f"joint {i}" for i in range(1, 8)), "gripper")

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import torch
 from torch import Tensor
 
-from mme_vla.backbone import flow
+from mme_vla.backbone.pi05 import flow
 from mme_vla.errors import UserError
 
 

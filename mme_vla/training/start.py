@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.training.checkpoint import checkpoints_in, resolve_checkpoint
 from mme_vla.weights import transfer
 

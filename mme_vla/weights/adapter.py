@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.naming import Derived, NameTable, Unread, check, read, write
-from mme_vla.policy import MMEPolicy
-from mme_vla.pretrained import check_fit
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import check_fit
+from mme_vla.weights.name_tables import Derived, NameTable, Unread, check, read, write
 
 
 @dataclass(frozen=True)

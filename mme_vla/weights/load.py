@@ -10,15 +10,15 @@ from pathlib import Path
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.finetune import merge_state
-from mme_vla.policy import MMEPolicy
-from mme_vla.pretrained import assign_tensors, check_fit, dtype_of
+from mme_vla.policy.finetune import merge_state
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import assign_tensors, check_fit, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
+from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
 from mme_vla.weights.source import Source, open_source
-from mme_vla.weights.stats import read_stats, stats_files
 
 ADAPTERS: dict[str, Callable[[MMEPolicy], Adapter]] = {
     "lerobot": port_adapter,
@@ -31,7 +31,7 @@ _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)"
 _MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
 
 
-def load_into(
+def load_weights(
     policy: MMEPolicy,
     source: str | Path,
     *,
@@ -79,7 +79,7 @@ def read_as(policy: MMEPolicy, source: Source) -> dict[str, Tensor]:
     """Read a checkpoint in the names of a policy of its own variant.
 
     Raises:
-        UserError: as `load_into`.
+        UserError: as `load_weights`.
     """
     tensors = source.tensors()
     if source.format == "ours":

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from mme_vla.backbone import torch_names as names
 from mme_vla.errors import UserError
-from mme_vla.naming import prefixed
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.weights.adapter import Adapter
+from mme_vla.weights.name_tables import prefixed
+from mme_vla.weights.names import torch_backbone as names
 
 LEROBOT_PREFIX = "model."
 _VLM = rf"^{names.ROOT}\.paligemma\."

@@ -8,14 +8,14 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-import mme_vla.backbone.names as backbone_names
-import mme_vla.integration.names as integration_names
-import mme_vla.memory.names as memory_names
+import mme_vla.weights.names.jax_backbone as backbone_names
+import mme_vla.weights.names.jax_integration as integration_names
+import mme_vla.weights.names.jax_memory as memory_names
 from mme_vla.errors import UserError
-from mme_vla.naming import Derived, NameTable, Unread, prefixed
-from mme_vla.policy import MMEPolicy
-from mme_vla.pretrained import assign_tensors
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import assign_tensors
 from mme_vla.weights.adapter import Adapter
+from mme_vla.weights.name_tables import Derived, NameTable, Unread, prefixed
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:

@@ -8,8 +8,8 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.hub import local_folder
-from mme_vla.pretrained import INDEX, WEIGHTS, read_safetensors, weight_files
+from mme_vla.policy.hub import local_folder
+from mme_vla.policy.tensor_files import INDEX, WEIGHTS, read_safetensors, weight_files
 from mme_vla.weights.orbax import find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
 

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.torch_names import EMBEDDING
 from mme_vla.errors import UserError
-from mme_vla.policy import MMEPolicy
-from mme_vla.pretrained import DTYPES, WEIGHTS, cast
-from mme_vla.processing.normalize import NormStats
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
+from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE, VIEWS
+from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released

@@ -5,11 +5,11 @@ import re
 import gymnasium
 from mani_skill.utils.registration import register_env
 
-from mme_vla.envs.base import MemoryTask
+from mme_vla.envs.task import Task
 from mme_vla.registry import TASKS
 
 
-def register_task[T: type[MemoryTask]](task: T) -> T:
+def register_task[T: type[Task]](task: T) -> T:
     """File a task under its class name, in `TASKS` and as a Gymnasium id."""
     TASKS.register(task.__name__)(task)
     # The official package uses the same ids; whoever was imported first keeps them.

@@ -5,17 +5,17 @@ from collections import Counter
 
 import sapien
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.motions import Appear
-from mme_vla.envs.objects import Cube, H, build_board, build_button, build_cube
-from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube
-from mme_vla.envs.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Appear
+from mme_vla.envs.scene.objects import Cube, H, build_board, build_button, build_cube
+from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.things import distance_xy
 
 # Both bounds belong to the range.
 AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
@@ -29,7 +29,7 @@ IN_BIN = sapien.Pose((10.0, 10.0, 0.0))
 
 
 @register_task
-class BinFill(MemoryTask):
+class BinFill(Task):
     """Any cube counts towards its colour; the counts are judged at the button."""
 
     shared_draws = True

@@ -1,22 +1,28 @@
 """ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.containers import add_containers, add_hidden_cubes, container_choices, container_picks, hiding_goal
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.motions import Cover
-from mme_vla.envs.objects import build_button
-from mme_vla.envs.placement import draw_button
-from mme_vla.envs.predicates import pressed
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Cover
+from mme_vla.envs.scene.objects import build_button
+from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.containers import (
+    add_containers,
+    add_hidden_cubes,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 from mme_vla.envs.tasks.video_unmask import CONTAINERS, PICKS
 
 LETTERS = ("b", "c")
 
 
 @register_task
-class ButtonUnmask(MemoryTask):
+class ButtonUnmask(Task):
     """Containers cover three cubes while the robot presses a button."""
 
     def build(self, draws: Draws) -> None:

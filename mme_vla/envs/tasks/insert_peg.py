@@ -8,24 +8,24 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.motions import Highlight, Mark, build_mark
-from mme_vla.envs.objects import build_aperture_box, build_highlight, build_peg
-from mme_vla.envs.objects.shapes import at
-from mme_vla.envs.objects.solids import APERTURE_COLOUR, APERTURE_Z
-from mme_vla.envs.placement import SceneError
-from mme_vla.envs.predicates import StaticFor, any_picked_up, reset_reached
-from mme_vla.envs.primitives_peg import PegEnd
-from mme_vla.envs.robot_control import PlanningError
-from mme_vla.envs.robots import ROBOT_BASE
+from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robot.peg_skills import PegEnd
+from mme_vla.envs.robot.robots import ROBOT_BASE
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Highlight, Mark, build_mark
+from mme_vla.envs.scene.objects import build_aperture_box, build_highlight, build_peg
+from mme_vla.envs.scene.objects.shapes import at
+from mme_vla.envs.scene.objects.solids import APERTURE_COLOUR, APERTURE_Z
+from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, reset_reached
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.things import Thing
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 PEGS, PEG_LENGTH, PEG_RADIUS = 3, 0.05, 0.01
 FROM_BOX, FROM_PEG = 0.06, 0.075
@@ -44,7 +44,7 @@ MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 
 @register_task
-class InsertPeg(MemoryTask):
+class InsertPeg(Task):
     """The first peg is the one; places are drawn per episode and the difficulty changes nothing."""
 
     shared_draws = True

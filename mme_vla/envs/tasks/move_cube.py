@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.objects import PEG_COLOUR, H, build_cube, build_disc, build_peg
-from mme_vla.envs.objects.shapes import at
-from mme_vla.envs.placement import Region, SceneError, draw_cube, draw_disc
-from mme_vla.envs.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import PEG_COLOUR, H, build_cube, build_disc, build_peg
+from mme_vla.envs.scene.objects.shapes import at
+from mme_vla.envs.scene.placement import Region, SceneError, draw_cube, draw_disc
+from mme_vla.envs.scene.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
 PEG_LENGTH, PEG_RADIUS = 0.1, 0.01
@@ -30,7 +30,7 @@ MORE_TRIES = 2  # where the cube did not stay on the target
 
 
 @register_task
-class MoveCube(MemoryTask):
+class MoveCube(Task):
     """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty changes nothing."""
 
     shared_draws = True

@@ -1,13 +1,13 @@
 """PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.objects import Cube, H, build_button, build_cube, build_disc
-from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.predicates import any_picked_up, dropped_onto, picked_up, pressed
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_disc
+from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.scene.predicates import any_picked_up, dropped_onto, picked_up, pressed
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 COLOURS = ("red", "blue", "green")
@@ -18,7 +18,7 @@ TARGET_RADIUS, TARGET_THICKNESS = 0.04, 0.005
 
 
 @register_task
-class PickXtimes(MemoryTask):
+class PickXtimes(Task):
     """One cube is picked up and placed on the target again and again, as often as the goal says."""
 
     latch_failure = True

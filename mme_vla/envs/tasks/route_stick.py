@@ -5,19 +5,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.motions import Mark, Trace, build_mark
-from mme_vla.envs.objects import Disc, build_disc, build_obstacle
-from mme_vla.envs.predicates import over
-from mme_vla.envs.stick import back_to_start
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Mark, Trace, build_mark
+from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
+from mme_vla.envs.scene.predicates import over
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.things import distance_xy
+from mme_vla.envs.tasks.families.stick import back_to_start
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
@@ -31,7 +31,7 @@ SIDES: tuple[tuple[str, Turn], ...] = (
 
 
 @register_task
-class RouteStick(MemoryTask):
+class RouteStick(Task):
     """Five discs in a row with an obstacle between each two; left is the larger y."""
 
     stick = True

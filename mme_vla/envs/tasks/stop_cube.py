@@ -6,20 +6,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import ordinal
-from mme_vla.envs.motions import smoothstep
-from mme_vla.envs.objects import build_button, build_disc, build_moving_cube
-from mme_vla.envs.placement import draw_button
-from mme_vla.envs.predicates import hovering, pressed
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import smoothstep
+from mme_vla.envs.scene.objects import build_button, build_disc, build_moving_cube
+from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.predicates import hovering, pressed
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.things import distance_xy
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 INTERVALS = (60, 80, 120)  # steps of one pass
 PASSES = 5
@@ -31,7 +31,7 @@ CHECKPOINT = 100
 
 
 @register_task
-class StopCube(MemoryTask):
+class StopCube(Task):
     """The difficulty changes nothing."""
 
     latch_failure = True

@@ -1,16 +1,16 @@
 """SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.motions import Mark, build_mark
-from mme_vla.envs.objects import Cube, Disc, H, build_button, build_cube, build_disc
-from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.predicates import any_picked_up, dropped, picked_up, pressed
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Mark, build_mark
+from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
+from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.things import distance_xy
 
 SWINGS = {"easy": (1, 3), "medium": (1, 2), "hard": (3, 3)}
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
@@ -44,7 +44,7 @@ class Swings:
 
 
 @register_task
-class SwingXtimes(MemoryTask):
+class SwingXtimes(Task):
     """The cube goes right, then left, `repetitions` times."""
 
     latch_failure = True

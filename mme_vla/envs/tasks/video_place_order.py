@@ -2,12 +2,12 @@
 
 from typing import ClassVar
 
-from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import ordinal
-from mme_vla.envs.objects import Disc
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import Disc
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.video_place import VideoPlace
+from mme_vla.envs.tasks.families.video_place import VideoPlace
 
 
 @register_task

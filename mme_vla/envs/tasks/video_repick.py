@@ -2,20 +2,20 @@
 
 from typing import TYPE_CHECKING
 
-from mme_vla.envs.anchors import ANCHOR_HALF, rotated_anchors, swaps_in_turn
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.draws import Draws
 from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.motions import SWAP_STEPS, Swap
-from mme_vla.envs.objects import Cube, H, build_button, build_cube
-from mme_vla.envs.placement import Region, SceneError, draw_button, draw_cube
-from mme_vla.envs.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
+from mme_vla.envs.scene.anchors import ANCHOR_HALF, rotated_anchors, swaps_in_turn
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
+from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
+from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.demonstrator import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
@@ -25,7 +25,7 @@ PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
 
 
 @register_task
-class VideoRepick(MemoryTask):
+class VideoRepick(Task):
     """Three cubes of one colour that change places, or fifteen that do not."""
 
     shared_draws = True

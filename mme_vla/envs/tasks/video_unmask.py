@@ -1,20 +1,26 @@
 """VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
 
-from mme_vla.envs.base import MemoryTask
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.containers import add_containers, add_hidden_cubes, container_choices, container_picks, hiding_goal
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.motions import COVER_STEPS, Cover
-from mme_vla.envs.predicates import StaticFor
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import COVER_STEPS, Cover
+from mme_vla.envs.scene.predicates import StaticFor
 from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.containers import (
+    add_containers,
+    add_hidden_cubes,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 
 CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # asked for; in hard episodes as many as fit
 PICKS = {"easy": 1, "medium": 1, "hard": 2}
 
 
 @register_task
-class VideoUnmask(MemoryTask):
+class VideoUnmask(Task):
     """Containers cover three cubes during the conditioning video."""
 
     def build(self, draws: Draws) -> None:

@@ -1,13 +1,13 @@
 """VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick up the right one."""
 
-from mme_vla.envs.anchors import rotated_anchors
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.containers import container_choices, container_picks, hiding_goal
-from mme_vla.envs.draws import Draws
-from mme_vla.envs.predicates import StaticFor
+from mme_vla.envs.scene.anchors import rotated_anchors
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.predicates import StaticFor
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.unmask_swap import CONTAINERS, UnmaskSwap
+from mme_vla.envs.tasks.families.containers import container_choices, container_picks, hiding_goal
+from mme_vla.envs.tasks.families.unmask_swap import CONTAINERS, UnmaskSwap
 
 
 @register_task

@@ -15,12 +15,12 @@ import torch
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
-from mme_vla.build import build_policy
-from mme_vla.config import compose, config_dir
+from mme_vla.config.composition import compose, config_dir
 from mme_vla.errors import UserError
-from mme_vla.evaluation.cost_table import REPLAN, ModelCost
+from mme_vla.evaluation.results.cost_table import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.build import build_policy
+from mme_vla.policy.mme import MMEPolicy
 from mme_vla.types import VIEWS, Batch, HistoryTokens
 
 

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError
 from mme_vla.integration.modulator import Modulator
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 
 
 @dataclass

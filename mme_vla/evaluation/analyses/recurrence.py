@@ -9,7 +9,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.evaluation.analyses.replay import STRIDE, replay
 from mme_vla.memory.recurrent import RecurrentMemory
-from mme_vla.policy import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy
 
 
 @dataclass(frozen=True)

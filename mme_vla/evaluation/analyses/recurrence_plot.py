@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from mme_vla.evaluation.analyses.recurrence import RecurrenceCurves
-from mme_vla.evaluation.plots import COLOURS, FAINT, picture, svg
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, picture, svg
 
 _PAIR = ("inner_loss_before", "inner_loss_after")
 

@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.stats import compute_norm_stats
-from mme_vla.episode import Episode
+from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
-from mme_vla.policy import MMEPolicy
-from mme_vla.processing.subgoals import SubgoalText
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.subgoal_text import SubgoalText
 from mme_vla.types import VIEWS
 
 STRIDE = 16

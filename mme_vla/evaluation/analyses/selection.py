@@ -6,14 +6,14 @@ import numpy as np
 from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.pictures import contact_sheet
+from mme_vla.data.memory_picture import contact_sheet
 from mme_vla.errors import UserError
-from mme_vla.memory.base import MemoryModule
+from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
 
 
 def selection_sheets(
-    source: EpisodeSource, episode: int, memory: MemoryModule, name: str, every: int = 8
+    source: EpisodeSource, episode: int, memory: Memory, name: str, every: int = 8
 ) -> Iterator[tuple[int, Image.Image]]:
     """Draw what `memory` remembers at the first execution step and at every `every`-th after it.
 

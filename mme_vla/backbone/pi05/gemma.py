@@ -1,0 +1,293 @@
+"""Gemma experts under joint attention: every expert has its own weights, all share one attention.
+
+b batch · n tokens · d an expert's width · N query heads · K key heads · h head width
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from mme_vla.backbone.layers.attention import additive_mask, attend
+from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, token_positions
+from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
+from mme_vla.backbone.layers.precision import compute_dtype
+from mme_vla.backbone.layers.rope import Rotation, rotate, rotation
+from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+
+Hook = Callable[[int, Tensor], Tensor]
+"""The backbone's second door: (layer, residual stream [b, n, d]) → what the answering expert's MLP reads instead."""
+
+KeyValue = tuple[Tensor, Tensor]
+
+
+class LayerModulation(NamedTuple):
+    """One layer's two time modulations, made beforehand for a sampling step."""
+
+    attention: Modulation
+    mlp: Modulation
+
+
+class Segment(NamedTuple):
+    """Neighbouring blocks of one expert, run as one matrix."""
+
+    expert: str
+    tokens: Tensor
+
+
+class GatedMLP(nn.Module):
+    """GeGLU: (gelu(x W₀) ⊙ x W₁) W₂, with W₀ and W₁ in one matrix."""
+
+    def __init__(self, width: int, hidden: int) -> None:
+        super().__init__()
+        self.gate_up = nn.Linear(width, 2 * hidden, bias=False)
+        self.down = nn.Linear(hidden, width, bias=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        gate, up = self.gate_up(x).chunk(2, dim=-1)
+        return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
+
+
+class ExpertLayer(nn.Module):
+    """One expert's weights in one layer.
+
+    In the last layer only the answering expert is read further: of the others that layer needs keys and values
+    alone (`keys_only`), and has no other weights.
+    """
+
+    def __init__(self, config: BackboneConfig, expert: ExpertConfig, condition_width: int | None, keys_only: bool):
+        super().__init__()
+        self.heads, self.kv_heads, self.head_dim = config.num_heads, config.num_kv_heads, config.head_dim
+        self.keys_only = keys_only
+
+        def norm() -> nn.Module:
+            return AdaRMSNorm(expert.width, condition_width) if condition_width else RMSNorm(expert.width)
+
+        self.attention_norm = norm()
+        kv_width = 2 * self.kv_heads * self.head_dim
+        if keys_only:
+            self.kv = nn.Linear(expert.width, kv_width, bias=False)
+            return
+        q_width = self.heads * self.head_dim
+        self.qkv = nn.Linear(expert.width, q_width + kv_width, bias=False)
+        self.out = nn.Linear(q_width, expert.width, bias=False)
+        self.mlp_norm = norm()
+        self.mlp = GatedMLP(expert.width, expert.mlp_dim)
+
+    def project(
+        self, x: Tensor, turn: Rotation, condition: Tensor | Modulation | None
+    ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
+        """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate.
+
+        Queries and keys come back rotated, by `turn` at their positions.
+        """
+        x, gate = self.attention_norm(x, condition)
+        heads = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
+        v = heads[..., -self.kv_heads :, :]
+        qk = rotate(heads[..., : -self.kv_heads, :], turn)  # in one go: queries first, keys last
+        k = qk[..., -self.kv_heads :, :]
+        return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
+
+    def finish(
+        self,
+        x: Tensor,
+        attended: Tensor,
+        gate: Tensor | None,
+        condition: Tensor | Modulation | None,
+        hook: Callable[[Tensor], Tensor] | None,
+    ) -> Tensor:
+        """Add the attention's output, then the MLP's; the hook changes only what the MLP reads."""
+        x = _residual(x, self.out(attended), gate)
+        normed, gate = self.mlp_norm(x if hook is None else hook(x), condition)
+        return _residual(x, self.mlp(normed), gate)
+
+
+def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
+    return x + update if gate is None else torch.addcmul(x, update, gate)
+
+
+class JointBlock(nn.Module):
+    """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap it whole."""
+
+    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str, last: bool) -> None:
+        super().__init__()
+        self.answering = answering
+        self.experts = nn.ModuleDict({
+            name: ExpertLayer(config, expert, expert.width if name == answering else None, last and name != answering)
+            for name, expert in experts.items()
+        })  # fmt: skip
+
+    def forward(
+        self,
+        segments: Sequence[Segment],
+        turn: Rotation,
+        mask: Tensor,
+        condition: Tensor | LayerModulation | None,
+        hook: Callable[[Tensor], Tensor] | None = None,
+        past: KeyValue | None = None,
+    ) -> tuple[list[Segment], KeyValue]:
+        """Run one layer.
+
+        Args:
+            segments: this pass's tokens in sequence order. turn: their rotation.
+            mask: additive [b, 1, n, past + n].
+            condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
+            hook: see `Hook`, layer already bound.
+            past: keys and values [b, past, K, h] of earlier passes, rotated.
+
+        Returns:
+            The updated segments (of those that asked), and this pass's keys (rotated) and values.
+        """
+        of_attention, of_mlp = condition if isinstance(condition, LayerModulation) else (condition, condition)
+        asked, queries, keys, values, row = [], [], [], [], 0
+        for segment in segments:
+            layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
+            adaptive = segment.expert == self.answering
+            rows = slice(row, row + segment.tokens.shape[1])
+            q, k, v, gate = layer.project(segment.tokens, turn.rows(rows), of_attention if adaptive else None)
+            keys.append(k)
+            values.append(v)
+            if q is not None:
+                asked.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
+                queries.append(q)
+            row = rows.stop
+        k, v = _join(keys), _join(values)
+        if not asked:
+            return [], (k, v)
+        all_k, all_v = (k, v) if past is None else (torch.cat([past[0], k], 1), torch.cat([past[1], v], 1))
+        seen = mask if len(asked) == len(segments) else torch.cat([mask[:, :, rows] for *_, rows in asked], 2)
+        attended = attend(_join(queries), all_k, all_v, seen)
+        pieces = attended.split([rows.stop - rows.start for *_, rows in asked], dim=1)
+        updated = [
+            Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
+            for (segment, layer, gate, of, change, _), piece in zip(asked, pieces, strict=True)
+        ]
+        return updated, (k, v)
+
+
+@dataclass
+class KVCache:
+    """Keys and values of every layer, and what is needed to see them: their blocks and which tokens are valid."""
+
+    layers: list[KeyValue]
+    spans: list[Span]
+    mask: Tensor  # [b, past] bool
+
+
+class Layout(NamedTuple):
+    """What attention needs to know of a pass beside its tokens; the same for every Euler step of a chunk."""
+
+    spans: list[Span]  # of this pass and the cached ones before it
+    valid: Tensor  # [b, past + n] bool
+    mask: Tensor  # additive [b, 1, n, past + n]
+    turn: Rotation
+
+
+@dataclass
+class Conditioning:
+    """Time modulations of all layers, made once for the fixed times of a sampler (`JointTransformer.conditioning`)."""
+
+    layers: list[LayerModulation]
+    final: Modulation
+
+    def at(self, index: int) -> "Conditioning":
+        """Return the modulations of one time, kept broadcastable over the batch."""
+
+        def pick(m: Modulation) -> Modulation:
+            return Modulation(*(x[index : index + 1] for x in m))
+
+        return Conditioning([LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final))
+
+
+class JointTransformer(nn.Module):
+    """All layers and the final norm of the one expert that answers; nothing that no action reads."""
+
+    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str = "action") -> None:
+        super().__init__()
+        self.head_dim, self.answering, self.experts = config.head_dim, answering, experts
+        self.gradient_checkpointing = False
+        self.layers = nn.ModuleList(
+            JointBlock(config, experts, answering, last=i == config.depth - 1) for i in range(config.depth)
+        )
+        width = experts[answering].width
+        self.final_norm = AdaRMSNorm(width, width)
+
+    def conditioning(self, condition: Tensor) -> Conditioning:
+        """Compute every layer's modulation for conditions [m, c] at once: the weights are read once, not m times."""
+        layers = []
+        for block in self.layers:
+            layer: Any = block.experts[self.answering]  # type: ignore[index]
+            norms = (layer.attention_norm, layer.mlp_norm)
+            layers.append(LayerModulation(*(norm.modulation(condition) for norm in norms)))
+        return Conditioning(layers, self.final_norm.modulation(condition))
+
+    def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
+        """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
+        spans = [Span(block.name, len(block)) for block in blocks]
+        asking = torch.cat([block.mask for block in blocks], 1)
+        positions = token_positions(asking, past.mask if past else None)
+        all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
+        seen = attention_mask(spans, all_spans, asking, valid, table)
+        mask = additive_mask(seen, compute_dtype(blocks[0].tokens))
+        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim))
+
+    def forward(
+        self,
+        blocks: Sequence[Block],
+        layout: Layout,
+        condition: Tensor | Conditioning | None = None,
+        hook: Hook | None = None,
+        past: KVCache | None = None,
+        keep: bool = False,
+    ) -> tuple[Tensor | None, KVCache | None]:
+        """Run blocks, after those of `past`.
+
+        Args:
+            blocks: in sequence order. layout: of these blocks after this past.
+            condition: time condition [b, c] of the answering expert, or its modulations; unread without that expert.
+            hook: the per-layer hook. past: an earlier pass's cache.
+            keep: whether to return a cache of `past` and this pass.
+
+        Returns:
+            The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
+        """
+        segments = _segments(blocks, layout.mask.dtype)
+        cached: list[KeyValue] = []
+        for i, block in enumerate(self.layers):
+            of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
+            of_hook = None if hook is None else _bind(hook, i)
+            args = (segments, layout.turn, layout.mask, of_layer, of_hook, past.layers[i] if past else None)
+            if self.gradient_checkpointing and torch.is_grad_enabled():
+                segments, kv = checkpoint(block, *args, use_reentrant=False)
+            else:
+                segments, kv = block(*args)
+            if keep:
+                old = past.layers[i] if past else None
+                cached.append(kv if old is None else (torch.cat([old[0], kv[0]], 1), torch.cat([old[1], kv[1]], 1)))
+        answer = None
+        if segments:
+            final = condition.final if isinstance(condition, Conditioning) else condition
+            answer, _ = self.final_norm(segments[-1].tokens, final)
+        return answer, KVCache(cached, layout.spans, layout.valid) if keep else None
+
+
+def _join(parts: list[Tensor]) -> Tensor:
+    """Concatenate along the sequence, without a copy where there is one part."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+
+
+def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
+    """Join neighbouring blocks of one expert, in the compute dtype."""
+    runs: list[tuple[str, list[Tensor]]] = []
+    for block in blocks:
+        if not runs or runs[-1][0] != block.expert:
+            runs.append((block.expert, []))
+        runs[-1][1].append(block.tokens.to(dtype))
+    return [Segment(expert, _join(tokens)) for expert, tokens in runs]
+
+
+def _bind(hook: Hook, layer: int) -> Callable[[Tensor], Tensor]:
+    return lambda x: hook(layer, x)

@@ -1,0 +1,71 @@
+"""SigLIP: timm's vision transformer, which computes the same function, with the released model's dtype rules."""
+
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.layers.precision import compute_dtype
+from mme_vla.backbone.pi05.sizes import VisionConfig
+from mme_vla.errors import UserError
+
+
+class VisionTower(nn.Module):
+    """Images [n, 3, s, s] in [−1, 1] → tokens [n, patches, d_out], row-major; not pooled, a linear head on each."""
+
+    def __init__(self, config: VisionConfig, output_dim: int) -> None:
+        """Build the tower; `output_dim` is the width of the head, the VLM's."""
+        from timm.models.vision_transformer import VisionTransformer
+
+        super().__init__()
+        self.vit = VisionTransformer(
+            img_size=config.image_size,
+            patch_size=config.patch_size,
+            embed_dim=config.width,
+            depth=config.depth,
+            num_heads=config.num_heads,
+            mlp_ratio=(config.mlp_dim + 0.5) / config.width,  # timm truncates the product: aim at the middle
+            num_classes=output_dim,
+            class_token=False,
+            global_pool="",
+            act_layer="gelu_tanh",
+            norm_layer=partial(nn.LayerNorm, eps=1e-6),
+            weight_init="skip",
+        )
+
+    def forward(self, images: Tensor) -> Tensor:
+        vit: Any = self.vit
+        convolution = vit.patch_embed.proj
+        # Patches and positions in float32, as released; then the compute dtype.
+        with torch.autocast(images.device.type if images.device.type != "meta" else "cpu", enabled=False):
+            weight, bias = convolution.weight.float(), convolution.bias.float()
+            patches = nn.functional.conv2d(images.float(), weight, bias, stride=convolution.stride)
+            x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()
+        dtype = compute_dtype(vit.head.weight)
+        x = x.to(dtype)
+        for block in vit.blocks:
+            x = block(x)
+        return vit.head(vit.norm(x)).to(dtype)
+
+
+def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
+    """Pool [..., s², d] tokens of an s×s grid to [..., grid², d] over non-overlapping windows.
+
+    Args:
+        tokens: row-major. grid: the new side; must divide s.
+        pooling: `mean` as released, or `max` (paper, section 4.2).
+
+    Raises:
+        UserError: `grid` does not divide s, or the pooling is unknown.
+    """
+    side = int(tokens.shape[-2] ** 0.5)
+    if side % grid:
+        raise UserError(f"A {side}×{side} token grid cannot be pooled to {grid}×{grid}: {grid} must divide {side}.")
+    window = side // grid
+    cells = tokens.unflatten(-2, (grid, window, grid, window))
+    if pooling == "mean":
+        return cells.mean(dim=(-4, -2)).flatten(-3, -2)
+    if pooling == "max":
+        return cells.amax(dim=(-4, -2)).flatten(-3, -2)
+    raise UserError(f"pooling={pooling!r}: choose 'mean' (as released) or 'max' (paper).")

@@ -1,0 +1,151 @@
+"""`python -m mme_vla.envs.show`: the 16 tasks at a glance, one demonstrated episode each, on one page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from mme_vla.envs import metadata
+from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.errors import UserError, did_you_mean
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from mme_vla.envs.task import Task
+
+TILE, GAP, CAPTION = 176, 6, 18  # pixels
+VIDEO_RED, INK = (200, 33, 33), (60, 60, 60)
+EVERY = 8
+"""Steps between two pictures that are taken; which of them are shown is decided at the end."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The front view at one step."""
+
+    step: int
+    picture: np.ndarray
+    subtask: str
+    video: bool
+
+
+def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
+    """Demonstrate a task and look at it every few steps; also returns whether it succeeded."""
+    from mme_vla.envs.observations import Include, Observer
+    from mme_vla.envs.recording.demonstration import demonstrate
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.subtasks import NO_RECORD
+
+    observer = Observer(task, Include(), render=True)
+    snapshots: list[Snapshot] = []
+
+    def look(evaluated: dict[str, Any]) -> None:
+        observer.follow()
+        shown = task.progress.shown
+        if task.steps_done % every == 1 and shown.text != NO_RECORD:
+            picture = observer.frame(evaluated)["front_rgb"]
+            snapshots.append(Snapshot(task.steps_done, picture, shown.text, shown.video))
+
+    task.reset()
+    observer.start()
+    task.observe = look
+    try:
+        success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
+    finally:
+        task.observe = None
+    return snapshots, success
+
+
+def strip(snapshots: Sequence[Snapshot], tiles: int) -> Image.Image:
+    """Some of the snapshots side by side, spread evenly, each with its step; video frames have a red border."""
+    chosen = [snapshots[i] for i in np.unique(np.linspace(0, len(snapshots) - 1, tiles).round().astype(int))]
+    columns = min(4, len(chosen))
+    rows = -(-len(chosen) // columns)
+    sheet = Image.new("RGB", (columns * (TILE + GAP) - GAP, rows * (TILE + CAPTION)), "white")
+    draw = ImageDraw.Draw(sheet)
+    for i, shot in enumerate(chosen):
+        x, y = i % columns * (TILE + GAP), i // columns * (TILE + CAPTION)
+        sheet.paste(Image.fromarray(shot.picture).resize((TILE, TILE), Image.Resampling.LANCZOS), (x, y))
+        if shot.video:
+            draw.rectangle((x, y, x + TILE - 1, y + TILE - 1), outline=VIDEO_RED, width=4)
+        kind = "video, step" if shot.video else "step"
+        draw.text((x + 2, y + TILE + 3), f"{kind} {shot.step}", INK)
+    return sheet
+
+
+def page(entries: Sequence[tuple[str, str, str]]) -> str:
+    """The page's Markdown; each entry is a task, its goal and the name of its picture."""
+    lines = [
+        "# The sixteen tasks",
+        "",
+        "One demonstrated episode each, front camera; pictures with a red border belong to the conditioning video.",
+        "Drawn by `python -m mme_vla.envs.show`.",
+        "",
+    ]
+    for task, goal, picture in entries:
+        lines += [f"## {task}", "", f"*{goal}*", "", f"![{task}]({picture})", ""]
+    return "\n".join(lines)
+
+
+def run(cfg: "DictConfig") -> None:
+    """Draw the gallery as configs/show.yaml and the command line say.
+
+    Raises:
+        UserError: an unknown task, split or episode, too few tiles, or no simulator or renderer.
+    """
+    from mme_vla.data.progress import progress
+
+    tasks = [cfg.task] if isinstance(cfg.task, str) else list(cfg.task)
+    tasks = list(TASK_NAMES) if tasks == ["all"] else tasks
+    for task in tasks:
+        if task not in TASK_NAMES:
+            raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), ['all', *TASK_NAMES])}")
+    if not isinstance(cfg.tiles, int) or cfg.tiles < 2:
+        raise UserError(f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
+    specs = [metadata.episode(task, cfg.split, cfg.episode) for task in tasks]
+    require_simulator()
+    folder = Path(cfg.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    with progress("show", len(specs), unit="tasks") as advance:
+        for spec in specs:
+            env, snapshots = _demonstrated(spec)
+            picture = f"{spec.task}.jpg"
+            strip(snapshots, cfg.tiles).save(folder / picture, quality=82)
+            entries.append((spec.task, env.goals()[0], picture))
+            env.close()
+            advance(1)
+    (folder / "README.md").write_text(page(entries))
+    print(f"{folder / 'README.md'}: {len(entries)} tasks.")
+
+
+def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
+    """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
+    from mme_vla.envs.scene.placement import SceneError
+
+    for seed in range(spec.seed, spec.seed + 100):
+        try:
+            env = make_task(spec.task, render=True, seed=seed, difficulty=spec.difficulty)
+        except SceneError:
+            continue
+        snapshots, success = demonstrate_with_pictures(env)
+        if success:
+            return env, snapshots
+        env.close()
+    raise UserError(f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}.")
+
+
+def main() -> None:
+    """Run `python -m mme_vla.envs.show`."""
+    from mme_vla.config.composition import cli
+
+    cli("show")(run)()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,225 @@
+"""`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, and what a memory remembers of it."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from mme_vla.config.composition import cli
+from mme_vla.errors import UserError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
+
+    from mme_vla.data.episodes import EpisodeSource
+    from mme_vla.memory.base import Memory
+
+
+@cli("inspect")
+def main(cfg: DictConfig) -> None:
+    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its memory.
+
+    Raises:
+        UserError: nothing to inspect is named, or it cannot be read.
+    """
+    from rich.console import Console
+
+    console = Console()
+    if (cfg.checkpoint is None) == (cfg.dataset is None):
+        raise UserError("Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built in).")
+    if cfg.checkpoint is not None:
+        return show_checkpoint(Path(cfg.checkpoint), console)
+    from mme_vla.data.episodes import EpisodeSource
+
+    source = EpisodeSource(cfg.dataset, cfg.exec_starts)
+    if cfg.episode is None:
+        return show_dataset(source, console)
+    episode, step = check_place(source, cfg.episode, cfg.step)
+    show_episode(source, episode, step, console)
+    if cfg.memory is None:
+        return None
+    picture = draw_memory(source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console)
+    console.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+    return None
+
+
+def show_checkpoint(folder: Path, console: "Console") -> None:
+    """Print a checkpoint's parts, training state and normalisation statistics."""
+    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.training.checkpoint import STATE, read_state, resolve_checkpoint
+
+    folder = resolve_checkpoint(folder)
+    policy = MMEPolicy.from_pretrained(folder)
+    table = _table(str(folder), "part", "tensors", "parameters", "dtype")
+    for name, part in _parts(policy):
+        tensors = list(part.parameters())
+        if tensors:
+            dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
+            table.add_row(name, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
+    total = list(policy.parameters())
+    table.add_row("all", str(len(total)), f"{sum(t.numel() for t in total):,}", "", style="bold")
+    console.print(table)
+    settings = _table("configuration", "section", "values")
+    for name, section in policy.config.items():
+        settings.add_row(name, _plain(section))
+    settings.add_row("tokenizer", policy.require_processor().tokenizer.spec)
+    if (folder / STATE).is_file():
+        state = read_state(folder)
+        settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
+        settings.add_row("recipe", _plain(state["config"].get("train", {})))
+        settings.add_row("data", _plain(state["config"].get("data", {})))
+        settings.add_row("versions", _plain(state["versions"]))
+    console.print(settings)
+    stats = policy.require_processor().stats
+    if stats is not None:
+        numbers = _table("normalisation", "", *(str(i + 1) for i in range(len(stats.actions))))
+        for name, of in (("state", stats.state), ("action delta", stats.actions)):
+            for quantile in ("q01", "q99"):
+                numbers.add_row(f"{name} {quantile}", *(f"{x:.3f}" for x in getattr(of, quantile)))
+        console.print(numbers)
+
+
+def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) -> None:
+    """Print a dataset's episodes, at most `most` of them, and its totals."""
+    table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
+    for episode in range(min(len(source), most)):
+        frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
+        goal, seconds = source.goal(episode), f"{frames / source.fps:.1f}"
+        table.add_row(str(episode), source.task(episode), str(frames), str(video), seconds, goal)
+    if len(source) > most:
+        table.add_row("…", f"{len(source) - most} more")
+    frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
+    table.add_row("all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold")
+    console.print(table)
+    console.print(
+        f"{frames - video} execution steps to train on · {source.fps:g} frames per second · pictures as "
+        f"{'video' if source.video_views else 'images'} · subgoals: {', '.join(source.subgoal_names) or 'none'}",
+        highlight=False,
+    )
+
+
+def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Console") -> None:
+    """Print an episode's phases, and what is recorded at one step."""
+    start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
+    table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
+    table.add_row("task", source.task(episode))
+    table.add_row("goal", source.goal(episode))
+    table.add_row("video", f"frames 0 … {start - 1}" if start else "none")
+    table.add_row("execution", f"frames {start} … {length - 1}")
+    for name, text in source.subgoals(episode, step).items():
+        table.add_row(name, text)
+    table.add_row("state", _numbers(source.states(episode, step, step + 1)[0]))
+    table.add_row("action", _numbers(source.actions(episode, step, step + 1)[0]))
+    console.print(table)
+
+
+def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
+    """The episode and step asked for; the last step by default.
+
+    Raises:
+        UserError: the dataset has no such episode, or the episode no such step.
+    """
+    if not isinstance(episode, int) or not 0 <= episode < len(source):
+        raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
+    length = int(source.lengths[episode])
+    step = length - 1 if step is None else step
+    if not isinstance(step, int) or not 0 <= step < length:
+        raise UserError(f"step={step}: episode {episode} of {source.name} has frames 0 … {length - 1}.")
+    return episode, step
+
+
+def build_memory(cfg: DictConfig) -> "Memory":
+    """The memory the configuration names, of any width: it is only asked to select.
+
+    Raises:
+        UserError: an unknown memory or option.
+    """
+    from omegaconf import OmegaConf
+
+    import mme_vla.memory  # noqa: F401  (registers what ships)
+    from mme_vla.registry import MEMORIES
+
+    options: Any = OmegaConf.to_container(cfg.memory, resolve=True)
+    name = options.pop("name")
+    try:
+        return MEMORIES[name](d_vision=cfg.backbone.vlm.width, width=cfg.backbone.action.width, **options)
+    except TypeError as error:
+        raise UserError(f"memory {name!r} does not take these options: {options} ({error}).") from error
+
+
+def draw_memory(
+    source: "EpisodeSource",
+    episode: int,
+    step: int,
+    memory: "Memory",
+    name: str,
+    folder: Path,
+    console: "Console",
+) -> Path:
+    """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
+    from mme_vla.data.memory_picture import contact_sheet
+    from mme_vla.memory.history import OnlineHistory
+
+    frames = source.frames(episode, np.arange(step + 1))
+    history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
+    kept, patches = history.wanted(len(frames)), memory.storage.grid**2
+    history.append(frames, _no_tokens(len(kept), patches))
+    selected = memory.select(history, step)
+    remembered = np.unique(selected[:, 0])
+    table = _table(f"{name} at step {step}", "", "")
+    table.add_row("remembers", f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames")
+    table.add_row("frames", ", ".join(map(str, remembered)))
+    table.add_row("stored", f"{len(kept)} frames of {memory.storage.grid}×{memory.storage.grid} tokens")
+    console.print(table)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
+    title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
+    start = int(source.exec_starts[episode])
+    contact_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
+    return path
+
+
+def _no_tokens(frames: int, patches: int) -> Any:
+    import torch
+
+    return torch.zeros(frames, patches, 1)  # selections never look at tokens
+
+
+def _parts(policy: Any) -> list[tuple[str, Any]]:
+    from torch import nn
+
+    experts = {name: nn.ModuleList(block.experts[name] for block in policy.backbone.transformer.layers)
+               for name in policy.backbone.transformer.layers[0].experts}  # fmt: skip
+    return [
+        ("vision tower", policy.backbone.vision),
+        ("word embedding", policy.backbone.embedding),
+        *((f"{name} expert", part) for name, part in experts.items()),
+        ("memory", policy.memory or nn.Module()),
+        ("integration", policy.integration),
+    ]
+
+
+def _table(title: str, *columns: str) -> "Table":
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left", show_header=any(columns), title_style="bold")
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right")
+    return table
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key}={_plain(inner) if not isinstance(inner, dict) else '{' + _plain(inner) + '}'}"
+                         for key, inner in value.items())  # fmt: skip
+    return str(value)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return "  ".join(f"{x:.3f}" for x in values)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+"""The policy a command is about: a checkpoint, or a model with fresh weights for trying things out."""
+
+import logging
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from omegaconf import DictConfig
+
+from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+    from mme_vla.policy.mme import MMEPolicy
+
+# What a checkpoint brings along, so that it cannot be set beside one.
+_MODEL_KEYS = (
+    "name",
+    "model",
+    "backbone",
+    "memory",
+    "integration",
+    "policy",
+    "processor",
+    "subgoal_text",
+    "token_budget",
+)
+
+
+class LoadedPolicy(NamedTuple):
+    """A policy on its device. source: the checkpoint folder or repository it is from; None with fresh weights."""
+
+    policy: "MMEPolicy"
+    name: str
+    source: str | None
+
+
+def load_policy(
+    cfg: DictConfig, verb: str, logger: logging.Logger, device: "torch.device | None" = None
+) -> LoadedPolicy:
+    """Load `checkpoint`, or build `model` with fresh weights and say so.
+
+    Args:
+        cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from.
+        verb: what the command does with it, for messages. device: instead of the configured one.
+
+    Raises:
+        UserError: neither a checkpoint nor a model is named, or both (or a part of one), or there is no such device.
+    """
+    from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.training.checkpoint import resolve_checkpoint
+
+    device = find_device(cfg.device) if device is None else device
+    named = words_of(*_MODEL_KEYS)
+    if cfg.checkpoint is not None:
+        if named:
+            raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
+        source = Path(str(cfg.checkpoint)).expanduser()
+        where = str(resolve_checkpoint(source)) if source.exists() else str(cfg.checkpoint)
+        policy = MMEPolicy.from_pretrained(where, device=device, dtype=cfg.dtype, revision=cfg.revision)
+        name = str(policy.config.get("name", "policy"))
+        logger.info("%s from %s, on %s", name, where, device)
+        return LoadedPolicy(policy, name, where)
+    if not any(word.startswith("model=") for word in named):
+        raise UserError(
+            f"Name what to {verb}: checkpoint=<folder>, or model=<model> with fresh weights, to try things out."
+        )
+    from mme_vla.testing.small import unit_stats
+
+    if cfg.dtype != "float32":
+        raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
+    policy = build_from_config(cfg).to(device)
+    policy.require_processor().stats = unit_stats()
+    logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
+    return LoadedPolicy(policy, str(cfg.name), None)
+
+
+def words_of(*keys: str) -> list[str]:
+    """The words of the command line that set one of these keys or groups, or something below."""
+    from hydra.core.hydra_config import HydraConfig
+
+    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    found = []
+    for word in given:
+        key = word.lstrip("+~").split("=")[0]
+        if any(key == wanted or key.startswith((f"{wanted}.", f"{wanted}@")) for wanted in keys):
+            found.append(word)
+    return found

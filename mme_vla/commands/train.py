@@ -1,0 +1,118 @@
+"""`python -m mme_vla.train model=tokendrop_expert`: train a policy (configs/train.yaml)."""
+
+import os
+import shlex
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from mme_vla.config.composition import cli
+
+# Threads that wait for each other asleep: busy waiting slows a step tenfold when anything else runs on the same cores
+# (data workers do). It counts only when set before PyTorch is imported.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+
+@cli("train")
+def main(cfg: DictConfig) -> None:
+    """Train from the beginning, or go on with a run that was interrupted.
+
+    Raises:
+        UserError: anything in the settings, the data or a checkpoint that cannot work, before training begins.
+    """
+    from hydra.core.hydra_config import HydraConfig
+
+    begun = time.perf_counter()
+    config = OmegaConf.to_container(cfg, resolve=True)
+    assert isinstance(config, dict)
+    fresh = Path(HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else config["output"])
+    train(cfg, {str(key): value for key, value in config.items()}, fresh, begun)
+
+
+def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -> Path:
+    """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
+
+    Returns:
+        The last checkpoint.
+    """
+    from accelerate import Accelerator
+    from accelerate.utils import broadcast_object_list
+
+    from mme_vla.data.dataset import collate
+    from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.finetune import apply_finetuning
+    from mme_vla.policy.tensor_files import assign_tensors, load_tensors
+    from mme_vla.training.checkpoint import check_disk
+    from mme_vla.training.console import ProgressLine
+    from mme_vla.training.data import check_frozen, prepare_data
+    from mme_vla.training.finish import finish
+    from mme_vla.training.logging import Loggers, check_logger, open_loggers
+    from mme_vla.training.loop import Trainer
+    from mme_vla.training.runs import CONFIG, open_run
+    from mme_vla.training.settings import TrainSettings
+    from mme_vla.training.start import start_from
+    from mme_vla.training.validation import Validation
+
+    settings = TrainSettings.from_dict(config["train"], config["seed"])
+    check_logger(config)
+    accelerator = Accelerator(cpu=settings.device == "cpu")
+    chosen: list[Any] = [open_run(folder, config["resume"], config)]
+    run = broadcast_object_list(chosen)[0]  # the clock is in the folder's name: the first process decides
+    if run.folder != folder:
+        with suppress(OSError):
+            folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
+    first = accelerator.is_main_process
+    line = ProgressLine(settings.steps, run.step, shown=first)
+    # A backbone whose weights are about to be replaced is not drawn first.
+    policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and not config["init_from"])
+    check_frozen(policy, config["finetune"]["freeze_vision"])
+    if run.checkpoint is None and config["init_from"]:
+        line.say(start_from(policy, config["init_from"]))
+    apply_finetuning(policy, **config["finetune"])
+    if run.checkpoint is not None:
+        assign_tensors(policy, load_tensors(run.checkpoint), str(run.checkpoint))
+        line.say(f"going on from {run.checkpoint}")
+    recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
+    policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
+    policy.to(accelerator.device)
+    with accelerator.main_process_first():
+        data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
+    check_disk(run.folder, policy, settings.keep)
+    validation = None
+    if data.val is not None and settings.val_samples:
+        batch_size = settings.batch_size // (settings.accumulate * accelerator.num_processes)
+        validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)
+    trainer = Trainer(policy, data.train, collate, validation, settings, run, config, accelerator)
+    line.say(trainer.describe())
+    loggers = open_loggers(run.folder, config, run.step) if first else Loggers([])
+    if first:
+        OmegaConf.save(cfg, run.folder / CONFIG, resolve=True)
+    try:
+        with line:
+            finished = trainer.run(line, loggers)
+        if finished and first:
+            finish(trainer, data, time.perf_counter() - begun, line, loggers)
+    finally:
+        loggers.close()
+    accelerator.end_training()
+    assert trainer.last_checkpoint is not None
+    return trainer.last_checkpoint
+
+
+def cache_command() -> str:
+    """The command that builds the vision cache of this run: the same words, but for those on resuming and output."""
+    from hydra.core.hydra_config import HydraConfig
+
+    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
+    words = [word for word in given if not word.startswith(("resume=", "output="))]
+    if "--config-dir" in sys.argv[:-1]:
+        words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
+    return shlex.join(["python", "-m", "mme_vla.data.cache", *words])
+
+
+if __name__ == "__main__":
+    main()

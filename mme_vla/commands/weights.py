@@ -1,0 +1,126 @@
+"""`python -m mme_vla.weights.convert SRC DST`: a checkpoint from one format to another.
+
+    python -m mme_vla.weights.convert lerobot/pi05_base base                         # to ours
+    python -m mme_vla.weights.convert runs/modul/79999 modul model=framesamp_modul   # a released JAX run
+    python -m mme_vla.weights.convert base for_lerobot --to lerobot
+    python -m mme_vla.weights.convert base - --to openpi --dry-run                   # the mapping alone
+
+Words after the two places are overrides of configs/policy.yaml, as for every command; a checkpoint of ours brings its
+own configuration. The full backbone is assumed unless `backbone=…` says otherwise.
+"""
+
+import argparse
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from mme_vla.errors import UserError
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
+from mme_vla.weights.foreign_statistics import read_stats
+from mme_vla.weights.load import read_as
+from mme_vla.weights.mapping_report import print_mapping
+from mme_vla.weights.source import FORMATS, Source, open_source
+from mme_vla.weights.writers import WRITERS, check_target
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line and convert; a mistake of the user's ends with a sentence and code 2."""
+    style = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser("python -m mme_vla.weights.convert", description=__doc__, formatter_class=style)
+    parser.add_argument("source", help="folder, safetensors file, Orbax run or step, or owner/name on the hub")
+    parser.add_argument("destination", help="new folder; never one that exists ('-' with --dry-run)")
+    parser.add_argument("overrides", nargs="*", help="model=…, backbone=…, memory.budget=…")
+    parser.add_argument("--to", default="ours", choices=list(FORMATS), help="format to write (default: ours)")
+    parser.add_argument("--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in")
+    parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
+    parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
+    parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
+    given = parser.parse_intermixed_args(arguments)
+    from mme_vla.config.composition import print_user_errors
+
+    with print_user_errors():
+        convert(
+            given.source, given.destination, given.overrides, to=given.to, dtype=given.dtype, asset=given.asset,
+            revision=given.revision, dry_run=given.dry_run,
+        )  # fmt: skip
+
+
+def convert(
+    source: str | Path,
+    destination: str | Path,
+    overrides: Sequence[str] = (),
+    *,
+    to: str = "ours",
+    dtype: str = "float32",
+    asset: str | None = None,
+    revision: str | None = None,
+    dry_run: bool = False,
+) -> None:
+    """Convert a checkpoint; the destination appears whole or not at all.
+
+    Raises:
+        UserError: the destination exists, the source is no checkpoint or does not fit the model, or the target format
+            has no place for the model.
+    """
+    target, kind = Path(destination).expanduser(), dtype_of(dtype)
+    if not dry_run and target.exists():
+        raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
+    found = open_source(source, revision)
+    policy = _policy(found, overrides)
+    check_target(policy, to)
+    tensors = read_as(policy, found)
+    if dry_run:
+        print_mapping(policy, found, to)
+        return
+    if to == "ours" and policy.processor is None:
+        from mme_vla.policy.build import build_processor
+
+        policy.processor = build_processor(policy.config)
+    with torch.no_grad():
+        assign_tensors(policy, tensors, str(source), torch.float32)
+    stats = read_stats(found.folder, asset)
+    if policy.processor is not None and stats is not None:
+        policy.processor.stats = stats
+    draft = target.with_name(f".{target.name}.partial")
+    shutil.rmtree(draft, ignore_errors=True)
+    draft.mkdir(parents=True)
+    try:
+        WRITERS[to](policy, draft, kind, stats)
+        draft.rename(target)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
+
+
+def _policy(found: Source, overrides: Sequence[str]) -> MMEPolicy:
+    """The policy a source belongs to, on meta, with its processor if that can be had."""
+    from mme_vla.config.composition import compose
+    from mme_vla.processing.processor import Processor
+
+    if found.format == "ours":
+        if overrides:
+            raise UserError(f"{found.folder} brings its own configuration: {' '.join(overrides)} would contradict it.")
+        config = {key: value for key, value in found.config.items() if key != "adapters"}
+        if "backbone" not in config:
+            raise UserError(f"{found.folder} holds our weights but no config.json that describes them.")
+        with torch.device("meta"):
+            policy = MMEPolicy.from_config(config)
+        policy.processor = Processor.load(found.folder)
+        return policy
+    words, said = list(overrides), found.model
+    named = [word.partition("=")[2] for word in words if word.startswith("model=")]
+    if said is not None and named and named[-1] != said:
+        raise UserError(f"{found.folder} says it is {said}, but model={named[-1]} was given.")
+    if not named:
+        words.insert(0, f"model={said or 'pi05'}")
+    if not any(word.startswith("backbone=") for word in words):
+        words.append("backbone=pi05")
+    from mme_vla.policy.build import build_from_config
+
+    return build_from_config(compose("policy", words), device="meta")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""Building a vision cache: episode by episode, each written whole or not at all."""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.data.cache.store import DTYPES, FINGERPRINT, MEMORY_VIEW, check_fingerprint, score_file, token_file
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.progress import progress
+from mme_vla.errors import UserError
+from mme_vla.memory.base import Memory
+
+Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What building would take: frames to encode, bytes on disk, seconds (one process), as measured on a few frames."""
+
+    frames: int
+    bytes: int
+    seconds: float
+
+
+def process_rank() -> tuple[int, int]:
+    """(rank, world size) as torchrun gives them, (0, 1) without it."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def clear_cache(folder: Path) -> None:
+    """Remove the files of a cache, and nothing else.
+
+    Raises:
+        UserError: the folder is not a vision cache.
+    """
+    if not folder.exists():
+        return
+    if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
+        raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.")
+    for path in [*folder.glob("episode_*.np[yz]"), *folder.glob("*.partial"), folder / FINGERPRINT]:
+        path.unlink(missing_ok=True)
+
+
+def build_cache(
+    source: EpisodeSource,
+    memory: Memory,
+    encode: Encode,
+    folder: Path,
+    expected: dict[str, Any],
+    *,
+    batch_size: int = 32,
+    shard: tuple[int, int] | None = None,
+) -> int:
+    """Encode the episodes that are still missing; return how many were written.
+
+    Stopped at any moment, it continues with the next call. Processes share the work: of the episodes, each takes those
+    whose number is its rank modulo the world size.
+
+    Raises:
+        UserError: the folder holds something else (`check_fingerprint`).
+    """
+    rank, world = process_rank() if shard is None else shard
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / FINGERPRINT).is_file():
+        if any(not path.name.endswith(".partial") for path in folder.iterdir()):
+            check_fingerprint(folder, expected)
+        _replace(folder / FINGERPRINT, json.dumps(expected, indent=1).encode())
+    check_fingerprint(folder, expected)
+    mine = range(rank, len(source), world)
+    missing = [episode for episode in mine if not token_file(folder, episode).is_file()]
+    total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
+    with progress(f"vision cache {source.name}", total, total - left, "frames") as advance:
+        for episode in missing:
+            _build_episode(source, episode, memory, encode, folder, expected["dtype"], batch_size, advance)
+    return len(missing)
+
+
+def estimate(
+    source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
+) -> Estimate:
+    """Measure a few batches of the first episode and extrapolate to the dataset."""
+    spec = memory.storage
+    kept = sum(len(spec.kept_frames(int(length))) for length in source.lengths)
+    chunk = next(_chunks(source, 0, memory, batch_size))
+    encode(chunk.kept_pictures[:1])  # the first call pays for warming up
+    started = time.perf_counter()
+    seen, bytes_per_frame = 0, 0
+    for chunk in _chunks(source, 0, memory, batch_size):
+        tokens = encode(chunk.kept_pictures)
+        bytes_per_frame = tokens[0].numel() * np.dtype(DTYPES[dtype]).itemsize
+        seen += chunk.length
+        if time.perf_counter() - started > 5:
+            break
+    seconds = (time.perf_counter() - started) / seen * int(source.lengths.sum())
+    return Estimate(kept, kept * bytes_per_frame, seconds)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A stretch of an episode: how many frames it spans, the pictures to encode, and the scores that came up."""
+
+    length: int
+    kept_pictures: np.ndarray
+    score_frames: list[int]
+    score_values: list[np.ndarray]
+
+
+def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
+    spec, length, scorer = memory.storage, int(source.lengths[episode]), memory.make_scorer()
+    kept = spec.kept_frames(length)
+    span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
+    for start in range(0, length, span):
+        stop = min(start + span, length)
+        here = kept[(kept >= start) & (kept < stop)]
+        wanted = np.arange(start, stop) if scorer is not None else here
+        if not len(wanted):
+            continue
+        pictures = source.frames(episode, wanted, MEMORY_VIEW)
+        frames, values = [], []
+        if scorer is not None:
+            for frame, picture in zip(wanted.tolist(), pictures, strict=True):
+                row = scorer(frame, picture)
+                if row is not None:
+                    frames.append(frame)
+                    values.append(np.asarray(row, np.float32))
+        yield _Chunk(stop - start, pictures[np.isin(wanted, here)], frames, values)
+
+
+def _build_episode(
+    source: EpisodeSource,
+    episode: int,
+    memory: Memory,
+    encode: Encode,
+    folder: Path,
+    dtype: str,
+    batch_size: int,
+    advance: Callable[[int], None],
+) -> None:
+    patches = memory.storage.grid**2
+    rows: list[np.ndarray] = []
+    frames: list[int] = []
+    values: list[np.ndarray] = []
+    for chunk in _chunks(source, episode, memory, batch_size):
+        frames += chunk.score_frames
+        values += chunk.score_values
+        if len(chunk.kept_pictures):
+            tokens = encode(chunk.kept_pictures)
+            if tokens.shape[:2] != (len(chunk.kept_pictures), patches):
+                raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.kept_pictures)} frames")
+            rows.append(_to_numpy(tokens, dtype))
+        advance(chunk.length)
+    if memory.storage.scorer:
+        stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
+        _save(score_file(folder, episode), np.savez, frames=np.asarray(frames, np.int64), values=stacked)
+    _save(token_file(folder, episode), np.save, np.concatenate(rows))
+
+
+def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
+    if dtype == "bfloat16":
+        return tokens.detach().to(torch.bfloat16).view(torch.uint16).cpu().numpy()
+    return tokens.detach().float().cpu().numpy()
+
+
+def _save(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> None:
+    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    with draft.open("wb") as handle:
+        writer(handle, *arrays, **named)
+        handle.flush()
+        os.fsync(handle.fileno())
+    draft.replace(path)
+
+
+def _replace(path: Path, content: bytes) -> None:
+    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    draft.write_bytes(content)
+    draft.replace(path)

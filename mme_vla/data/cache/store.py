@@ -1,0 +1,285 @@
+"""The vision cache: pooled tokens of the memory view, computed once with the frozen encoder and read memory-mapped.
+
+`python -m mme_vla.data.cache model=… data=…` builds it; under `torchrun` every process takes its share of the
+episodes. One folder holds the tokens of one dataset under one encoder and one way of pooling; what it was made of
+stands in its `fingerprint.json`, and a folder whose fingerprint is not the expected one is refused, never read and
+never replaced unless asked to.
+"""
+
+import json
+import os
+from collections import OrderedDict
+from hashlib import sha256
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+
+from mme_vla.config.devices import find_device
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.memory.base import Memory
+from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+    from mme_vla.data.cache.building import Encode
+
+FORMAT = 1  # of the files below
+PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
+MEMORY_VIEW = "image"
+FINGERPRINT = "fingerprint.json"
+COMMAND = "python -m mme_vla.data.cache model=<model> data=<data>"
+DTYPES = {"bfloat16": np.uint16, "float32": np.float32}  # bfloat16 is stored as its bits
+
+
+DAMAGED = (OSError, ValueError, EOFError, BadZipFile)  # what reading a damaged file can raise
+
+
+class CacheMissingError(UserError):
+    """There is no cache, or not all of it yet: building (on) mends it."""
+
+
+def default_cache_root() -> Path:
+    """Where caches go unless told otherwise: $MME_VLA_CACHE, else ~/.cache/mme_vla."""
+    return Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / "vision"
+
+
+def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: str = "bfloat16") -> dict[str, Any]:
+    """Everything the tokens of a cache depend on.
+
+    Args:
+        source: the dataset. spec: what a memory stores of each frame.
+        encoder: hash of the vision tower's weights (`policy.vision_fingerprint()`).
+        dtype: `bfloat16` or `float32`.
+
+    Raises:
+        UserError: another dtype.
+    """
+    if dtype not in DTYPES:
+        raise UserError(f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
+    return {
+        "format": FORMAT,
+        "encoder": encoder,
+        "preprocessing": PREPROCESSING,
+        "view": MEMORY_VIEW,
+        "dtype": dtype,
+        "storage": spec.to_dict(),
+        "dataset": {"content": source.fingerprint, "episodes": len(source), "frames": int(source.lengths.sum())},
+    }
+
+
+def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) -> Path:
+    """The folder of a cache below `root`: readable, and another one for another dataset, encoder or pooling."""
+    spec = StorageSpec(**expected["storage"])
+    scorer = f"-{spec.scorer}" if spec.scorer else ""
+    encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
+    name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}-{encoder}"
+    return root / f"{source.name}-{source.fingerprint[:8]}" / name
+
+
+def token_file(folder: Path, episode: int) -> Path:
+    """Tokens of an episode, [kept frames, patches, d]."""
+    return folder / f"episode_{episode:06d}.npy"
+
+
+def score_file(folder: Path, episode: int) -> Path:
+    """Scores of an episode, where the memory needs them; written before the tokens, so that tokens imply scores."""
+    return folder / f"episode_{episode:06d}.scores.npz"
+
+
+class VisionCache:
+    """A finished cache of one dataset: histories of its episodes, of which only the rows asked for are read."""
+
+    max_open = 64  # histories kept at hand
+
+    def __init__(self, folder: Path, source: EpisodeSource, expected: dict[str, Any], command: str = COMMAND) -> None:
+        """Open and check a cache.
+
+        Args:
+            folder: where it is (`cache_folder`). source: the dataset it belongs to.
+            expected: the fingerprint it must have. command: what to tell the user to run, without `rebuild=true`.
+
+        Raises:
+            CacheMissingError: it does not exist or is half-written.
+            UserError: it was made of something else, or a file is damaged. Both name the command that mends it.
+        """
+        check_fingerprint(folder, expected, command)
+        self.folder, self.spec = folder, StorageSpec(**expected["storage"])
+        self._lengths, self._exec_starts = source.lengths, source.exec_starts
+        self._dtype, self._command = DTYPES[expected["dtype"]], command
+        files = (token_file, score_file) if self.spec.scorer else (token_file,)
+        missing = [e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)]
+        if missing:
+            raise CacheMissingError(
+                f"The vision cache {folder} is half-written: {len(missing)} of {len(source)} episodes are missing. "
+                f"Finish it with: {command}"
+            )
+        widths = {self._tokens(episode).shape[-1] for episode in range(len(source))}
+        if len(widths) > 1:
+            raise UserError(f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true")
+        self.width = widths.pop()
+        self._histories: OrderedDict[int, CachedHistory] = OrderedDict()
+
+    def history(self, episode: int) -> CachedHistory:
+        """The stored tokens of a whole episode."""
+        if episode not in self._histories:
+            length = int(self._lengths[episode])
+            self._histories[episode] = CachedHistory(
+                self.spec,
+                self._tokens(episode),
+                self.spec.kept_frames(length),
+                length,
+                self._scores(episode),
+                int(self._exec_starts[episode]),
+            )
+            while len(self._histories) > self.max_open:
+                self._histories.popitem(last=False)
+        self._histories.move_to_end(episode)
+        return self._histories[episode]
+
+    def _tokens(self, episode: int) -> np.ndarray:
+        path = token_file(self.folder, episode)
+        rows = len(self.spec.kept_frames(int(self._lengths[episode])))
+        try:
+            tokens = np.load(path, mmap_mode="r")
+        except DAMAGED as error:
+            raise UserError(f"{path} is damaged ({error}). Rebuild the cache: {self._command} rebuild=true") from None
+        if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:
+            raise UserError(
+                f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
+                f"{self.spec.grid**2}, d] is expected. Rebuild the cache: {self._command} rebuild=true"
+            )
+        return tokens
+
+    def _scores(self, episode: int) -> FrameScores | None:
+        if not self.spec.scorer:
+            return None
+        path = score_file(self.folder, episode)
+        try:
+            with np.load(path) as stored:
+                return FrameScores(stored["frames"], stored["values"])
+        except (*DAMAGED, KeyError) as error:
+            raise UserError(f"{path} is damaged ({error}). Rebuild the cache: {self._command} rebuild=true") from None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_histories": OrderedDict()}  # a worker maps its own
+
+
+def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COMMAND) -> None:
+    """Make sure that `folder` was made of what is expected.
+
+    Raises:
+        CacheMissingError: there is nothing. UserError: it is something else; the message says what differs.
+    """
+    path = folder / FINGERPRINT
+    if not path.is_file():
+        if folder.is_dir() and any(folder.iterdir()):
+            raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another data.cache.root.")
+        raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
+    try:
+        found = json.loads(path.read_text())
+    except json.JSONDecodeError:
+        found = {}
+    differing = [key for key, value in expected.items() if found.get(key) != value]
+    if differing:
+        details = "; ".join(f"{key} is {found.get(key)!r}, expected {expected[key]!r}" for key in differing)
+        raise UserError(f"The vision cache {folder} is stale: {details}. Rebuild it with: {command} rebuild=true")
+
+
+def ensure_cache(
+    source: EpisodeSource,
+    memory: Memory,
+    encode: "Encode",
+    encoder: str,
+    *,
+    root: Path | str | None = None,
+    dtype: str = "bfloat16",
+    max_build_frames: int = 5000,
+    batch_size: int = 32,
+    command: str = COMMAND,
+) -> VisionCache:
+    """Open the cache of a dataset for this memory; build it first, or finish it, where the dataset is small.
+
+    Args:
+        source, memory: whose tokens. encode: `policy.encode_frames`. encoder: `policy.vision_fingerprint()`.
+        root: folder of all caches; None for `default_cache_root()`.
+        dtype: of the stored tokens. batch_size: frames encoded at once.
+        max_build_frames: datasets of more frames are not built here: that is worth a command of its own.
+        command: that command, for messages.
+
+    Raises:
+        UserError: the dataset is larger than that and its cache is not there, or the cache is stale or damaged.
+    """
+    from mme_vla.data.cache.building import build_cache
+
+    expected = fingerprint(source, memory.storage, encoder, dtype)
+    folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
+    try:
+        return VisionCache(folder, source, expected, command)
+    except CacheMissingError as error:
+        frames = int(source.lengths.sum())
+        if frames > max_build_frames:
+            raise UserError(
+                f"{error} (It is not built here because {source.name} has {frames} frames, more than "
+                f"data.cache.max_build_frames={max_build_frames}; add dry_run=true to see size and time first.)"
+            ) from None
+    # All of it here, also under torchrun, where training has its first process prepare the data for the others.
+    build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
+    return VisionCache(folder, source, expected, command)
+
+
+def run(cfg: "DictConfig") -> None:
+    """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line describe."""
+    from mme_vla.data.cache.building import build_cache, clear_cache, estimate
+    from mme_vla.data.sources import open_sources
+    from mme_vla.policy.build import build_from_config
+    from mme_vla.training.start import start_from
+
+    if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        raise UserError("rebuild=true removes files that other processes write: run it once without torchrun first.")
+    policy = build_from_config(cfg, fresh_backbone=cfg.init_from is None)
+    if cfg.init_from is not None:
+        print(start_from(policy, cfg.init_from))
+    device = _device(cfg.device)
+    memory = policy.to(device).memory
+    if memory is None:
+        raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
+    encoder, dtype = policy.vision_fingerprint(), str(policy.history_dtype).removeprefix("torch.")
+    root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
+    for source in open_sources(cfg.data.sources):
+        expected = fingerprint(source, memory.storage, encoder, dtype)
+        folder = cache_folder(root, source, expected)
+        if cfg.dry_run:
+            plan = estimate(source, memory, policy.encode_frames, dtype, cfg.data.cache.batch_size)
+            print(
+                f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode, "
+                f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
+            )
+            continue
+        if cfg.rebuild:
+            clear_cache(folder)
+        batch_size = cfg.data.cache.batch_size
+        written = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
+        print(f"{source.name}: {written} episodes encoded, {len(source)} in all, at {folder}")
+
+
+def _device(name: str) -> torch.device:
+    """`auto` and `cuda` mean this process's own GPU under torchrun."""
+    device = find_device(name)
+    own = int(os.environ.get("LOCAL_RANK", "0"))
+    return torch.device("cuda", own) if device.type == "cuda" and device.index is None else device
+
+
+def main() -> None:
+    """Run `python -m mme_vla.data.cache`."""
+    from mme_vla.config.composition import cli
+
+    cli("cache")(run)()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,242 @@
+"""From official HDF5 demonstrations to one LeRobot v3.0 dataset.
+
+`python -m mme_vla.data.convert input=<files or folders> output=<new folder>`
+
+Every episode first becomes a complete small dataset of its own in `<output>.partial`, which is renamed when it is
+whole; at the end all of them are merged and the result is moved to `<output>` in one step. LeRobot's own writer keeps
+files open across episodes, so a killed run would leave files that cannot be read: here it leaves finished episodes,
+and the next run continues with the missing ones.
+"""
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, find_files, list_episodes, open_episode
+from mme_vla.data.progress import progress
+from mme_vla.errors import UserError
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
+_PLAN, _PARTS, _MERGED = "plan.json", "episodes", "merged"
+
+
+@dataclass(frozen=True)
+class ConvertOptions:
+    """How pictures are stored.
+
+    images: `video`, or `png` for lossless pictures inside the tables (about ten times larger).
+    fps: frames per second; 20 is the simulator's control rate.
+    codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
+        between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
+    """
+
+    images: str = "video"
+    fps: int = 20
+    codec: str = "h264"
+    crf: int = 0
+    pix_fmt: str = "yuv444p"
+    gop: int = 8
+
+    def __post_init__(self) -> None:
+        if self.images not in ("video", "png"):
+            raise UserError(f"images={self.images!r}: expected 'video' or 'png'.")
+        if self.fps < 1 or self.gop < 1:
+            raise UserError(f"fps={self.fps} and video.gop={self.gop} must be positive.")
+
+
+def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
+    """The dataset's columns, under the names of the released LeRobot datasets."""
+    joints = [*(f"joint{i}" for i in range(1, 8)), "gripper"]
+    kind = "video" if options.images == "video" else "image"
+    view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
+    return {
+        "image": dict(view),
+        "wrist_image": dict(view),
+        "state": {"dtype": "float32", "shape": (8,), "names": joints},
+        "actions": {"dtype": "float32", "shape": (8,), "names": joints},
+        "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
+        "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
+        "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
+        **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
+    }
+
+
+def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOptions | None = None) -> int:
+    """Convert these episodes, in this order, into a dataset at `output`; return how many were newly written.
+
+    A run that was interrupted is continued by calling again with the same arguments.
+
+    Raises:
+        UserError: `output` holds something else, a partial run had other episodes or options, or an episode is
+            damaged. Nothing that exists is overwritten.
+    """
+    options = options or ConvertOptions()
+    if not episodes:
+        raise UserError("There is no episode to convert.")
+    origins = [{"file": ref.file.name, "bytes": ref.file.stat().st_size, "episode": ref.index} for ref in episodes]
+    plan = {"options": asdict(options), "episodes": origins}
+    partial = output.with_name(output.name + ".partial")
+    if _finished(output, plan):
+        shutil.rmtree(partial, ignore_errors=True)
+        return 0
+    _claim(partial, plan)
+    names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
+    parts = [partial / _PARTS / name for name in names]
+    missing = [i for i, part in enumerate(parts) if not part.is_dir()]
+    with progress("convert", len(parts), len(parts) - len(missing), "episodes") as advance:
+        for i in missing:
+            _write_part(episodes[i], parts[i], options)
+            advance(1)
+    _merge(parts, partial / _MERGED, plan)
+    (partial / _MERGED).rename(output)
+    shutil.rmtree(partial)
+    return len(missing)
+
+
+def _finished(output: Path, plan: dict[str, Any]) -> bool:
+    if not output.exists() or (output.is_dir() and not any(output.iterdir())):
+        return False
+    side = output / SIDE_FILE
+    if side.is_file() and json.loads(side.read_text()).get("plan") == plan:
+        return True
+    raise UserError(
+        f"{output} exists and is not the result of this conversion (other files, episodes or options). "
+        "Choose another output, or remove that folder yourself."
+    )
+
+
+def _claim(partial: Path, plan: dict[str, Any]) -> None:
+    """Make `partial` the work folder of this plan, or recognise it as such."""
+    record = partial / _PLAN
+    if partial.exists() and any(partial.iterdir()):
+        if not record.is_file() or json.loads(record.read_text()) != plan:
+            raise UserError(
+                f"{partial} belongs to another conversion (other inputs or options). Repeat that one to finish it, "
+                "choose another output, or remove that folder yourself."
+            )
+        for leftover in (partial / "writing", partial / _MERGED):
+            shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
+        return
+    (partial / _PARTS).mkdir(parents=True, exist_ok=True)
+    draft = partial / (_PLAN + ".new")
+    draft.write_text(json.dumps(plan, indent=1))
+    draft.rename(record)
+
+
+def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
+    """Write one episode as a dataset of its own; `part` appears only when it is whole."""
+    draft = part.parent.parent / "writing"
+    shutil.rmtree(draft, ignore_errors=True)
+    with open_episode(ref) as episode:
+        _write_dataset(episode, draft, options)
+        side = {
+            "task": ref.task,
+            "source_file": ref.file.name,
+            "source_episode": ref.index,
+            "seed": episode.seed,
+            "difficulty": episode.difficulty,
+            "goals": episode.goals,
+            "length": episode.length,
+            "exec_start_idx": episode.exec_start,
+        }
+    (draft / SIDE_FILE).write_text(json.dumps(side))
+    draft.rename(part)
+
+
+def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> None:
+    from lerobot.configs import RGBEncoderConfig
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    dataset = None
+    goal = episode.goals[0]
+    for step, frame in enumerate(episode):
+        if dataset is None:
+            video = options.images == "video"
+            encoder = RGBEncoderConfig(vcodec=options.codec, crf=options.crf, pix_fmt=options.pix_fmt, g=options.gop)
+            dataset = LeRobotDataset.create(
+                repo_id=f"local/{episode.ref.task}",
+                fps=options.fps,
+                features=features(frame.front.shape, options),
+                root=root,
+                robot_type="panda",
+                use_videos=video,
+                video_backend="pyav",
+                rgb_encoder=encoder if video else None,
+                streaming_encoding=video,
+                # LeRobot drops frames when this queue is full, as a live recorder must: never let it be.
+                encoder_queue_maxsize=episode.length + 1,
+            )
+        scalars = {"is_demo": frame.is_demo, "exec_start_idx": episode.exec_start, "step_idx": step}
+        dtypes = {"is_demo": np.bool_, "exec_start_idx": np.int32, "step_idx": np.int32}
+        dataset.add_frame(
+            {
+                "image": frame.front,
+                "wrist_image": frame.wrist,
+                "state": frame.state,
+                "actions": frame.action.astype(np.float32),
+                **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
+                **frame.subgoals,
+                "task": goal,
+            }
+        )
+    assert dataset is not None  # an episode has at least one frame
+    dataset.save_episode(parallel_encoding=False)
+    dataset.finalize()
+    for path in root.glob("videos/**/*.mp4"):
+        if (count := count_frames(path)) != episode.length:
+            raise RuntimeError(f"{path} holds {count} frames instead of {episode.length}.")
+
+
+def count_frames(path: Path) -> int:
+    """Number of pictures in a video file, counted without decoding."""
+    import av
+
+    container = av.open(str(path))
+    try:
+        return sum(packet.size > 0 for packet in container.demux(video=0))
+    finally:
+        container.close()
+
+
+def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
+    from lerobot.datasets.aggregate import aggregate_datasets
+    from lerobot.utils.utils import SuppressProgressBars
+
+    sides = [json.loads((part / SIDE_FILE).read_text()) for part in parts]
+    with SuppressProgressBars():  # one bar for the merge, not one for every file it reads
+        aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
+    for video in merged.glob("videos/**/*.mp4"):
+        video.chmod(0o644)  # LeRobot joins videos in private temporary files
+    episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
+    (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
+
+
+def run(cfg: "DictConfig") -> None:
+    """Convert as configs/convert.yaml and the command line say."""
+    inputs = [cfg.input] if isinstance(cfg.input, str) else list(cfg.input)
+    episodes = list_episodes(find_files(inputs))
+    if cfg.episodes is not None:
+        episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
+    output = Path(cfg.output)
+    written = convert(episodes, output, ConvertOptions(images=cfg.images, fps=cfg.fps, **cfg.video))
+    already = len(episodes) - written
+    print(f"{output}: {len(episodes)} episodes ({written} written now, {already} already there).")
+
+
+def main() -> None:
+    """Run `python -m mme_vla.data.convert`."""
+    from mme_vla.config.composition import cli
+
+    cli("convert")(run)()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""Normalisation statistics of the training data, over the samples a policy trains on."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.progress import progress
+from mme_vla.errors import UserError
+from mme_vla.processing.actions import to_deltas
+from mme_vla.processing.normalisers import NormStats, RunningStats
+
+BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
+
+
+def compute_norm_stats(
+    sources: Sequence[EpisodeSource],
+    episodes: Sequence[np.ndarray] | None = None,
+    horizon: int = 20,
+    action_offset: int = 0,
+    seed: int = 42,
+) -> NormStats:
+    """Mean, deviation and 1 % / 99 % quantiles of states and of joint-delta action chunks.
+
+    As released: one pass over all execution steps in shuffled order, in batches of 128 of which an incomplete last one
+    is left out (unless it is the only one), every step of every chunk counted, repeated last actions included.
+
+    Args:
+        sources: the datasets.
+        episodes: which of each dataset's episodes count; None counts all.
+        horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
+        seed: of the order.
+
+    Raises:
+        UserError: fewer than two execution steps.
+    """
+    steps = _execution_steps(sources, episodes)
+    if len(steps) < 2:
+        raise UserError(f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
+    np.random.default_rng(seed).shuffle(steps)
+    batches = max(len(steps) // BATCH, 1)
+    states, actions = RunningStats(), RunningStats()
+    with progress("statistics", batches, unit="batches") as advance:
+        for i in range(batches):
+            rows = [_row(sources, step, horizon, action_offset) for step in steps[i * BATCH : (i + 1) * BATCH]]
+            state = torch.from_numpy(np.stack([row[0] for row in rows]))
+            chunk = torch.from_numpy(np.stack([row[1] for row in rows]))
+            states.update(state.numpy())
+            actions.update(to_deltas(chunk, state).numpy())
+            advance(1)
+    return NormStats(state=states.result(), actions=actions.result())
+
+
+def _execution_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None) -> np.ndarray:
+    """All (source, episode, step) of the execution phases, int32 [n, 3]."""
+    parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
+    for i, source in enumerate(sources):
+        for episode in range(len(source)) if episodes is None else episodes[i]:
+            step = np.arange(source.exec_starts[episode], source.lengths[episode], dtype=np.int32)
+            parts.append(np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1))
+    return np.concatenate(parts)
+
+
+def _row(
+    sources: Sequence[EpisodeSource], place: np.ndarray, horizon: int, offset: int
+) -> tuple[np.ndarray, np.ndarray]:
+    source, episode, step = (int(x) for x in place)
+    chunk, _ = sources[source].action_chunk(episode, step + offset, horizon)
+    return sources[source].states(episode, step, step + 1)[0], chunk

@@ -1,0 +1,182 @@
+"""One demonstration as data: every stored step of an episode, with the fields of the official files."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.envs.grounding import Grounding, project
+from mme_vla.envs.observations import AngleTrack, Include, Observer
+from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.robot.grasping import DOWNWARD_Q
+from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
+
+if TYPE_CHECKING:
+    import sapien
+
+    from mme_vla.envs.subtasks import SubTask
+    from mme_vla.envs.task import Task
+
+MAX_STEPS = 2000
+"""Control steps after which a recording is given up."""
+SEAM, AT_REST = 5e-8, 1e-5  # rad
+GRIPPER_CLOSED = 0.03
+"""Finger position below which the gripper counts as closed, metres."""
+
+
+class TooLongError(RuntimeError):
+    """A demonstration took more than `MAX_STEPS` control steps."""
+
+
+@dataclass(frozen=True)
+class RecordedStep:
+    """One stored time step; the observation was taken after the action.
+
+    obs: keys of the official files' `obs`. action: likewise. info: likewise.
+    """
+
+    obs: dict[str, Any]
+    action: dict[str, Any]
+    info: dict[str, Any]
+
+
+@dataclass
+class Recording:
+    """What became of one demonstration."""
+
+    success: bool
+    steps: int
+    """Control steps, stored or not."""
+    stored: int = 0
+    video: int = 0
+    """Stored steps of the conditioning video."""
+    error: str | None = None
+    """Why the demonstration broke off, if it did."""
+    frames: list[RecordedStep] = field(default_factory=list)
+    """Empty where a callback took the steps."""
+
+
+class Recorder:
+    """Demonstrates a task and takes down every step that is worth storing.
+
+    Steps during which the demonstrator is at a sub-task without words (`NO_RECORD`) are not stored.
+
+    Args:
+        task: created with the observation mode `none`.
+        render: take pictures; without them frames hold states, actions and plain texts only.
+        on_step: takes each stored step; by default they are collected in `Recording.frames`.
+    """
+
+    def __init__(
+        self, task: "Task", render: bool = True, on_step: Callable[[RecordedStep], None] | None = None
+    ) -> None:
+        self._task, self._render, self._on_step = task, render, on_step
+        pictures = {"include_front_depth": render, "include_wrist_depth": render}
+        poses = {"include_front_camera_extrinsic": True, "include_wrist_camera_extrinsic": True}
+        self._observer = Observer(task, Include.from_options(pictures | poses), render)
+
+    def record(self) -> Recording:
+        """Reset the task and demonstrate it once."""
+        task = self._task
+        task.reset()
+        self._observer.start()
+        self._planned = Grounding(retry=False)
+        self._online = Grounding(retry=False)  # unlike a running environment's, a file's text is made once
+        self._action_angles = AngleTrack()
+        self._roll_shift: float | None = None
+        self._waypoint: np.ndarray | None = None
+        self._in_video: bool | None = None
+        self._last_stored: str | int | None = None
+        self._shown = task.progress.shown
+        self._result = Recording(success=False, steps=0)
+        self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
+        task.observe = self._observe
+        try:
+            self._result.success = demonstrate(task, self._demonstrator)
+        except (PlanningError, TooLongError) as error:
+            self._result.error = str(error) or type(error).__name__
+        finally:
+            task.observe = None
+        return self._result
+
+    def _step(self, action: np.ndarray) -> None:
+        if self._result.steps >= MAX_STEPS:
+            raise TooLongError(f"not done after {MAX_STEPS} control steps")
+        self._action = np.asarray(action, np.float64)
+        self._task.step(np.asarray(action, np.float32))
+        self._result.steps += 1
+
+    def _note_waypoint(self, pose: "sapien.Pose", gripper: float) -> None:
+        self._enter_phase()
+        angles = AngleTrack().follow(pose.q)
+        # Straight down is a half turn either way: which one would be a matter of rounding.
+        if np.array_equal(pose.q, DOWNWARD_Q):  # as over buttons
+            angles[0] = -np.pi
+        else:
+            angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
+        self._waypoint = np.concatenate([pose.p, angles, [gripper]]).astype(np.float64)
+
+    def _observe(self, evaluated: dict[str, Any]) -> None:
+        self._observer.follow()
+        progress = self._task.progress
+        # The text was set before the evaluation moved the pointer: it follows one step later.
+        shown, self._shown = self._shown, progress.shown
+        planned = progress.demonstrated
+        self._enter_phase()
+        if planned.text == NO_RECORD:
+            return
+        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, shown))
+        self._result.stored += 1
+        self._result.video += planned.video
+        if self._on_step is None:
+            self._result.frames.append(step)
+        else:
+            self._on_step(step)
+
+    def _enter_phase(self) -> None:
+        """Forget the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
+        video = self._task.progress.demonstrated.video
+        if self._in_video is not None and video != self._in_video:
+            self._waypoint = None
+        self._in_video = video
+
+    def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
+        frame = self._observer.frame(evaluated)
+        closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
+        return frame | {"eef_state": frame["eef_state"].astype(np.float32), "is_gripper_close": closed}
+
+    def _actions(self, planned: "SubTask") -> dict[str, Any]:
+        task, action = self._task, self._action
+        pose = self._demonstrator.arm.forward(action[:7])
+        gripper = -1.0 if task.stick else float(action[7])
+        angles = self._action_angles.follow(pose.q)
+        if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
+            self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
+        angles[0] += self._roll_shift
+        shown = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
+        return {
+            "joint_action": np.append(action[:7], gripper),
+            "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
+            "waypoint_action": np.full(7, np.nan, np.float32) if self._waypoint is None else self._waypoint,
+            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in shown]}),
+        }
+
+    def _texts(self, planned: "SubTask", shown: "SubTask") -> dict[str, Any]:
+        progress = self._task.progress
+        completed = progress.succeeded
+        look = self._observer.segmentation if self._render else None
+        now = "completed" if completed else progress.planned
+        boundary, self._last_stored = now != self._last_stored, now
+        return {
+            "simple_subgoal": COMPLETED if completed else planned.text,
+            "grounded_subgoal": self._planned.update(planned, look),
+            "simple_subgoal_online": shown.text,
+            "grounded_subgoal_online": self._online.update(shown, look),
+            "is_video_demo": planned.video,
+            "is_subgoal_boundary": boundary,
+            "is_completed": completed,
+        }

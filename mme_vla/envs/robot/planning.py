@@ -1,0 +1,159 @@
+"""Motion plans for the arm: a straight screw motion of the tool, and a sampled detour for when that fails.
+
+Both give joint angles to be used as targets, one row a control step. Their timing is the fastest one that keeps every
+joint below a velocity and an acceleration limit, so the number of steps follows from the path.
+"""
+
+import logging
+
+import numpy as np
+import sapien
+import toppra
+from toppra import algorithm, constraint
+
+from mme_vla.envs.robot.kinematics import ARM_JOINTS, Arm
+from mme_vla.envs.robot.path_search import sample_path
+
+CONTROL_STEP = 0.05
+"""Seconds between two rows of a plan: the control period."""
+JOINT_STEP = 0.1
+"""Length of one step along a screw motion, in joint space (radians, Euclidean norm)."""
+MOST_STEPS = 200
+"""Steps after which a screw motion is given up: at the edge of its reach the arm would swing for ever."""
+_STALLED = 1e-4
+_NO_ROTATION = 3e-5
+_HALF_TURN = 1e-5
+# The trace of a rotation matrix within these of 3 and of -1: the angle is then below 0.0055, or within 0.0032 of pi.
+
+logging.getLogger("toppra").setLevel(logging.ERROR)
+
+
+def plan_screw(
+    arm: Arm,
+    qpos: np.ndarray,
+    target_pose: sapien.Pose,
+    velocity_limit: float = 0.9,
+    acceleration_limit: float = 0.9,
+    dt: float = CONTROL_STEP,
+) -> np.ndarray | None:
+    """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
+
+    The displacement's twist is followed by the pseudo-inverse of the Jacobian, in joint steps of norm `JOINT_STEP`.
+    Differences in orientation below 0.0055 radians are left as they are. Collisions are not examined.
+
+    Args:
+        arm: the kinematic model.
+        qpos: present joint angles, [7] or longer.
+        target_pose: of the tool centre point in the world.
+        velocity_limit: of every joint, radians per second.
+        acceleration_limit: of every joint, radians per second squared.
+        dt: seconds between two rows.
+
+    Returns:
+        Joint targets [n, 7], the first being the present angles; None where a joint limit is in the way, the motion
+        stalls at a singularity, or the displacement turns the tool by half a turn.
+    """
+    joints = np.asarray(qpos, np.float64)[:ARM_JOINTS].copy()
+    displacement = (arm.base.inv() * target_pose).to_transformation_matrix().astype(np.float64) @ np.linalg.inv(
+        arm.forward_in_base(joints).to_transformation_matrix().astype(np.float64)
+    )
+    remaining = twist_of(displacement)
+    if remaining is None:
+        return None
+    path, arrived = [joints.copy()], False
+    while not arrived:
+        jacobian = arm.jacobian(joints)
+        step = np.linalg.pinv(jacobian) @ remaining
+        length = np.linalg.norm(step)
+        if length == 0:
+            return None
+        step *= JOINT_STEP / length
+        moved = jacobian @ step
+        overshoot = np.linalg.norm(moved) / max(np.linalg.norm(remaining), np.finfo(float).tiny)
+        arrived = bool(overshoot > 1)
+        if arrived:
+            step, moved = step / overshoot, moved / overshoot
+        joints = joints + step
+        remaining = remaining - moved
+        if np.linalg.norm(moved) < _STALLED or not arm.within_limits(joints):
+            return None
+        path.append(joints)
+        if len(path) > MOST_STEPS:
+            return None
+    return time_optimal(np.array(path), velocity_limit, acceleration_limit, dt)
+
+
+def plan_free(
+    arm: Arm,
+    qpos: np.ndarray,
+    target_pose: sapien.Pose,
+    velocity_limit: float = 0.9,
+    acceleration_limit: float = 0.9,
+    dt: float = CONTROL_STEP,
+    seed: int = 0,
+) -> np.ndarray | None:
+    """Move the tool to a pose along whatever joint path sampling finds (RRT*); the fallback of `plan_screw`.
+
+    Args:
+        arm: the kinematic model.
+        qpos: present joint angles, [7] or longer.
+        target_pose: of the tool centre point in the world.
+        velocity_limit: of every joint, radians per second.
+        acceleration_limit: of every joint, radians per second squared.
+        dt: seconds between two rows.
+        seed: of the samples.
+
+    Returns:
+        Joint targets [n, 7], the first being the present angles; None where the pose is out of reach or no path was
+        found.
+    """
+    start = np.asarray(qpos, np.float64)[:ARM_JOINTS]
+    goal = arm.ik(target_pose, start)
+    path = None if goal is None else sample_path(arm, start, goal, seed)
+    return None if path is None else time_optimal(path, velocity_limit, acceleration_limit, dt)
+
+
+def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: float, dt: float) -> np.ndarray | None:
+    """The fastest passage through joint waypoints, sampled.
+
+    A cubic spline through the waypoints, which are spaced evenly in its parameter, is given constant accelerations
+    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / dt) instants from start to end.
+
+    Args:
+        path: joint waypoints [k, 7], k at least 2.
+        velocity_limit: of every joint, radians per second.
+        acceleration_limit: of every joint, radians per second squared.
+        dt: seconds.
+
+    Returns:
+        Joint targets [n, 7], or None where no passage within the limits exists.
+    """
+    joints = path.shape[1]
+    spline = toppra.SplineInterpolator(np.linspace(0, 1, len(path)), path)
+    limits = [
+        constraint.JointVelocityConstraint(np.full(joints, velocity_limit)),
+        constraint.JointAccelerationConstraint(np.full(joints, acceleration_limit)),
+    ]
+    passage = algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel").compute_trajectory()
+    if passage is None:
+        return None
+    return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / dt))))
+
+
+def twist_of(transform: np.ndarray) -> np.ndarray | None:
+    """Exponential coordinates [6] of a rigid displacement [4, 4], linear part first; None for half a turn."""
+    rotation, translation = transform[:3, :3], transform[:3, 3]
+    trace = np.trace(rotation)
+    if abs(trace - 3) <= _NO_ROTATION:
+        return np.concatenate([translation, np.zeros(3)])
+    if abs(trace + 1) <= _HALF_TURN:
+        return None
+    angle = np.arccos((trace - 1) / 2)
+    axis = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    ) / (2 * np.sin(angle))
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    # Inverse of the left Jacobian of SO(3): from the displacement's translation to the twist's linear part.
+    linear = np.eye(3) - angle / 2 * cross + (1 - angle / 2 / np.tan(angle / 2)) * cross @ cross
+    return np.concatenate([linear @ translation, angle * axis])

@@ -1,0 +1,197 @@
+"""Scripted motions of objects, keyed on the number of steps done: covering, swapping, highlighting, tracing."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import sapien
+
+from mme_vla.envs.scene.objects import COLOURS, Disc, build_highlight, build_sphere
+from mme_vla.envs.scene.things import AWAY, Thing, distance_xy
+
+if TYPE_CHECKING:
+    from mme_vla.envs.task import Task
+
+UNCOVERED_STEPS = 32
+"""The first half of the covering window: containers are away and the cubes lie open."""
+COVER_STEPS = 64
+SWAP_STEPS = 50
+BELOW_TABLE = (0.0, 0.0, -10.0)
+
+
+def smoothstep(x: float) -> float:
+    """x²(3 - 2x): from 0 to 1 with no speed at either end."""
+    return x * x * (3 - 2 * x)
+
+
+class Appear:
+    """An object is away for a number of steps, then appears at its place."""
+
+    def __init__(self, thing: Thing, until: int) -> None:
+        self.thing, self.until = thing, until
+        self.home = thing.pose
+
+    def apply(self, k: int) -> None:
+        """Move the object for the step before which `k` steps were done."""
+        if k < self.until:
+            self.thing.move_to(sapien.Pose(AWAY, self.home.q))
+        elif k == self.until:
+            self.thing.move_to(self.home)
+
+
+class Cover:
+    """Containers are away for half of a window and then stand over what lay open."""
+
+    def __init__(self, containers: Sequence[Thing]) -> None:
+        self._parts = [Appear(container, UNCOVERED_STEPS) for container in containers]
+
+    def apply(self, k: int) -> None:
+        """Move the containers for the step before which `k` steps were done."""
+        for part in self._parts:
+            part.apply(k)
+
+
+class Swap:
+    """Two objects change places on arcs around each other while all others stand still.
+
+    Args:
+        initiator: one of the two; the other is `partner`, by default the nearest one when the swap begins.
+        group: every object that takes part or is to be kept in its place.
+        start: step at which it begins; it takes `SWAP_STEPS`.
+        lane: how far the two evade each other sideways, metres.
+    """
+
+    def __init__(
+        self, initiator: Thing, group: Sequence[Thing], start: int, lane: float = 0.07, partner: Thing | None = None
+    ) -> None:
+        self.initiator, self.partner, self.start, self.lane = initiator, partner, start, lane
+        self._group = list(group)
+        self._poses: dict[Thing, sapien.Pose] = {}
+
+    @property
+    def end(self) -> int:
+        """The step at which the two have changed places."""
+        return self.start + SWAP_STEPS
+
+    def apply(self, k: int) -> None:
+        """Move the objects for the step before which `k` steps were done."""
+        if not self.start <= k <= self.end:
+            return
+        if k == self.start:
+            self._begin()
+        assert self.partner is not None
+        a, b = self._poses[self.initiator], self._poses[self.partner]
+        alpha = smoothstep((k - self.start) / SWAP_STEPS)
+        way = b.p[:2] - a.p[:2]
+        aside = np.array([-way[1], way[0]]) / max(float(np.linalg.norm(way)), 1e-9)
+        arc = way * alpha + aside * self.lane * math.sin(math.pi * (k - self.start) / SWAP_STEPS)
+        if k == self.end:
+            arc = way
+        for thing, pose in self._poses.items():
+            if thing is self.initiator:
+                thing.move_to(sapien.Pose([*(a.p[:2] + arc), a.p[2]], blend(a.q, b.q, alpha)))
+            elif thing is self.partner:
+                thing.move_to(sapien.Pose([*(b.p[:2] - arc), b.p[2]], blend(b.q, a.q, alpha)))
+            else:
+                thing.move_to(pose)
+
+    def _begin(self) -> None:
+        self._poses = {thing: thing.pose for thing in self._group}
+        if self.partner is None:
+            origin = self.initiator.position
+            others = [thing for thing in self._group if thing is not self.initiator]
+            self.partner = min(others, key=lambda thing: distance_xy(thing.position, origin))
+
+
+def blend(a: np.ndarray, b: np.ndarray, alpha: float) -> np.ndarray:
+    """Linear mixture of two quaternions, normalised."""
+    mixed = (1 - alpha) * np.asarray(a) + alpha * np.asarray(b)
+    return mixed / np.linalg.norm(mixed)
+
+
+class Hide:
+    """Hidden objects are away during a window; at its end each lies under its container again."""
+
+    def __init__(self, hidden: Sequence[tuple[Thing, Thing]], start: int, end: int) -> None:
+        self._hidden, self._start, self._end = list(hidden), start, end
+        self._homes = [thing.pose for thing, _ in self._hidden]
+
+    def apply(self, k: int) -> None:
+        """Move the hidden objects for the step before which `k` steps were done."""
+        for (thing, container), home in zip(self._hidden, self._homes, strict=True):
+            if self._start <= k < self._end:
+                thing.move_to(sapien.Pose(AWAY, home.q))
+            elif k == self._end:
+                thing.move_to(sapien.Pose([*container.position[:2], home.p[2]], home.q))
+
+
+class Highlight:
+    """A white disc under an object from one step to another, both included."""
+
+    DEPTH = 0.01
+    """How far below the object's origin the disc lies, metres."""
+
+    def __init__(self, disc: Thing, thing: Thing, start: int, end: int) -> None:
+        self._disc, self._thing, self._start, self._end = disc, thing, start, end
+
+    def apply(self, k: int) -> None:
+        """Move the disc for the step before which `k` steps were done."""
+        if self._start <= k <= self._end:
+            below = self._thing.position - [0, 0, self.DEPTH]
+            self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
+        else:
+            self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
+
+
+def build_mark(env: "Task", name: str, radius: float, half_length: float) -> Disc:
+    """Red rings that cover a target's own, for `Mark`; metres."""
+    return build_highlight(env, name, radius, half_length, COLOURS["red"], rings=True)
+
+
+class Mark:
+    """A red disc over a target for a number of steps after it was last touched.
+
+    Args:
+        disc: what marks the target.
+        place: the origin of what is marked, [3]; the disc's centre lies `Highlight.DEPTH` below it.
+        steps: how long it stays, beside the step of the touch itself.
+    """
+
+    def __init__(self, disc: Thing, place: np.ndarray, steps: int) -> None:
+        self._disc, self._place, self._steps = disc, place - [0, 0, Highlight.DEPTH], steps
+        self._until = -1
+        self._shown = False
+        self._move(BELOW_TABLE)
+
+    def update(self, k: int, touched: bool) -> None:
+        """Show or hide the disc after step `k`."""
+        if touched:
+            self._until = k + self._steps
+        if (k <= self._until) != self._shown:
+            self._shown = not self._shown
+            self._move(self._place if self._shown else BELOW_TABLE)
+
+    def _move(self, place: Sequence[float] | np.ndarray) -> None:
+        self._disc.move_to(sapien.Pose(place, self._disc.pose.q))
+
+
+class Trace:
+    """White dots where the tip of the stick went, each for 40 steps."""
+
+    STEPS, RADIUS, HEIGHT, BELOW = 40, 0.005, 0.01, 0.1
+
+    def __init__(self, env: "Task") -> None:
+        self._env = env
+        self._dots = [build_sphere(env, f"trace_{i}", self.RADIUS) for i in range(self.STEPS)]
+
+    def restart(self) -> None:
+        """Forget every dot."""
+        for dot in self._dots:
+            dot.move_to(sapien.Pose(BELOW_TABLE))
+
+    def update(self, k: int) -> None:
+        """Draw the dot of step `k`; it takes the place of the one drawn 40 steps before."""
+        x, y, z = self._env.tcp_pose.p
+        place = (x, y, self.HEIGHT) if z < self.BELOW else BELOW_TABLE
+        self._dots[k % self.STEPS].move_to(sapien.Pose(place))

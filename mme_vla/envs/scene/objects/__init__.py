@@ -1,0 +1,52 @@
+"""The objects that scenes are made of, and how each is built."""
+
+from mme_vla.envs.scene.objects.articulated import BUTTON_BASE, PEG_COLOUR, Button, Peg, build_button, build_peg
+from mme_vla.envs.scene.objects.shapes import RGB
+from mme_vla.envs.scene.objects.solids import (
+    COLOURS,
+    HIDDEN_H,
+    WHITE,
+    Board,
+    Container,
+    Cube,
+    Disc,
+    H,
+    build_aperture_box,
+    build_board,
+    build_container,
+    build_cube,
+    build_disc,
+    build_hidden_cube,
+    build_highlight,
+    build_moving_cube,
+    build_obstacle,
+    build_sphere,
+)
+
+__all__ = [
+    "BUTTON_BASE",
+    "COLOURS",
+    "HIDDEN_H",
+    "PEG_COLOUR",
+    "RGB",
+    "WHITE",
+    "Board",
+    "Button",
+    "Container",
+    "Cube",
+    "Disc",
+    "H",
+    "Peg",
+    "build_aperture_box",
+    "build_board",
+    "build_button",
+    "build_container",
+    "build_cube",
+    "build_disc",
+    "build_hidden_cube",
+    "build_highlight",
+    "build_moving_cube",
+    "build_obstacle",
+    "build_peg",
+    "build_sphere",
+]

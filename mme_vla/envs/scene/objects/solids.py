@@ -1,0 +1,210 @@
+"""Objects without joints: cubes, targets, containers, the board with a hole, the box with an aperture, obstacles."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import sapien
+from transforms3d.euler import euler2quat
+
+from mme_vla.envs.scene.objects.shapes import BELOW_TABLE, RGB, UPRIGHT, XY, Shapes, at
+from mme_vla.envs.scene.things import Thing
+
+if TYPE_CHECKING:
+    from mme_vla.envs.task import Task
+
+H = 0.02
+"""Half the edge of a cube, metres."""
+HIDDEN_H = H / 1.2
+"""Half the edge of a cube that fits under a container."""
+COLOURS: dict[str, RGB] = {
+    "red": (1.0, 0.0, 0.0),
+    "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}
+"""Colours of cubes."""
+TARGET_COLOURS: dict[str, RGB] = {
+    "purple": (160 / 255, 32 / 255, 240 / 255),
+    "gray": (128 / 255, 128 / 255, 128 / 255),
+    "green": (34 / 255, 139 / 255, 34 / 255),
+}
+"""Colours of targets."""
+WHITE: RGB = (1.0, 1.0, 1.0)
+BROWN: RGB = (0.8, 0.6, 0.4)
+
+CONTAINER_Z = 0.052
+"""Height of a container's origin, the middle of its handle, when it stands on the table."""
+CONTAINER_INNER, CONTAINER_WALL, CONTAINER_HEIGHT, CONTAINER_LID = 2.5 * H, 0.005, 0.05, 0.004
+BOARD_SIDE, BOARD_HOLE, BOARD_HEIGHT = 0.1, 0.08, 0.05
+APERTURE_Z = 0.04
+"""Height of the middle of the box with an aperture."""
+APERTURE_COLOUR: RGB = tuple((np.array([0xFF, 0xD2, 0x89]) / 255) ** 2.2)
+
+
+class Cube(Thing):
+    """A cube of one colour.
+
+    Args:
+        name: unique in the scene.
+        entity: its actor.
+        colour: name of the colour, or RGB in 0 … 1.
+        half_size: half its edge, metres.
+    """
+
+    def __init__(self, name: str, entity: Any, colour: str | RGB, half_size: float = H) -> None:
+        super().__init__(name, entity)
+        self.colour, self.half_size = colour, half_size
+
+
+class Disc(Thing):
+    """A flat round target; its axis is the actor's x axis.
+
+    Args:
+        name: unique in the scene.
+        entity: its actor.
+        radius: metres.
+    """
+
+    def __init__(self, name: str, entity: Any, radius: float) -> None:
+        super().__init__(name, entity)
+        self.radius = radius
+
+
+class Container(Thing):
+    """A box open below, with a handle on top; its origin is the middle of the handle."""
+
+
+class Board(Thing):
+    """A low square frame on the table; things thrown into its hole cannot be seen."""
+
+
+def _rgb(colour: str | RGB) -> RGB:
+    return COLOURS[colour] if isinstance(colour, str) else colour
+
+
+def build_cube(env: "Task", name: str, colour: str | RGB, xy: XY, yaw: float = 0.0, half_size: float = H) -> Cube:
+    """A cube lying on the table."""
+    actor = Shapes(env).solid_box([half_size] * 3, _rgb(colour)).build(name, at(xy, half_size, yaw))
+    return Cube(name, actor, colour, half_size)
+
+
+def build_hidden_cube(env: "Task", name: str, colour: str, xy: XY) -> Cube:
+    """A smaller cube, as it lies under a container."""
+    return build_cube(env, name, colour, xy, half_size=HIDDEN_H)
+
+
+def build_moving_cube(env: "Task", name: str, colour: RGB, xy: XY, z: float) -> Cube:
+    """A cube that nothing can touch and that moves only when told to."""
+    actor = Shapes(env).box([H] * 3, colour).build(name, at(xy, z), kinematic=True)
+    return Cube(name, actor, colour)
+
+
+def build_disc(
+    env: "Task",
+    name: str,
+    radius: float,
+    thickness: float,
+    colour: str,
+    xy: XY,
+    z: float | None = None,
+) -> Disc:
+    """A target: five rings, of one of `TARGET_COLOURS` and white by turns, that nothing can touch.
+
+    Args:
+        env: whose scene it goes into.
+        name: unique in the scene.
+        radius: metres.
+        thickness: metres.
+        colour: key of `TARGET_COLOURS`.
+        xy: centre on the table.
+        z: height of the centre; by default the thickness.
+    """
+    pose = sapien.Pose([float(xy[0]), float(xy[1]), thickness if z is None else z], UPRIGHT)
+    rings = Shapes(env).rings(radius, thickness / 2, TARGET_COLOURS[colour])
+    return Disc(name, rings.build(name, pose, kinematic=True), radius)
+
+
+def build_highlight(
+    env: "Task", name: str, radius: float, half_length: float, colour: RGB = WHITE, rings: bool = False
+) -> Disc:
+    """A disc that marks something for a while; it waits below the table.
+
+    Args:
+        env: whose scene it goes into.
+        name: unique in the scene.
+        radius: metres.
+        half_length: half its thickness, metres.
+        colour: RGB in 0 … 1.
+        rings: alternate with white like a target.
+    """
+    shapes = Shapes(env)
+    shapes = shapes.rings(radius, half_length, colour) if rings else shapes.cylinder(radius, half_length, colour)
+    return Disc(name, shapes.build(name, sapien.Pose(BELOW_TABLE, UPRIGHT), kinematic=True), radius)
+
+
+def build_sphere(env: "Task", name: str, radius: float, colour: RGB = WHITE) -> Thing:
+    """A ball that nothing can touch; it waits below the table."""
+    return Thing(name, Shapes(env).sphere(radius, colour).build(name, sapien.Pose(BELOW_TABLE), kinematic=True))
+
+
+def build_container(env: "Task", name: str, xy: XY, yaw: float = 0.0) -> Container:
+    """A container standing on the table, opening down."""
+    wall, lid = CONTAINER_WALL / 2, CONTAINER_LID / 2
+    middle = CONTAINER_INNER / 2 + wall
+    # In the actor's own frame the opening is up: heights count downwards from the handle's middle.
+    rim = CONTAINER_Z - CONTAINER_HEIGHT / 2
+    # Walls and lid end at the middle of the wall they meet. Where a container settles depends on that and on the order.
+    shapes = Shapes(env).solid_box([H] * 3, None)
+    for side in (-1, 1):
+        shapes.solid_box([wall, middle, CONTAINER_HEIGHT / 2], None, centre=[side * middle, 0, rim])
+        shapes.solid_box([middle, wall, CONTAINER_HEIGHT / 2], None, centre=[0, side * middle, rim])
+    shapes.solid_box([middle, middle, lid], None, centre=[0, 0, lid])
+    # Turned about its own vertical, which then points down: seen from above the turn goes the other way.
+    pose = at(xy, CONTAINER_Z) * sapien.Pose(q=euler2quat(np.pi, 0, 0)) * sapien.Pose(q=euler2quat(0, 0, yaw))
+    return Container(name, shapes.build(name, pose))
+
+
+def build_board(env: "Task", xy: XY, yaw: float = 0.0, name: str = "board") -> Board:
+    """The frame with a hole; a black block hides the lower half of the hole."""
+    side, hole, height = BOARD_SIDE / 2, BOARD_HOLE / 2, BOARD_HEIGHT / 2
+    strip = (side - hole) / 2
+    shapes = Shapes(env)
+    for sign in (-1, 1):
+        shapes.solid_box([side, strip, height], BROWN, centre=[0, sign * (hole + strip), 0])
+        shapes.solid_box([strip, hole, height], BROWN, centre=[sign * (hole + strip), 0, 0])
+    shapes.box([hole, hole, height / 2], (0.0, 0.0, 0.0), centre=[0, 0, -height / 2])
+    return Board(name, shapes.build(name, at(xy, height, yaw), kinematic=True))
+
+
+def build_aperture_box(
+    env: "Task",
+    xy: XY,
+    yaw: float,
+    inner: float = 0.017,
+    outer: float = 0.04,
+    half_depth: float = 0.05,
+    name: str = "box",
+) -> Thing:
+    """A box with a square hole along its x axis, standing on the table.
+
+    Args:
+        env: whose scene it goes into.
+        xy: centre on the table.
+        yaw: radians.
+        inner: half the width of the hole, metres.
+        outer: half the width of the box, metres.
+        half_depth: half its length along the hole, metres.
+        name: unique in the scene.
+    """
+    wall = (outer - inner) / 2
+    shapes = Shapes(env)
+    for sign in (-1, 1):
+        offset = sign * (inner + wall)
+        shapes.solid_box([half_depth, wall, outer], APERTURE_COLOUR, centre=[0, offset, 0], glossy=True)
+        shapes.solid_box([half_depth, outer, wall], APERTURE_COLOUR, centre=[0, 0, offset], glossy=True)
+    return Thing(name, shapes.build(name, at(xy, APERTURE_Z, yaw), kinematic=True))
+
+
+def build_obstacle(env: "Task", name: str, xy: XY, yaw: float, colour: RGB) -> Thing:
+    """An upright block, thin along its y axis, to be circled around."""
+    half = [0.03, 0.015, 0.05]
+    return Thing(name, Shapes(env).solid_box(half, colour).build(name, at(xy, half[2], yaw), kinematic=True))

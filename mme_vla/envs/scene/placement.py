@@ -1,0 +1,227 @@
+"""Random places on the table: draws are tried until an object keeps clear of those that are there already.
+
+The tests are the official benchmark's, with their peculiarities, so that the same seed gives the same scene: an
+obstacle is the shadow of the first two axes of its bounding box, whichever these are, and what counts as the gap
+depends on what is placed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from mani_skill.utils.geometry.trimesh_utils import get_component_mesh
+from sapien import physx
+
+from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import BUTTON_BASE, Board, Button, Disc, H
+from mme_vla.envs.scene.things import Thing
+
+TRIALS = 256
+CONTAINER_HALF = 0.0275
+"""Half the width of a container as the placement counts it, metres."""
+BUTTON_CLEARANCE = 1.5 * BUTTON_BASE[0]
+VERTICAL = 1e-6
+"""An axis whose part on the table is shorter than this stands upright."""
+
+
+class SceneError(RuntimeError):
+    """A scene that cannot be laid out from its seed: an object found no place."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """A rectangle on the table along its axes.
+
+    Args:
+        centre: metres.
+        half: half its width; one number, or one per axis.
+    """
+
+    centre: tuple[float, float]
+    half: float | tuple[float, float]
+
+    def place(self, draws: Draws, margin: float) -> np.ndarray:
+        """Draw a point that keeps `margin` from the edges [2]; x is drawn first."""
+        half = self.half if isinstance(self.half, tuple) else (self.half, self.half)
+        low = [c - h + margin for c, h in zip(self.centre, half, strict=True)]
+        high = [c + h - margin for c, h in zip(self.centre, half, strict=True)]
+        return np.array([a + draws.uniform() * (b - a) for a, b in zip(low, high, strict=True)])
+
+
+@dataclass(frozen=True, eq=False)
+class Box2D:
+    """A rectangle on the table in any direction; an axis of length zero makes it a line.
+
+    Args:
+        centre: [2], metres.
+        axes: [2, 2], one direction a row.
+        half: half its width along each axis [2], metres.
+    """
+
+    centre: np.ndarray
+    axes: np.ndarray
+    half: np.ndarray
+
+    @classmethod
+    def aligned(cls, centre: Sequence[float] | np.ndarray, half: Sequence[float]) -> "Box2D":
+        """A rectangle along the table's axes."""
+        return cls(np.array(centre, float)[:2], np.eye(2), np.array(half, float))
+
+    @classmethod
+    def square(cls, centre: np.ndarray, half: float, yaw: float) -> "Box2D":
+        """A square turned by `yaw` radians."""
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return cls(centre, np.array([[cos, sin], [-sin, cos]]), np.array([half, half]))
+
+    def grown(self, gap: float) -> "Box2D":
+        """The rectangle with `gap` more on every side."""
+        return Box2D(self.centre, self.axes, self.half + gap)
+
+    def distance(self, point: np.ndarray) -> float:
+        """From a point to the nearest point of the rectangle, metres."""
+        offset = point - self.centre
+        nearest = np.clip(self.axes @ offset, -self.half, self.half) @ self.axes
+        return float(np.linalg.norm(offset - nearest))
+
+    def intersects(self, other: "Box2D") -> bool:
+        """Whether the two overlap or touch: no side of either separates them."""
+        offset = other.centre - self.centre
+        for axis in (*self.axes, *other.axes):
+            reach = self.half @ np.abs(self.axes @ axis) + other.half @ np.abs(other.axes @ axis)
+            if abs(float(offset @ axis)) > reach:
+                return False
+        return True
+
+
+type Avoid = Thing | Box2D
+
+
+def obstacle_box(thing: Thing) -> Box2D:
+    """What an object occupies: its bounding box's first two axes on the table.
+
+    The axes of a smallest bounding box come in no particular order. Where one of the first two is the vertical, the
+    obstacle is only a line.
+
+    Raises:
+        SceneError: nothing of the object can be touched.
+    """
+    bounds = _bounds(thing)
+    if bounds is None:
+        raise SceneError(f"{thing.name} has no collision shape; it cannot be an obstacle.")
+    return bounds
+
+
+def _bounds(thing: Thing) -> Box2D | None:
+    body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
+    mesh = get_component_mesh(body)
+    if mesh is None:
+        return None
+    box = mesh.bounding_box_oriented.primitive
+    centre, axes = box.transform[:2, 3], box.transform[:2, :2].T
+    length = np.linalg.norm(axes, axis=1, keepdims=True)
+    axes = np.where(length > VERTICAL, axes / np.maximum(length, VERTICAL), 0.0)
+    return Box2D(np.array(centre), axes, np.array(box.extents[:2]) / 2)
+
+
+def button_box(button: Button) -> Box2D:
+    """What a button occupies: its base and half as much around it."""
+    return Box2D.aligned(button.pose.p, (BUTTON_CLEARANCE, BUTTON_CLEARANCE))
+
+
+def board_boxes(board: Board) -> list[Box2D]:
+    """What the board with a hole occupies: its four strips, as if it were not turned."""
+    x, y = board.position[:2]
+    strips = [Box2D.aligned((x, y + side * 0.045), (0.05, 0.005)) for side in (1, -1)]
+    return strips + [Box2D.aligned((x + side * 0.045, y), (0.005, 0.04)) for side in (1, -1)]
+
+
+def draw_cube(
+    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005, yaw: bool = True, half: float = H
+) -> tuple[np.ndarray, float] | None:
+    """Draw the place and the turn of a cube; targets are no obstacles.
+
+    Args:
+        draws: the scene's random numbers.
+        region: the cube keeps inside it, as if it were not turned.
+        avoid: what it keeps clear of.
+        gap: metres.
+        yaw: draw a turn too; otherwise the cube stands along the axes.
+        half: half its edge, metres.
+
+    Returns:
+        Centre [2] and yaw in radians; None when 256 trials have failed.
+    """
+    obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=0.0)
+    for _ in range(TRIALS):
+        xy = region.place(draws, half)
+        turn = 2 * np.pi * draws.uniform() if yaw else 0.0
+        cube = Box2D.square(xy, half + gap, turn)
+        if not any(cube.intersects(obstacle) for obstacle in obstacles):
+            return xy, turn
+    return None
+
+
+def draw_disc(
+    draws: Draws, region: Region, radius: float, avoid: Sequence[Avoid] = (), gap: float = 0.005
+) -> np.ndarray | None:
+    """Draw the centre of a target [2]; None when 256 trials have failed.
+
+    Args:
+        draws: the scene's random numbers.
+        region: the target lies wholly inside it.
+        radius: metres.
+        avoid: what it keeps clear of; other targets are circles.
+        gap: metres.
+    """
+    circles = [(disc.position[:2], disc.radius) for disc in avoid if isinstance(disc, Disc)]
+    obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=0.0)
+    for _ in range(TRIALS):
+        xy = region.place(draws, radius)
+        clear = all(obstacle.distance(xy) >= radius + gap for obstacle in obstacles)
+        if clear and all(np.linalg.norm(xy - centre) >= radius + gap + other for centre, other in circles):
+            return xy
+    return None
+
+
+def draw_container(
+    draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005
+) -> tuple[np.ndarray, float] | None:
+    """Draw the place of a container and then its turn, 0 … 90°; the gap to other objects counts twice.
+
+    Args:
+        draws: the scene's random numbers.
+        region: the container lies inside it.
+        avoid: what it keeps clear of.
+        gap: metres.
+
+    Returns:
+        Centre [2] and yaw in radians; None when 256 trials have failed.
+    """
+    obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=gap)
+    for _ in range(TRIALS):
+        xy = region.place(draws, CONTAINER_HALF)
+        if all(obstacle.distance(xy) >= CONTAINER_HALF + gap for obstacle in obstacles):
+            return xy, float(np.deg2rad(90 * draws.uniform()))
+    return None
+
+
+def draw_button(
+    draws: Draws, centre: tuple[float, float], range: tuple[float, float] = (0.1, 0.4)
+) -> tuple[float, float]:
+    """Draw the centre of a button in a rectangle of the given widths, metres."""
+    x, y = (draws.uniforms(2) - 0.5).tolist()
+    return centre[0] + x * range[0], centre[1] + y * range[1]
+
+
+def _obstacles(avoid: Sequence[Avoid], grow: float) -> list[Box2D]:
+    boxes: list[Box2D] = []
+    for item in avoid:
+        if isinstance(item, Box2D):
+            boxes.append(item)
+        elif isinstance(item, Button):
+            boxes.append(button_box(item))
+        elif isinstance(item, Board):
+            boxes += board_boxes(item)
+        else:
+            boxes.append(obstacle_box(item).grown(grow))
+    return boxes

@@ -1,0 +1,298 @@
+"""Many environments at once, each in a process of its own; a policy batches whichever are ready.
+
+    with make_vec_env("PickXtimes", episodes=range(50), workers=8) as envs:
+        for worker in range(envs.workers):
+            envs.start_next(worker)
+        while envs.busy:
+            for reply in envs.recv():
+                ...  # reply.job, reply.observation, reply.info; then
+                envs.send(reply.worker, action)  # or, when reply.done: envs.start_next(reply.worker)
+
+Processes are started afresh ("spawn"), so a script that makes one keeps its work under `if __name__ == "__main__":`.
+"""
+
+import multiprocessing
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import wait
+from typing import Any
+
+import numpy as np
+
+from mme_vla.envs import metadata
+from mme_vla.envs.make import check_names, make_env, require_simulator
+from mme_vla.envs.vector import worker as protocol
+from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.errors import UserError
+
+_CLOSING_SECONDS = 5.0
+_STARTING_SECONDS = 120.0
+_NEXT_PIECE_SECONDS = 0.02
+
+
+@dataclass
+class _Worker:
+    process: Any
+    connection: Any
+    block: Any
+    job: Job | None = None
+    running: bool = False
+    """A command was given and its result is due."""
+    resetting: bool = False
+    deadline: float = float("inf")
+    arrays: list[np.ndarray] = field(default_factory=list)
+
+    @property
+    def begun(self) -> Job:
+        assert self.job is not None
+        return self.job
+
+
+class VecEnv:
+    """Worker processes that run episodes, each at its own pace.
+
+    Args:
+        jobs: the episodes, in the order `start_next` hands them out.
+        workers: number of processes.
+        factory: makes an environment from `task`, `split`, `episode` and `options`; importable by name.
+        options: further arguments of `factory`.
+        timeout: seconds after which a command without result counts as hung, and its worker is replaced.
+
+    Raises:
+        UserError: `workers` or `timeout` is not positive.
+    """
+
+    def __init__(
+        self,
+        jobs: Iterable[Job],
+        workers: int,
+        factory: Callable[..., Any] = make_env,
+        options: dict[str, Any] | None = None,
+        timeout: float = 600.0,
+    ) -> None:
+        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
+            raise UserError(f"workers is {workers!r}; expected a positive integer.")
+        if not timeout > 0:
+            raise UserError(f"timeout is {timeout!r}; expected a positive number of seconds.")
+        self.jobs = deque(jobs)
+        """Episodes that no worker has begun yet."""
+        self.timeout = timeout
+        self._factory, self._options = factory, options or {}
+        self._context = multiprocessing.get_context("spawn")
+        self._closed = False
+        self._workers: list[_Worker] = []
+        self._lost: list[Reply] = []
+        try:
+            for _ in range(workers):
+                self._workers.append(self._spawn())
+        except BaseException:
+            self.close()
+            raise
+
+    # Commands -----------------------------------------------------------------------------------------------------
+
+    @property
+    def workers(self) -> int:
+        """Number of worker processes."""
+        return len(self._workers)
+
+    @property
+    def busy(self) -> bool:
+        """Whether a reply is still to come."""
+        return bool(self._lost) or any(worker.running for worker in self._workers)
+
+    def start_next(self, worker: int) -> Job | None:
+        """Let a worker begin the next episode that nobody has begun; None when there is none left."""
+        self._idle(worker)
+        if not self.jobs:
+            return None
+        job = self.jobs.popleft()
+        self.start(worker, job)
+        return job
+
+    def start(self, worker: int, job: Job) -> None:
+        """Let a worker begin an episode; its reply carries the first observation.
+
+        Raises:
+            UserError: the environments are closed, or the worker's last reply has not been received.
+        """
+        state = self._idle(worker)
+        state.job, state.resetting = job, True
+        arguments = {"task": job.task, "split": job.split, "episode": job.episode}
+        self._command(worker, protocol.RESET, arguments)
+
+    def send(self, worker: int, action: Any) -> None:
+        """Let a worker perform an action; returns at once.
+
+        Raises:
+            UserError: the environments are closed, the worker runs no episode, or its last reply has not been received.
+        """
+        state = self._idle(worker)
+        if state.job is None:
+            raise UserError(f"Worker {worker} runs no episode; call start() or start_next() first.")
+        state.resetting = False
+        self._command(worker, protocol.STEP, action)
+
+    def recv(self, timeout: float | None = None) -> list[Reply]:
+        """Wait until at least one worker is ready, and take the replies of all that are.
+
+        A worker that died or hangs is replaced, and reported by a reply with `crashed` and the status `error`; the
+        others go on.
+
+        Args:
+            timeout: seconds to wait at most; None waits as long as commands may take.
+
+        Returns:
+            Replies in the order of the workers; empty when the time is up or nothing is under way.
+
+        Raises:
+            UserError: the environments are closed.
+        """
+        self._require_open()
+        until = time.monotonic() + (float("inf") if timeout is None else timeout)
+        while True:
+            replies, self._lost = self._lost, []
+            for index, state in enumerate(self._workers):
+                if state.running and (reply := self._poll(index, state)) is not None:
+                    replies.append(reply)
+            if replies or not self.busy or time.monotonic() >= until:
+                return sorted(replies, key=lambda reply: reply.worker)
+            self._sleep(until)
+
+    def close(self) -> None:
+        """Stop all workers; closing twice is harmless."""
+        self._closed = True
+        for state in self._workers:
+            try:
+                protocol.send(state.connection, protocol.CLOSE)
+                # A worker that waits to hand over a piece takes this for the answer, and then finds the pipe closed.
+                state.connection.close()
+            except OSError:
+                pass  # it is gone already
+        until = time.monotonic() + _CLOSING_SECONDS
+        for state in self._workers:
+            state.process.join(max(0.0, until - time.monotonic()))
+            protocol.end(state.process)
+        self._workers = []
+
+    def __enter__(self) -> "VecEnv":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # Workers ------------------------------------------------------------------------------------------------------
+
+    def _spawn(self) -> _Worker:
+        here, there = self._context.Pipe()
+        block = self._context.RawArray("B", protocol.BLOCK_BYTES)
+        process = self._context.Process(
+            target=protocol.serve, args=(there, block, self._factory, self._options), daemon=True
+        )
+        process.start()
+        there.close()
+        return _Worker(process, here, block)
+
+    def _idle(self, worker: int) -> _Worker:
+        self._require_open()
+        if not 0 <= worker < len(self._workers):
+            raise UserError(f"Unknown worker {worker}; expected 0 to {len(self._workers) - 1}.")
+        state = self._workers[worker]
+        if state.running or any(reply.worker == worker for reply in self._lost):
+            raise UserError(f"Worker {worker} is still at its last command; call recv() first.")
+        return state
+
+    def _command(self, worker: int, *message: Any) -> None:
+        state = self._workers[worker]
+        state.running, state.arrays = True, []
+        state.deadline = time.monotonic() + self.timeout + (_STARTING_SECONDS if state.resetting else 0)
+        try:
+            protocol.send(state.connection, *message)
+        except OSError:
+            self._lost.append(self._replace(worker, protocol.last_words(state.process)))
+
+    def _poll(self, index: int, state: _Worker) -> Reply | None:
+        """Take what a worker has sent; its reply if that is complete."""
+        try:
+            # A long video comes in many pieces, each sent when the last was taken: a caller that looks in rarely would
+            # hold it up, so the next one is waited for.
+            while state.connection.poll(_NEXT_PIECE_SECONDS if state.arrays else 0):
+                kind, *content = protocol.receive(state.connection)
+                if kind == protocol.PIECE:
+                    state.arrays += protocol.read(state.block, content[0])
+                    state.deadline = max(state.deadline, time.monotonic() + self.timeout)
+                    protocol.send(state.connection, protocol.GO_ON)
+                elif kind == protocol.RESULT:
+                    state.running = False
+                    return Reply.of_outcome(
+                        index, state.begun, state.resetting, protocol.restore(content[0], state.arrays)
+                    )
+                elif kind == protocol.FAILURE:
+                    state.running = False
+                    return Reply.of_failure(index, state.begun, state.resetting, *content)
+        except (EOFError, OSError):
+            return self._replace(index, protocol.last_words(state.process))
+        if time.monotonic() > state.deadline:
+            return self._replace(index, f"gave no result within {self.timeout:g} s")
+        return None
+
+    def _replace(self, index: int, what: str) -> Reply:
+        """Put a new process in a worker's place; the reply that reports the old one's end."""
+        old = self._workers[index]
+        old.connection.close()
+        protocol.end(old.process)
+        self._workers[index] = self._spawn()
+        return Reply.of_failure(index, old.begun, old.resetting, "WorkerCrash", f"the worker process {what}")
+
+    def _sleep(self, until: float) -> None:
+        running = [state for state in self._workers if state.running]
+        until = min([until, *(state.deadline for state in running)])
+        wait([state.connection for state in running], timeout=max(0.0, min(until - time.monotonic(), 60.0)))
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise UserError("The environments are closed; make new ones.")
+
+
+def make_vec_env(
+    tasks: str | Sequence[str],
+    episodes: Iterable[int] | None = None,
+    workers: int = 2,
+    split: str = "test",
+    action_space: str = "joint_angle",
+    *,
+    timeout: float = 600.0,
+    factory: Callable[..., Any] = make_env,
+    **options: Any,
+) -> VecEnv:
+    """Environments for all given episodes of all given tasks.
+
+    Args:
+        tasks: one task name or several.
+        episodes: episode numbers of every task; by default all of the split.
+        workers: number of processes; more than the machine has cores is of no use.
+        split: `train`, `val` or `test`.
+        action_space: as for `make_env`.
+        timeout: seconds after which a command without result counts as hung.
+        factory: what makes an environment, importable by name.
+        options: further arguments of `make_env`, such as `max_steps`, `render` and `include_…`.
+
+    Raises:
+        UserError: an unknown task, split, episode or action space, or a missing package.
+    """
+    names = [tasks] if isinstance(tasks, str) else list(tasks)
+    if not names:
+        raise UserError("No task given; expected a task name or several.")
+    numbers = None if episodes is None else list(episodes)
+    jobs = []
+    for name in names:
+        if factory is make_env:
+            check_names(name, options.get("env", "mme_vla"), action_space, None, None)
+            if options.get("env", "mme_vla") == "mme_vla":
+                require_simulator()
+        known = metadata.episodes(name, split)
+        for number in range(len(known)) if numbers is None else numbers:
+            jobs.append(Job(name, split, metadata.episode(name, split, number).episode))
+    return VecEnv(jobs, workers, factory, {"action_space": action_space, **options}, timeout)

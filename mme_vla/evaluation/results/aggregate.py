@@ -1,0 +1,253 @@
+"""From episode records to the figures of the tables: means over runs, deviations, intervals.
+
+Nothing incomplete is averaged: a run enters a figure only if it has every episode the figure is about, and a figure
+says how many of its episodes there are.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
+from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.intervals import Interval, bootstrap, mean_std, task_interval
+from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
+from mme_vla.evaluation.results.scopes import Protocol, Scope, scopes
+from mme_vla.evaluation.suites import DIFFICULTIES, MAX_STEPS, PAPER_ORDER, task_facts
+
+USUAL_BUDGET = 512
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One number of a table, in percent.
+
+    mean, std: over the complete runs; None without one (`std` needs two). interval: see `mme_vla.evaluation.results.intervals`.
+    runs, complete: runs there are, and those that have every episode of this figure.
+    done, expected: episodes of all runs. partial: rate of the episodes that are done, if no run is complete.
+    paper: what the paper reports here.
+    """
+
+    mean: float | None
+    std: float | None
+    interval: Interval | None
+    runs: int
+    complete: int
+    done: int
+    expected: int
+    partial: float | None = None
+    paper: PaperResult | None = None
+
+
+@dataclass
+class Run:
+    """One pass over the benchmark."""
+
+    key: RunKey
+    records: dict[EpisodeKey, EpisodeRecord]
+    protocol: Protocol
+
+    @property
+    def expected(self) -> int:
+        return len(self.protocol.tasks) * self.protocol.episodes
+
+    @property
+    def complete(self) -> bool:
+        return len(self.records) == self.expected
+
+    @property
+    def outcomes(self) -> dict[str, int]:
+        return dict(count_outcomes(self.records.values()))
+
+    def successes(self, task: str) -> list[bool] | None:
+        """Outcomes of a task's episodes in order, or None if some are missing."""
+        keys = [EpisodeKey(task, episode) for episode in range(self.protocol.episodes)]
+        if any(key not in self.records for key in keys):
+            return None
+        return [self.records[key].success for key in keys]
+
+
+@dataclass
+class Method:
+    """All runs of one model, with the figures of every scope in `figures[kind][name]`."""
+
+    label: str
+    model: str
+    subgoal: str | None
+    memory_budget: int | None
+    runs: list[Run]
+    paper: PaperMethod | None
+    figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
+
+    @property
+    def average(self) -> Figure:
+        return self.figures["average"]["average"]
+
+    @property
+    def complete(self) -> bool:
+        return all(run.complete for run in self.runs)
+
+
+@dataclass
+class Results:
+    """Everything the tables and the report are made of. notes: what a reader has to know, one sentence each."""
+
+    methods: list[Method]
+    protocol: Protocol
+    notes: list[str]
+
+    def method(self, label: str) -> Method:
+        """Find a method.
+
+        Raises:
+            UserError: there is none of this label.
+        """
+        for method in self.methods:
+            if method.label == label:
+                return method
+        raise UserError(f"No results of {label!r}. {did_you_mean(label, [m.label for m in self.methods])}")
+
+
+def aggregate(
+    records: Iterable[EpisodeRecord],
+    protocol: Protocol | None = None,
+    split: str | None = None,
+    conflicts: str = "refuse",
+) -> Results:
+    """Make all figures.
+
+    Args:
+        records: of any number of runs; they are merged here. split: only these; needed if there are several.
+        conflicts: see `merge`.
+
+    Raises:
+        UserError: nothing to average, an unknown task, several splits, or records that contradict each other.
+    """
+    protocol = protocol or Protocol()
+    merged = merge(records, conflicts)
+    for task in {record.task for record in merged}:
+        task_facts(task)
+    splits = sorted({record.split for record in merged})
+    if split is None and len(splits) > 1:
+        raise UserError(f"These are results of several splits ({', '.join(splits)}): choose one with --split.")
+    chosen = [r for r in merged if split in (None, r.split)]
+    if not chosen:
+        raise UserError(f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}.")
+    inside = [r for r in chosen if protocol.expects(r.key)]
+    counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
+    if not counted:
+        raise UserError(
+            f"None of the {len(chosen)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
+        )
+    _check_environments(counted)
+    groups: dict[tuple[str, str | None, int | None], list[Run]] = {}
+    for key, members in by_run(counted).items():
+        run = Run(key, {record.key: record for record in members}, protocol)
+        groups.setdefault((key.model, key.subgoal, key.memory_budget), []).append(run)
+    methods = [_method(*group, runs, protocol) for group, runs in groups.items()]
+    return Results(methods, protocol, _notes(methods, protocol, len(chosen) - len(inside)))
+
+
+def _method(model: str, subgoal: str | None, budget: int | None, runs: list[Run], protocol: Protocol) -> Method:
+    known = paper.paper_method(model, subgoal) if budget in (None, USUAL_BUDGET) else None
+    label = model if subgoal is None else f"{model}+{subgoal}"
+    label = label if budget is None else f"{label}@{budget}"
+    runs = sorted(runs, key=lambda run: (str(run.key.checkpoint).zfill(12), run.key.model_seed))
+    method = Method(label, model, subgoal, budget, runs, known)
+    for scope in scopes(protocol):
+        reported = _reported(known, scope, protocol)
+        figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
+        method.figures.setdefault(scope.kind, {})[scope.name] = figure
+    difficulties = {key: record.difficulty for run in runs for key, record in run.records.items()}
+    whole = {task for task in protocol.tasks for run in runs if run.successes(task) is not None}
+    for level in DIFFICULTIES:
+        seen = {key.task for key, of in difficulties.items() if of == level}
+        # A task without the level is left out; one that is not whole yet may have it, and keeps the figure incomplete.
+        tasks = tuple(task for task in protocol.tasks if task in seen or task not in whole)
+        if seen:
+            figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
+            method.figures.setdefault("difficulty", {})[level] = figure
+    return method
+
+
+def _of_difficulty(level: str, difficulties: dict[EpisodeKey, str]) -> Callable[[Run, str], list[bool] | None]:
+    def pick(run: Run, task: str) -> list[bool] | None:
+        outcomes = run.successes(task)
+        if outcomes is None:
+            return None
+        return [won for e, won in enumerate(outcomes) if difficulties[EpisodeKey(task, e)] == level]
+
+    return pick
+
+
+def _figure(
+    runs: Sequence[Run],
+    tasks: tuple[str, ...],
+    protocol: Protocol,
+    pick: Callable[[Run, str], list[bool] | None],
+    reported: PaperResult | None,
+) -> Figure:
+    """A figure over whole tasks, from the runs that have all of them."""
+    per_run = [[pick(run, task) for task in tasks] for run in runs]
+    whole = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
+    done = [record for run in runs for key, record in run.records.items() if key.task in tasks]
+    counts = {
+        "runs": len(runs), "complete": len(whole), "done": len(done),
+        "expected": len(runs) * len(tasks) * protocol.episodes,
+    }  # fmt: skip
+    if not whole:
+        partial = 100 * sum(record.success for record in done) / len(done) if done else None
+        return Figure(None, None, None, **counts, partial=partial, paper=reported)
+    matrices = [np.array([run[i] for run in whole], np.float64).T for i in range(len(tasks))]  # episodes × runs
+    mean, std = mean_std([float(np.mean([matrix[:, r].mean() for matrix in matrices])) for r in range(len(whole))])
+    if len(tasks) == 1:
+        interval = task_interval(matrices[0], protocol.confidence)
+    else:
+        episodes = {task: matrix.mean(1) for task, matrix in zip(tasks, matrices, strict=True)}
+        interval = bootstrap(episodes, protocol.confidence, protocol.samples, protocol.seed)
+    percent = Interval(100 * interval.low, 100 * interval.high)
+    return Figure(100 * mean, None if std is None else 100 * std, percent, **counts, paper=reported)
+
+
+def _reported(known: PaperMethod | None, scope: Scope, protocol: Protocol) -> PaperResult | None:
+    """The paper's number, where it is about the same tasks."""
+    if known is None:
+        return None
+    if scope.kind == "task":
+        return paper.per_task(known.name)[scope.name]
+    if len(protocol.tasks) < len(PAPER_ORDER):
+        return None
+    if scope.kind == "average":
+        return paper.average(known.name)
+    return (paper.suite_mean if scope.kind == "suite" else paper.group_mean)(known.name, scope.name)
+
+
+def _check_environments(records: Sequence[EpisodeRecord]) -> None:
+    seeds: dict[EpisodeKey, EpisodeRecord] = {}
+    for record in records:
+        first = seeds.setdefault(record.key, record)
+        if (first.seed, first.difficulty) != (record.seed, record.difficulty):
+            raise UserError(
+                f"{record.task} {record.episode} has seed {first.seed} ({first.difficulty}) in {first.run}, "
+                f"but {record.seed} ({record.difficulty}) in {record.run}: these are different benchmarks."
+            )
+
+
+def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[str]:
+    notes = []
+    for method in methods:
+        for run in method.runs:
+            if not run.complete:
+                notes.append(f"Incomplete, not averaged: {run.key} has {len(run.records)} of {run.expected} episodes.")
+            errors = run.outcomes["error"]
+            if errors:
+                notes.append(f"{run.key}: {errors} episodes ended in an error and count as failures.")
+        limits = {record.max_steps for run in method.runs for record in run.records.values()}
+        if method.paper and limits != {MAX_STEPS}:
+            given = ", ".join(map(str, sorted(limits)))
+            notes.append(f"{method.label} ran with a limit of {given} steps; the paper's is {MAX_STEPS}.")
+    if outside:
+        notes.append(f"{outside} records of other tasks, or of episodes from {protocol.episodes} on, are left out.")
+    return notes

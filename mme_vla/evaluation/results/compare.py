@@ -1,0 +1,119 @@
+"""Two policies on the same episodes: how much better, and could it be chance."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeKey
+from mme_vla.evaluation.results.aggregate import Method
+from mme_vla.evaluation.results.intervals import Interval, bootstrap, holm, sign_test
+from mme_vla.evaluation.results.scopes import Protocol, scopes
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """`first` minus `second`, in percentage points, over the episodes that all runs of both have.
+
+    first_rate, second_rate, difference: means over tasks. interval: paired bootstrap over episodes.
+    wins, losses: episodes that the first, or the second, solved in a larger share of its runs; the rest are ties.
+    p: exact two-sided test on wins and losses (McNemar's where each has one run). corrected: by Holm, over all
+        comparisons made together. significant: `corrected` is below 1 − confidence.
+    suites: difference and interval of each suite.
+    """
+
+    first: str
+    second: str
+    episodes: int
+    expected: int
+    first_rate: float
+    second_rate: float
+    difference: float
+    interval: Interval
+    wins: int
+    losses: int
+    p: float
+    corrected: float
+    significant: bool
+    suites: dict[str, tuple[float, Interval]]
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        p = f"p {show_p(self.corrected)}" if self.corrected < 0.001 else f"p = {show_p(self.corrected)}"
+        if self.significant:
+            better, worse = (self.first, self.second) if self.wins > self.losses else (self.second, self.first)
+            return f"{better} is significantly better than {worse} ({p})"
+        return f"no significant difference between {self.first} and {self.second} ({p})"
+
+
+def show_p(p: float) -> str:
+    """A p value as one prints it."""
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def compare_all(pairs: Sequence[tuple[Method, Method]], protocol: Protocol) -> list[Comparison]:
+    """Compare pairs of methods, with p values corrected for their number.
+
+    Raises:
+        UserError: a pair has no episode in common, or is one method twice.
+    """
+    made = [compare(first, second, protocol) for first, second in pairs]
+    corrected = holm([comparison.p for comparison in made])
+    level = 1 - protocol.confidence
+    return [replace(c, corrected=p, significant=p < level) for c, p in zip(made, corrected, strict=True)]
+
+
+def common_episodes(first: Method, second: Method) -> set[EpisodeKey]:
+    """The episodes that every run of both methods has."""
+    return set.intersection(*(set(run.records) for method in (first, second) for run in method.runs))
+
+
+def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
+    """Compare two methods.
+
+    Raises:
+        UserError: they have no episode in common, or are one and the same.
+    """
+    if first is second:
+        raise UserError(f"{first.label} cannot be compared with itself; name two methods.")
+    rates = [_rates(method) for method in (first, second)]
+    common = [key for key in rates[0] if key in rates[1]]
+    if not common:
+        raise UserError(f"{first.label} and {second.label} have no episode in common: there is nothing to pair.")
+    by_task = {
+        task: np.array([[side[key] for side in rates] for key in common if key.task == task])  # episodes × 2
+        for task in protocol.tasks
+        if any(key.task == task for key in common)
+    }
+    means = 100 * np.mean([values.mean(0) for values in by_task.values()], axis=0)
+    gaps = {task: values[:, 0] - values[:, 1] for task, values in by_task.items()}
+    everything = np.concatenate(list(gaps.values()))
+    wins, losses = int((everything > 0).sum()), int((everything < 0).sum())
+    p = sign_test(wins, losses)
+    suites = {}
+    for scope in scopes(protocol):
+        inside = {task: gaps[task] for task in scope.tasks if task in gaps}
+        if scope.kind == "suite" and inside:
+            suites[scope.name] = (
+                100 * float(np.mean([g.mean() for g in inside.values()])),
+                _interval(inside, protocol),
+            )
+    return Comparison(
+        first.label, second.label, len(common), len(protocol.tasks) * protocol.episodes, float(means[0]),
+        float(means[1]), float(means[0] - means[1]), _interval(gaps, protocol), wins, losses, p, p,
+        p < 1 - protocol.confidence, suites,
+    )  # fmt: skip
+
+
+def _rates(method: Method) -> dict[EpisodeKey, float]:
+    """For each episode that every run has: the share of runs that solved it."""
+    common = set.intersection(*(set(run.records) for run in method.runs))
+    ordered = sorted(common)
+    return {key: float(np.mean([run.records[key].success for run in method.runs])) for key in ordered}
+
+
+def _interval(gaps: dict[str, np.ndarray], protocol: Protocol) -> Interval:
+    low, high = bootstrap(gaps, protocol.confidence, protocol.samples, protocol.seed)
+    return Interval(100 * low, 100 * high)

@@ -1,0 +1,220 @@
+"""The report's figures, as SVG text that stands in a page by itself."""
+
+import io
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mme_vla.evaluation.results import paper
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results
+from mme_vla.evaluation.suites import SUITES, TASK_FACTS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Canvas
+
+COLOURS = ("#1f6f8b", "#e07a2f", "#5a9367", "#8d5a97", "#c44536", "#7a8b99", "#b8972f", "#3d5a80")
+FAMILIES = {"none": "#7a8b99", "symbolic": "#b8972f", "perceptual": "#1f6f8b", "recurrent": "#8d5a97"}
+INK, FAINT = "#2b2d42", "#8d99ae"
+MOST_BARS = 8
+SWEPT = ("framesamp_modul", "tokendrop_modul")
+"""Models whose memory budget the paper varies."""
+_STYLE = {
+    "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 10, "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK, "axes.spines.top": False,
+    "axes.spines.right": False, "axes.grid": True, "axes.grid.axis": "y", "grid.color": "#e3e6ec",
+    "axes.axisbelow": True, "legend.frameon": False, "svg.hashsalt": "mme_vla",
+}  # fmt: skip
+
+
+def bars(results: Results, kind: str, wide: bool = False) -> str:
+    """Success of every suite, functional group or difficulty, a bar a method; black lines are the paper's numbers.
+
+    Whiskers are the confidence intervals; a method without a complete run has no bar. Beyond `MOST_BARS` methods the
+    tables and the heat map have to do.
+    """
+    having = [
+        (i, m) for i, m in enumerate(results.methods) if any(f.complete for f in m.figures.get(kind, {}).values())
+    ]
+    having = having[:MOST_BARS]
+    names = list(dict.fromkeys(name for _, method in having for name in method.figures[kind]))
+    with picture((10.4, 3.8) if wide else (5.6, 3.6)) as (canvas, (axes,)):
+        width, lines = 0.8 / max(len(having), 1), []
+        for place, (i, method) in enumerate(having):
+            shift = (place - (len(having) - 1) / 2) * width
+            figures = [(j + shift, method.figures[kind][name]) for j, name in enumerate(names)]
+            whole = [(at, f.mean, f.interval) for at, f in figures if f.mean is not None and f.interval is not None]
+            xs, heights = [at for at, *_ in whole], [mean for _, mean, _ in whole]
+            gaps = [[mean - of.low for _, mean, of in whole], [of.high - mean for _, mean, of in whole]]
+            axes.bar(xs, heights, 0.88 * width, color=_colour(i), label=method.label)
+            axes.errorbar(xs, heights, np.maximum(gaps, 0), fmt="none", ecolor=INK, elinewidth=0.9)
+            lines += [(at, f.paper.mean) for at, f in figures if f.paper is not None]
+        if lines:
+            ends = [(at - 0.46 * width, at + 0.46 * width) for at, _ in lines]
+            axes.hlines([y for _, y in lines], *zip(*ends, strict=True), color="black", lw=2, label="paper")
+        axes.set_xticks(range(len(names)), [_folded(name) for name in names])
+        axes.set_ylabel("success (%)")
+        axes.set_ylim(0, 100)
+        axes.tick_params(axis="x", length=0)
+        _legend(canvas, axes, 6 if wide else 3)
+        return svg(canvas)
+
+
+def heat_map(results: Results) -> str:
+    """Methods × tasks; under each method that the paper reports, the paper's numbers."""
+    tasks = results.protocol.tasks
+    rows: list[tuple[str, list[float | None]]] = []
+    for method in results.methods:
+        rows.append((method.label, [method.figures["task"][task].mean for task in tasks]))
+        if method.paper is not None:
+            rows.append(("paper", [paper.per_task(method.paper.name)[task].mean for task in tasks]))
+    values = np.array([[np.nan if v is None else v for v in row] for _, row in rows], float)
+    with picture((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
+        axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto")
+        for i, j in np.ndindex(values.shape):
+            known = not np.isnan(values[i, j])
+            colour = "white" if known and values[i, j] > 62 else (INK if known else FAINT)
+            text = f"{values[i, j]:.0f}" if known else "–"
+            axes.text(j, i, text, ha="center", va="center", color=colour, fontsize=8.5)
+        axes.set_xticks(range(len(tasks)), tasks, rotation=40, ha="right", rotation_mode="anchor")
+        axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+        for label, (name, _) in zip(axes.get_yticklabels(), rows, strict=True):
+            label.set_color(FAINT if name == "paper" else INK)
+        axes.grid(False)
+        axes.tick_params(length=0)
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+        for edge in range(1, len(rows)):
+            if rows[edge][0] != "paper":
+                axes.axhline(edge - 0.5, color="white", lw=3)
+        boundary = 0
+        for suite in SUITES:
+            boundary += len(results.protocol.choose("suite", suite))
+            if 0 < boundary < len(tasks) and list(tasks) == sorted(tasks, key=_suite_of):
+                axes.axvline(boundary - 0.5, color="white", lw=3)
+        return svg(canvas)
+
+
+def efficiency(results: Results, flops: dict[str, float]) -> str:
+    """Success over what a chunk costs: one's own models filled, the paper's numbers as rings.
+
+    Args:
+        flops: of a sampled chunk at full size, by model.
+    """
+    with picture((5.6, 3.9)) as (canvas, (axes,)):
+        named = set()
+        for known in paper.paper_methods().values():
+            if known.model in flops and known.subgoal != "memer":
+                x, y = flops[known.model] / 1e12, paper.average(known.name).mean
+                label = None if known.family in named else f"{_FAMILY_NAMES[known.family]} (paper)"
+                named.add(known.family)
+                axes.scatter(x, y, s=38, facecolors="none", edgecolors=FAMILIES[known.family], lw=1.3, label=label)
+        points = []
+        for i, method in enumerate(results.methods):
+            if method.model in flops and method.memory_budget is None and method.average.mean is not None:
+                x, average = flops[method.model] / 1e12, method.average
+                style = {"color": _colour(i), "ecolor": INK, "elinewidth": 0.9, "ms": 7}
+                axes.errorbar(x, method.average.mean, average.std or 0, fmt="o", **style)  # type: ignore[arg-type]
+                points.append((method.average.mean, x, i))
+        axes.set_xlabel("TFLOPs of a sampled chunk at full size (counted)")
+        axes.set_ylabel("average success (%)")
+        axes.set_ylim(bottom=0)
+        axes.margins(x=0.08)
+        axes.grid(True, axis="both", color="#e3e6ec")
+        height, least = axes.get_ylim()[1], -np.inf
+        for y, x, i in sorted(points):
+            least = max(y, least + 0.055 * height)  # labels keep clear of each other
+            place = (max(x for _, x, _ in points) + 0.14, least)
+            arrow = {"arrowstyle": "-", "color": FAINT, "lw": 0.6}
+            label = results.methods[i].label
+            axes.annotate(label, (x, y), place, fontsize=9, color=_colour(i), va="center", arrowprops=arrow)
+        _legend(canvas, axes, 2)
+        return svg(canvas)
+
+
+_FAMILY_NAMES = {"none": "no memory", "symbolic": "symbolic", "perceptual": "perceptual", "recurrent": "recurrent"}
+
+
+def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) -> str:
+    """Success over the memory budget: the paper's sweep dashed, one's own models with their intervals.
+
+    Args:
+        points: as `budget_points` gives them.
+    """
+    order = list(dict.fromkeys(method.model for method in results.methods))
+    with picture((5.6, 3.9)) as (canvas, (axes,)):
+        table = paper.paper_table("memory_budget")
+        budgets = [int(row["memory_tokens"]) for row in table]
+        for marker, model in zip("ov", SWEPT, strict=True):
+            values = [float(row[f"{model}_success"]) for row in table]
+            colour = _colour(order.index(model)) if model in points else FAINT
+            axes.plot(budgets, values, f"--{marker}", color=colour, mfc="white", ms=5, lw=1.1, label=f"{model} (paper)")
+        for model, found in points.items():
+            whole = [(b, f.mean, f.interval) for b, f in found if f.mean is not None and f.interval is not None]
+            gaps = [[mean - of.low for _, mean, of in whole], [of.high - mean for _, mean, of in whole]]
+            style = {"color": _colour(order.index(model)), "lw": 1.8, "ms": 6, "capsize": 3, "label": model}
+            axes.errorbar([b for b, *_ in whole], [mean for _, mean, _ in whole], gaps, fmt="-s", **style)  # type: ignore[arg-type]
+        axes.set_xscale("log", base=2)
+        ticks = sorted({*budgets, *(b for found in points.values() for b, _ in found)})
+        axes.set_xticks(ticks, [f"{b:,}" for b in ticks])
+        axes.minorticks_off()
+        axes.set_xlabel("memory tokens")
+        axes.set_ylabel("average success (%)")
+        axes.set_ylim(bottom=0)
+        _legend(canvas, axes, 2)
+        return svg(canvas)
+
+
+def budget_points(methods: Sequence[Method], usual: int) -> dict[str, list[tuple[int, Figure]]]:
+    """The average at each budget, ascending, of every model with a sweep, or that the paper swept; complete only."""
+    points: dict[str, list[tuple[int, Figure]]] = {}
+    for method in methods:
+        if method.average.mean is not None:
+            points.setdefault(method.model, []).append((method.memory_budget or usual, method.average))
+    return {
+        model: sorted(found, key=lambda point: point[0])
+        for model, found in points.items()
+        if len({budget for budget, _ in found}) > 1 or model in SWEPT
+    }
+
+
+@contextmanager
+def picture(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canvas, list[Axes]]]":
+    """A figure of panels under each other, in the report's style for as long as it is entered."""
+    import matplotlib
+    from matplotlib.figure import Figure as Canvas
+
+    with matplotlib.rc_context(_STYLE):  # type: ignore[arg-type]
+        canvas = Canvas(size, layout="constrained")
+        yield canvas, list(canvas.subplots(panels, squeeze=False, sharex=True)[:, 0])
+
+
+def svg(canvas: "Canvas") -> str:
+    """The figure as an element that stands in a page."""
+    out = io.StringIO()
+    canvas.savefig(out, format="svg", transparent=True, metadata={"Date": None})
+    text = out.getvalue()
+    return text[text.index("<svg") :]
+
+
+def _legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
+    handles, labels = axes.get_legend_handles_labels()
+    if handles:
+        order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))  # last, in the bars
+        canvas.legend([handles[i] for i in order], [labels[i] for i in order], loc="outside upper center",
+                      ncols=min(len(labels), columns), fontsize=9)  # fmt: skip
+
+
+def _colour(i: int) -> str:
+    return COLOURS[i % len(COLOURS)]
+
+
+def _suite_of(task: str) -> int:
+    return SUITES.index(TASK_FACTS[task].suite)
+
+
+def _folded(name: str) -> str:
+    words = name.split(" ")
+    return name if len(words) == 1 else "\n".join([words[0], " ".join(words[1:])])

@@ -1,0 +1,248 @@
+"""The result tables, and their spellings: terminal, Markdown, LaTeX, CSV."""
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from mme_vla.evaluation.results.aggregate import Figure, Method, Results
+from mme_vla.evaluation.results.compare import Comparison, show_p
+from mme_vla.evaluation.suites import PAPER_SEEDS, SUITES
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
+
+@dataclass
+class Table:
+    """A table of text. rules: rows before which a line is drawn. strong: rows in bold."""
+
+    title: str
+    columns: Sequence[str]
+    rows: list[list[str]]
+    rules: set[int] = field(default_factory=set)
+    strong: set[int] = field(default_factory=set)
+
+
+def show(figure: Figure, short: bool = False) -> str:
+    """A figure as text: mean ± deviation, or how far it is.
+
+    A mean that leaves incomplete runs out says of how many it is.
+    """
+    if figure.mean is None:
+        if short:
+            return f"incomplete ({figure.done:,} of {figure.expected:,})"
+        partial = "" if figure.partial is None else f" ({figure.partial:.1f} so far)"
+        return f"{figure.done:,} of {figure.expected:,} episodes{partial}"
+    text = f"{figure.mean:.2f}" + ("" if figure.std is None else f" ± {figure.std:.2f}")
+    return text if figure.complete == figure.runs else f"{text} ({figure.complete} of {figure.runs} runs)"
+
+
+def span(figure: Figure) -> str:
+    """A figure's confidence interval."""
+    return "" if figure.interval is None else f"[{figure.interval.low:.1f}, {figure.interval.high:.1f}]"
+
+
+def show_paper(figure: Figure) -> str:
+    """What the paper reports for a figure."""
+    if figure.paper is None:
+        return ""
+    return f"{figure.paper.mean:.2f}" + ("" if figure.paper.std is None else f" ± {figure.paper.std:.2f}")
+
+
+def overview(results: Results) -> Table:
+    """Methods × suites, as the paper's suite table."""
+    suites = [suite for suite in SUITES if results.protocol.choose("suite", suite)]
+    level = f"{100 * results.protocol.confidence:g} %"
+    columns = ["method", "runs", "episodes", *suites, "average", level, "paper"]
+    rows = []
+    for method in results.methods:
+        average = method.average
+        episodes = (
+            f"{average.done:,}" if average.done == average.expected else f"{average.done:,} of {average.expected:,}"
+        )
+        cells = [show(method.figures["suite"][suite], short=True) for suite in suites]
+        rows.append(
+            [
+                method.label,
+                str(average.runs),
+                episodes,
+                *cells,
+                show(average, short=True),
+                span(average),
+                show_paper(average),
+            ]
+        )
+    return Table("Success rate (%), mean ± sample standard deviation over runs", columns, rows)
+
+
+def detail(method: Method, results: Results) -> Table:
+    """One method: tasks by suite, suites, functional groups, difficulties, average, beside the paper's numbers."""
+    level = f"{100 * results.protocol.confidence:g} %"
+    rows: list[list[str]] = []
+    rules, strong = set(), set()
+
+    def add(name: str, figure: Figure, mark: bool = False) -> None:
+        gap = "" if figure.mean is None or figure.paper is None else f"{figure.mean - figure.paper.mean:+.2f}"
+        if mark:
+            strong.add(len(rows))
+        rows.append([name, show(figure), span(figure), show_paper(figure), gap])
+
+    for suite in SUITES:
+        tasks = results.protocol.choose("suite", suite)
+        for task in tasks:
+            add(task, method.figures["task"][task])
+        if tasks:
+            add(suite, method.figures["suite"][suite], True)
+            rules.add(len(rows))
+    for kind in ("group", "difficulty"):
+        for name, figure in method.figures.get(kind, {}).items():
+            add(name, figure)
+        rules.add(len(rows))
+    add("average", method.average, True)
+    title = f"{method.label}: {len(method.runs)} runs"
+    return Table(title, ["", "success (%)", level, "paper", "difference"], rows, rules - {len(rows)}, strong)
+
+
+def runs_table(results: Results) -> Table:
+    """Every run: how far it is, how its episodes ended, and its average."""
+    rows = []
+    for method in results.methods:
+        for run in method.runs:
+            outcomes = run.outcomes
+            rate = f"{100 * outcomes['success'] / run.expected:.2f}" if run.complete else "incomplete"
+            rows.append(
+                [
+                    method.label,
+                    str(run.key.checkpoint),
+                    str(run.key.model_seed),
+                    f"{len(run.records)} of {run.expected}",
+                ]
+                + [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
+                + [rate]
+            )
+    columns = ["method", "checkpoint", "seed", "episodes", "success", "fail", "timeout", "error", "average (%)"]
+    return Table("Runs", columns, rows)
+
+
+def comparison_table(comparisons: Sequence[Comparison]) -> Table:
+    """Differences of pairs, on their common episodes."""
+    rows = []
+    for c in comparisons:
+        paired = f"{c.episodes}" if c.episodes == c.expected else f"{c.episodes} of {c.expected}"
+        rows.append([
+            f"{c.first} − {c.second}", paired, f"{c.first_rate:.2f}", f"{c.second_rate:.2f}", f"{c.difference:+.2f}",
+            f"[{c.interval.low:+.1f}, {c.interval.high:+.1f}]", f"{c.wins} : {c.losses}", show_p(c.corrected),
+            "yes" if c.significant else "no",
+        ])  # fmt: skip
+    columns = ["pair", "episodes", "first", "second", "difference", "interval", "better : worse", "p", "significant"]
+    return Table("Paired comparison, percentage points", columns, rows)
+
+
+def leaderboard(method: Method, results: Results) -> list[Table]:
+    """The leaderboard's format: for each checkpoint, tasks × model seeds, and their average.
+
+    Cells of a run that lacks episodes of a task say how many there are, and have no average.
+    """
+    tables = []
+    for checkpoint in dict.fromkeys(run.key.checkpoint for run in method.runs):
+        runs = [run for run in method.runs if run.key.checkpoint == checkpoint]
+        order = {seed: i for i, seed in enumerate(PAPER_SEEDS)}
+        runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
+        columns = ["Task", *(f"Seed {run.key.model_seed}" for run in runs), "Average"]
+        values: list[list[float | str]] = []
+        for task in results.protocol.tasks:
+            row: list[float | str] = []
+            for run in runs:
+                outcomes = run.successes(task)
+                done = sum(key.task == task for key in run.records)
+                row.append(
+                    f"{done} of {results.protocol.episodes} episodes"
+                    if outcomes is None
+                    else 100 * sum(outcomes) / len(outcomes)
+                )
+            values.append(row)
+        whole = [[row[i] for row in values] for i in range(len(runs))]
+        values.append([_mean(column) for column in whole])
+        names = [*results.protocol.tasks, "**Average**"]
+        rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(names, values, strict=True)]
+        tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
+    return tables
+
+
+def _mean(values: Sequence[float | str]) -> float | str:
+    numbers = [value for value in values if isinstance(value, float)]
+    return sum(numbers) / len(numbers) if len(numbers) == len(values) else "incomplete"
+
+
+def _percent(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.2f}"
+
+
+def to_rich(table: Table) -> "RichTable":
+    """For the terminal."""
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    made = RichTable(title=Text(table.title), title_justify="left", title_style="bold")
+    for i, column in enumerate(table.columns):
+        made.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
+    for i, row in enumerate(table.rows):
+        if i in table.rules:
+            made.add_section()
+        made.add_row(*map(Text, row), style="bold" if i in table.strong else None)
+    return made
+
+
+def to_markdown(table: Table) -> str:
+    """A Markdown table under its title."""
+    lines = [table.columns, [":---", *["---:"] * (len(table.columns) - 1)], *table.rows]
+    body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return f"### {table.title}\n\n{body}\n"
+
+
+_LATEX = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "±": r"$\pm$", "−": "$-$",
+          "<": "$<$", ">": "$>$",
+          "π": r"$\pi$", "$": r"\$", "{": r"\{", "}": r"\}",
+          "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}  # fmt: skip
+
+
+def to_latex(table: Table) -> str:
+    """A LaTeX table (package booktabs)."""
+
+    def line(cells: Sequence[str], strong: bool = False) -> str:
+        escaped = ("".join(_LATEX.get(letter, letter) for letter in cell) for cell in cells)
+        return " & ".join(rf"\textbf{{{cell}}}" if strong and cell else cell for cell in escaped) + r" \\"
+
+    body = []
+    for i, row in enumerate(table.rows):
+        body += [r"\midrule"] * (i in table.rules) + [line(row, i in table.strong)]
+    caption = line([table.title]).removesuffix(r" \\")
+    return "\n".join([
+        r"\begin{table}", r"\centering", rf"\caption{{{caption}}}",
+        rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}",
+        r"\toprule", line(table.columns), r"\midrule", *body, r"\bottomrule", r"\end{tabular}", r"\end{table}", "",
+    ])  # fmt: skip
+
+
+CSV_COLUMNS = (
+    "method", "kind", "name", "mean", "std", "low", "high", "runs", "complete_runs", "episodes", "expected_episodes",
+    "paper_mean", "paper_std",
+)  # fmt: skip
+
+
+def to_csv(results: Results) -> str:
+    """Every figure as a row of numbers."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(CSV_COLUMNS)
+    for method in results.methods:
+        for kind, figures in method.figures.items():
+            for name, f in figures.items():
+                low, high = f.interval or (None, None)
+                reported = f.paper or (None, None)
+                numbers = [f.mean, f.std, low, high, f.runs, f.complete, f.done, f.expected, *reported]
+                cells = [f"{n:.4f}" if isinstance(n, float) else ("" if n is None else str(n)) for n in numbers]
+                writer.writerow([method.label, kind, name, *cells])
+    return out.getvalue()

@@ -1,0 +1,206 @@
+"""The environment's side of a rollout, in a worker process: executes whole chunks and hands back every frame.
+
+A worker gets a chunk at a time, so it simulates on while the policy answers others. Its frames come in the form the
+policy reads, and its report says where the time went.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mme_vla.envs.make import make_env
+from mme_vla.envs.task_names import STICK_TASKS
+from mme_vla.evaluation.rollout.film import EpisodeVideo, video_name
+
+REPORTED = (
+    "status", "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "error_message", "exception_type",
+)  # fmt: skip
+"""What is passed on of the environment's info."""
+_BLIND = np.zeros((256, 256, 3), np.uint8)
+
+Observation = dict[str, Any]
+"""`front`, `wrist`: lists of uint8 [H, W, 3]; `state`: float32 [t, 8], seven joint angles and the first finger."""
+
+
+class RenderClock:
+    """Adds up what the simulator spends on taking pictures, where its scene is within reach."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def watch(self, env: Any) -> None:
+        """Time the pictures of this environment; those of the official package cannot be told from its simulation."""
+        scene = getattr(getattr(env, "task", None), "scene", None)
+        if scene is None:
+            return
+        scene.update_render = self._timed(scene.update_render)
+        for sensor in scene.sensors.values():
+            sensor.capture, sensor.get_obs = self._timed(sensor.capture), self._timed(sensor.get_obs)
+
+    def _timed(self, call: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*args: Any, **kwargs: Any) -> Any:
+            begun = time.perf_counter()
+            try:
+                return call(*args, **kwargs)
+            finally:
+                self.seconds += time.perf_counter() - begun
+
+        return timed
+
+
+class ChunkEnv:
+    """One episode that takes chunks of joint-angle actions.
+
+    Args:
+        make: builds an environment with the benchmark's interface.
+        stick: its robot holds a stick, and takes 7 numbers instead of 8.
+        max_steps: actions after which the outcome is `timeout`, should the environment itself not say so: one more
+            than this is executed, as in the benchmark.
+        video: draws the episode as it goes.
+    """
+
+    def __init__(
+        self, make: Callable[[], Any], stick: bool = False, max_steps: int = 1300, video: EpisodeVideo | None = None
+    ) -> None:
+        self._numbers, self._max_steps, self._video = 7 if stick else 8, max_steps, video
+        self._clock = RenderClock()
+        self._simulating = self._rendered = 0.0
+        self._steps = 0
+        with self._simulation():
+            self._env = make()
+        self._clock.watch(self._env)
+
+    def reset(self) -> tuple[Observation, dict[str, Any]]:
+        """All frames of the conditioning video, the current one last, and the report."""
+        with self._simulation():
+            observation, info = self._env.reset()
+        frames = _Frames()
+        count = frames.add(observation)
+        self._draw(frames, count, demo=count - 1)
+        return frames.observation(), self._report(info)
+
+    def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Execute actions one after the other until they, or the episode, are over.
+
+        Args:
+            command: `actions` [n, 8]; `subgoal`, the text that stands in the video meanwhile.
+
+        Returns:
+            One frame an executed action, 0, terminated, truncated, and the report with `executed`.
+        """
+        frames, executed = _Frames(), 0
+        terminated = truncated = False
+        info: dict[str, Any] = {}
+        for action in np.asarray(command["actions"]):
+            with self._simulation():
+                observation, _, ended, cut, info = self._env.step(action[: self._numbers])
+            terminated, truncated = bool(ended), bool(cut)
+            if info.get("status") == "error":
+                terminated = True
+                break
+            executed += 1
+            self._steps += 1
+            self._draw(frames, frames.add(observation), caption=command.get("subgoal"))
+            if not (terminated or truncated) and self._steps > self._max_steps:
+                truncated, info = True, {**info, "status": "timeout"}
+            if terminated or truncated:
+                break
+        report = self._report(info) | {"executed": executed}
+        if terminated or truncated:
+            report |= self._finish_video(report)
+        return frames.observation(), 0.0, terminated, truncated, report
+
+    def close(self) -> None:
+        """Free the simulator; an unfinished video is removed."""
+        if self._video is not None:
+            self._video.discard()
+        self._env.close()
+
+    @contextmanager
+    def _simulation(self) -> Iterator[None]:
+        begun, rendered = time.perf_counter(), self._clock.seconds
+        try:
+            yield
+        finally:
+            pictures = self._clock.seconds - rendered
+            self._rendered += pictures
+            self._simulating += time.perf_counter() - begun - pictures
+
+    def _report(self, info: dict[str, Any]) -> dict[str, Any]:
+        report = {key: info[key] for key in REPORTED if key in info}
+        report["seconds"] = {"sim": self._simulating, "render": self._rendered}
+        self._simulating = self._rendered = 0.0
+        self._goal = str((report.get("task_goal") or [getattr(self, "_goal", "")])[0])
+        return report
+
+    def _draw(self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None) -> None:
+        if self._video is not None:
+            for index, (front, wrist) in enumerate(frames.newest(count)):
+                self._video.add(front, wrist, caption, demo=index < demo)
+
+    def _finish_video(self, report: dict[str, Any]) -> dict[str, Any]:
+        if self._video is None:
+            return {}
+        path = self._video.finish(str(report.get("status")), self._goal)
+        return {} if path is None else {"video": path.name}
+
+
+class _Frames:
+    """Collects frames in the policy's form."""
+
+    def __init__(self) -> None:
+        self._front: list[np.ndarray] = []
+        self._wrist: list[np.ndarray] = []
+        self._states: list[np.ndarray] = []
+
+    def add(self, observation: dict[str, list[Any]]) -> int:
+        """Take the benchmark's lists; how many frames they hold."""
+        joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
+        self._states += [
+            np.concatenate([np.asarray(q, np.float32)[:7], np.asarray(f, np.float32)[:1]])
+            for q, f in zip(joints, fingers, strict=True)
+        ]
+        blind = [_BLIND] * len(joints)  # of an environment that was asked not to render
+        self._front += observation.get("front_rgb_list", blind)
+        self._wrist += observation.get("wrist_rgb_list", blind)
+        return len(joints)
+
+    def newest(self, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        start = len(self._front) - count
+        return zip(self._front[start:], self._wrist[start:], strict=True)
+
+    def observation(self) -> Observation:
+        state = np.stack(self._states) if self._states else np.zeros((0, 8), np.float32)
+        return {"front": self._front, "wrist": self._wrist, "state": state}
+
+
+def make_rollout_env(
+    task: str,
+    split: str,
+    episode: int,
+    *,
+    base: Callable[..., Any] = make_env,
+    max_steps: int = 1300,
+    videos: tuple[str, str] | None = None,
+    **options: Any,
+) -> ChunkEnv:
+    """What every worker builds for an episode.
+
+    Args:
+        base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
+        videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
+    """
+    video = None
+    if videos is not None:
+        folder, kept = videos
+        video = EpisodeVideo(lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), kept)
+    return ChunkEnv(
+        lambda: base(task=task, split=split, episode=episode, max_steps=max_steps, **options),
+        stick=task in STICK_TASKS,
+        max_steps=max_steps,
+        video=video,
+    )

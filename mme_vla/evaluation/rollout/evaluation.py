@@ -1,0 +1,190 @@
+"""A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode at once."""
+
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mme_vla.envs.make import make_env
+from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import VecEnv
+from mme_vla.errors import UserError
+from mme_vla.evaluation.record_log import RecordLog, read_records
+from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
+from mme_vla.evaluation.rollout.environment import make_rollout_env
+from mme_vla.evaluation.rollout.plan import Shard, take_share
+from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
+from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.serving.session import subgoal_kind
+from mme_vla.subgoal import SubgoalPredictor
+from mme_vla.subgoal.background import BackgroundPredictor
+
+USUAL_BUDGET = 512
+VIDEOS = "videos"
+
+
+class Evaluation(NamedTuple):
+    """What came of a run: the records of this shard's episodes, old and new, and what the policy did this time."""
+
+    records: list[EpisodeRecord]
+    workload: Workload
+
+
+def evaluate(
+    policy: MMEPolicy,
+    jobs: Sequence[Job],
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    subgoals: SubgoalPredictor | None = None,
+    shard: Shard | None = None,
+    source: str | None = None,
+    base: Callable[..., Any] = make_env,
+    notes: dict[str, Any] | None = None,
+    shown: bool = True,
+) -> Evaluation:
+    """Run every episode that `output` has no result of yet.
+
+    Args:
+        policy: in eval mode, on its device, with statistics.
+        jobs: the episodes of all shards.
+        output: the run's folder; one that holds a part of the same run is gone on with.
+        facts: what the records say of the policy.
+        subgoals: who says the subgoal, where the policy reads one.
+        source: where the weights are from; part of what makes a run the same.
+        base: makes an environment with the benchmark's interface; importable by name.
+        notes: kept in `run.json` and never compared.
+
+    Raises:
+        UserError: `output` holds another run, or the environments cannot be built.
+    """
+    policy.require_processor().require_stats()
+    check_subgoals(policy, subgoals)
+    claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
+    shard = shard or Shard()
+    mine = take_share(jobs, shard)
+    with RecordLog(output / shard.file) as log:
+        done = _done(output, mine, facts)
+        missing = [job for job in mine if (job.task, job.episode) not in finished(done)]
+        kept = [record for record in done if record.outcome != "error"]
+        with RolloutProgress(len(mine), kept, shown) as progress:
+            if kept:
+                progress.say(f"{output} holds {len(kept)} of {len(mine)} episodes: going on with the others")
+            workload = _run(policy, missing, output, facts, settings, subgoals, base, log, progress)
+    return Evaluation(_done(output, mine, facts), workload)
+
+
+def _run(
+    policy: MMEPolicy,
+    jobs: list[Job],
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    subgoals: SubgoalPredictor | None,
+    base: Callable[..., Any],
+    log: RecordLog,
+    progress: RolloutProgress,
+) -> Workload:
+    if not jobs:
+        return Workload()
+    options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps}
+    if base is make_env:
+        options |= {"env": settings.env, "render": settings.render}
+    if settings.video != "none":
+        options["videos"] = (str(output / VIDEOS), settings.video)
+    workers = settings.worker_count(len(jobs))
+    with VecEnv([], workers, make_rollout_env, options, settings.timeout_s) as envs:
+        folder = output / SUBGOALS if settings.subgoal_log else None
+        rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress)
+        rollout.run(jobs)
+    return rollout.workload
+
+
+def run_settings(
+    policy: MMEPolicy,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    subgoals: SubgoalPredictor | None = None,
+    source: str | None = None,
+) -> dict[str, Any]:
+    """What decides the outcomes, as `run.json` keeps it.
+
+    How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
+    batches may change the last bits of an action.
+    """
+    kept = ("seed", "split", "env", "max_steps", "execute", "flow_steps", "render")
+    dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
+    return {
+        "model": facts.model,
+        "checkpoint": facts.checkpoint,
+        "source": _end_of(source),
+        "policy": fingerprint(dict(policy.config)),
+        "dtype": dtype,
+        "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
+        **{name: getattr(settings, name) for name in kept},
+    }
+
+
+def _predictor_facts(name: str | None, subgoals: SubgoalPredictor) -> dict[str, Any]:
+    mode = {"mode": "background"} if isinstance(subgoals, BackgroundPredictor) else {}
+    decisive = {key: value for key, value in subgoals.settings.items() if key not in INDIFFERENT}
+    decisive |= {key: _end_of(decisive[key]) for key in ("model", "adapter") if key in decisive}
+    return {**decisive, "name": name, "kind": subgoals.kind, "interval": subgoals.interval, **mode}
+
+
+def _end_of(place: str | None) -> str | None:
+    """The end of a path alone: machines that share a run may have the folder at different places."""
+    return None if place is None else "/".join(Path(place).parts[-4:])
+
+
+def check_subgoals(policy: MMEPolicy, subgoals: SubgoalPredictor | None) -> None:
+    """Refuse a predictor that says what this policy was not trained to read.
+
+    Raises:
+        UserError: the policy reads no subgoal, or another kind.
+    """
+    if subgoals is None:
+        return
+    if not policy.require_processor().prompt_format.reads_subgoal:
+        raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
+    kind = subgoal_kind(policy)
+    if kind is not None and kind != f"{subgoals.kind}_subgoal":
+        wanted = kind.removesuffix("_subgoal")
+        raise UserError(f"The policy was trained with {wanted} subgoals: set subgoal.kind={wanted}.")
+
+
+def checkpoint_label(source: str | None) -> int | str:
+    """What records call a checkpoint: its step where its name ends in one, else its name."""
+    if source is None:
+        return "untrained"
+    name = Path(source).name
+    step = re.search(r"(?:^|[_-])(\d+)$", name)
+    return int(step[1]) if step else name
+
+
+def memory_budget(policy: MMEPolicy) -> int | None:
+    """Memory tokens, where they are not the usual 512."""
+    budget = None if policy.memory is None else policy.memory.budget
+    return None if budget == USUAL_BUDGET else budget
+
+
+def default_output(facts: RunFacts) -> Path:
+    """A folder that the same command finds again: `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`."""
+    name = facts.model if facts.memory_budget is None else f"{facts.model}-{facts.memory_budget}"
+    run = f"seed{facts.model_seed}" + (f"-{facts.subgoal}" if facts.subgoal else "")
+    run += "" if facts.split == "test" else f"-{facts.split}"
+    return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
+
+
+def _done(output: Path, mine: Sequence[Job], facts: RunFacts) -> list[EpisodeRecord]:
+    """What the folder has of these episodes, whichever shard wrote it; folders below it hold other runs."""
+    checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
+    run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split)
+    wanted = {(job.task, job.episode) for job in mine}
+    found = [record for path in sorted(output.glob("episodes*.jsonl")) for record in read_records(path)]
+    return [record for record in merge(found, "first") if record.run == run and record.key in wanted]

@@ -1,0 +1,221 @@
+"""Many episodes at once: environments in worker processes, one policy that answers whoever waits in one batch.
+
+Each worker executes its chunk at its own pace. Whoever has finished one is in the policy's next batch; nobody waits
+for a slow episode, and a long conditioning video is read in pieces between batches.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from mme_vla.envs import metadata
+from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.running_episode import RunningEpisode
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.rollout.subgoal_score import EXTRA
+from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.subgoal import SubgoalPredictor
+
+GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
+
+
+class Environments(Protocol):
+    """What a rollout needs of a `VecEnv`."""
+
+    @property
+    def workers(self) -> int: ...
+    @property
+    def busy(self) -> bool: ...
+    def start(self, worker: int, job: Job) -> None: ...
+    def send(self, worker: int, action: object) -> None: ...
+    def recv(self, timeout: float | None = None) -> list[Reply]: ...
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What all records of a run have in common; the fields are those of `EpisodeRecord`."""
+
+    model: str
+    checkpoint: int | str
+    model_seed: int
+    split: str = "test"
+    max_steps: int = 1300
+    subgoal: str | None = None
+    memory_budget: int | None = None
+
+
+@dataclass
+class Workload:
+    """What the policy did, over a whole rollout."""
+
+    batches: int = 0
+    chunks: int = 0
+    policy_s: float = 0.0
+    wall_s: float = 0.0
+
+    @property
+    def mean_batch(self) -> float:
+        """Episodes to a batch."""
+        return self.chunks / max(self.batches, 1)
+
+
+@dataclass
+class Rollout:
+    """Runs episodes and records each the moment it ends.
+
+    Args:
+        policy: in eval mode, on its device.
+        envs: environments that take chunks (`make_rollout_env`).
+        facts: what the records say of the policy.
+        record: called with every record, as soon as there is one.
+        subgoals: who says the subgoal; None leaves it out of the prompt.
+        subgoal_folder: where every subgoal is written down with its picture; None keeps the scores alone.
+    """
+
+    policy: MMEPolicy
+    envs: Environments
+    facts: RunFacts
+    settings: RolloutSettings
+    record: Callable[[EpisodeRecord], None]
+    subgoals: SubgoalPredictor | None = None
+    subgoal_folder: Path | None = None
+    progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, shown=False))
+    workload: Workload = field(default_factory=Workload)
+    _waiting: list[Job] = field(default_factory=list)
+    _running: dict[int, RunningEpisode] = field(default_factory=dict)
+    _reading: list[RunningEpisode] = field(default_factory=list)
+    _ready: list[RunningEpisode] = field(default_factory=list)
+    _tries: Counter[Job] = field(default_factory=Counter)
+    _stillborn: int = 0
+
+    def run(self, jobs: list[Job]) -> None:
+        """Run these episodes.
+
+        Raises:
+            UserError: the environments cannot be built, or a policy and its subgoals do not go together.
+        """
+        begun = time.perf_counter()
+        self._waiting = list(jobs)
+        for worker in range(self.envs.workers):
+            self._start(worker)
+        while self.envs.busy or self._reading or self._ready:
+            for reply in self.envs.recv(0 if self._reading or self._ready else None):
+                self._take(reply)
+            self._turn()
+        self.workload.wall_s += time.perf_counter() - begun
+
+    def _start(self, worker: int) -> None:
+        if not self._waiting:
+            return
+        job = self._waiting.pop(0)
+        self._tries[job] += 1
+        settings, memory = self.settings, self.policy.memory
+        # Of some memories most frames are never encoded.
+        piece = settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
+        trace = None
+        if self.subgoals is not None:
+            trace = SubgoalTrace(self.subgoals.kind, self.subgoal_folder, f"{job.task}_ep{job.episode}")
+        running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace)
+        running.worker = worker
+        self._running[worker] = running
+        self.envs.start(worker, job)
+
+    def _take(self, reply: Reply) -> None:
+        """Deal with what came back from a worker."""
+        running = self._running[reply.worker]
+        running.tick(reply.info)
+        if reply.info.get("exception_type") == "UserError" and reply.crashed:
+            raise UserError(str(reply.info.get("error_message")))
+        if reply.done:
+            if not reply.crashed:
+                running.end(reply.info)
+            self._stillborn += not running.chunks
+            if self._stillborn >= GIVE_UP_AFTER:
+                raise UserError(
+                    f"{self._stillborn} environments in a row could not be started, so the run stops; the last one: "
+                    f"{reply.info.get('error_message')}"
+                )
+            self._finish(running, str(reply.info.get("status")), reply.info.get("error_message"))
+            return
+        if reply.reward is None:
+            self._stillborn = 0
+            running.begin(reply.observation, reply.info)
+        else:
+            running.go_on(reply.observation, reply.info)
+        self._reading.append(running)
+
+    def _turn(self) -> None:
+        """Short observations first, then one batch, then long videos for as long as that took; at least a piece."""
+        begun = time.perf_counter()
+        for running in [running for running in self._reading if running.pieces <= 1]:
+            self._read(running)
+        if self._ready:
+            batch = self._ready[: self.settings.max_batch]
+            del self._ready[: len(batch)]
+            self._act(batch)
+        until = 2 * time.perf_counter() - begun
+        while self._reading:
+            self._read(self._reading[0])
+            if time.perf_counter() > until:
+                break
+        self.workload.policy_s += time.perf_counter() - begun
+
+    def _read(self, running: RunningEpisode) -> None:
+        running.read()
+        if not running.pieces:
+            self._reading.remove(running)
+            self._ready.append(running)
+
+    def _act(self, batch: list[RunningEpisode]) -> None:
+        begun = time.perf_counter()
+        if self.subgoals is not None:
+            subgoals = self.subgoals.predict([running.watched for running in batch])
+            latency = time.perf_counter() - begun
+            for running, subgoal in zip(batch, subgoals, strict=True):
+                running.told(subgoal, latency)
+        chunks = self.policy.act([running.episode for running in batch], self.settings.flow_steps)
+        self.workload.batches += 1
+        self.workload.chunks += len(batch)
+        share = (time.perf_counter() - begun) / len(batch)
+        for running, chunk in zip(batch, chunks, strict=True):
+            running.thought(share)
+            actions = chunk[: self.settings.execute]
+            if not np.isfinite(actions).all():
+                self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
+                continue
+            running.chosen(actions)
+            self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal})
+
+    def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
+        """Record an episode and let its worker begin another."""
+        job = running.job
+        outcome = status if status in ("success", "fail", "timeout") else "error"
+        if outcome == "error":
+            error = error or f"the environment ended the episode with the status {status!r}"
+        spec = metadata.episode(job.task, job.split, job.episode)
+        record = EpisodeRecord(
+            **vars(self.facts), task=job.task, episode=job.episode, seed=spec.seed, difficulty=spec.difficulty,
+            outcome=outcome, steps=running.steps, seconds=running.seconds, error=error,
+            extra={
+                "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
+                "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
+                **({"video": running.video} if running.video else {}),
+                **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
+            },
+        )  # fmt: skip
+        again = outcome == "error" and retry and self._tries[job] <= self.settings.retries
+        self.record(record)
+        self.progress.episode(record, again)
+        if again:
+            self._waiting.append(job)
+        del self._running[running.worker]
+        self._start(running.worker)

@@ -1,0 +1,78 @@
+"""What a rollout can be told, checked before anything is loaded."""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, Self
+
+from mme_vla.envs.make import ENVS
+from mme_vla.envs.metadata import SPLITS
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.rollout.film import KEPT
+from mme_vla.evaluation.suites import MAX_STEPS
+
+
+@dataclass(frozen=True)
+class RolloutSettings:
+    """The protocol, and how it is run. The defaults are the paper's.
+
+    seed: of the policy's noise; it does not reach the environments.
+    execute: actions of a chunk that are executed before the policy is asked again.
+    workers: environments at a time; None: one a core, at most 16.
+    max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
+    encode_chunk: frames encoded before other episodes may act.
+    retries: how often an episode whose environment failed is tried again before the run goes on without it.
+    timeout_s: seconds after which an environment that does not answer is replaced.
+    subgoal_log: whether every subgoal is written down with its picture, where a predictor says them.
+    """
+
+    seed: int = 42
+    split: str = "test"
+    env: str = "mme_vla"
+    max_steps: int = MAX_STEPS
+    execute: int = 16
+    flow_steps: int = 10
+    workers: int | None = None
+    max_batch: int = 16
+    encode_chunk: int = 32
+    retries: int = 1
+    timeout_s: float = 600.0
+    render: bool = True
+    video: str = "none"
+    subgoal_log: bool = True
+
+    def __post_init__(self) -> None:
+        for name, value, known in (
+            ("split", self.split, SPLITS), ("env", self.env, ENVS), ("video", self.video, KEPT),
+        ):  # fmt: skip
+            if value not in known:
+                raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")
+        least = {"max_steps": 1, "execute": 1, "flow_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
+        for name, smallest in least.items():
+            self._whole(name, getattr(self, name), smallest)
+        self._whole("seed", self.seed, 0)
+        if self.workers is not None:
+            self._whole("workers", self.workers, 1)
+        if not self.timeout_s > 0:
+            raise UserError(f"timeout_s={self.timeout_s!r} must be a positive number of seconds.")
+        if self.env == "official" and not self.render:
+            raise UserError("env=official always renders: leave out render=false.")
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read the keys of a configuration that are settings; others are ignored.
+
+        Raises:
+            UserError: a value that cannot be.
+        """
+        return cls(**{field.name: config[field.name] for field in fields(cls) if field.name in config})
+
+    def worker_count(self, episodes: int) -> int:
+        """How many workers run that many episodes."""
+        wanted = min(len(os.sched_getaffinity(0)), 16) if self.workers is None else self.workers
+        return max(1, min(wanted, episodes))
+
+    @staticmethod
+    def _whole(name: str, value: Any, least: int) -> None:
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise UserError(f"{name}={value!r} must be a whole number, at least {least}.")

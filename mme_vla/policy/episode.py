@@ -1,0 +1,199 @@
+"""One running episode: all streaming state lives here, never on the policy."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.memory.history import OnlineHistory
+from mme_vla.types import VIEWS, HistoryTokens
+
+if TYPE_CHECKING:
+    from mme_vla.policy.mme import MMEPolicy
+
+
+class Episode:
+    """What the policy knows of one episode: goal, current view and state, and the history of past frames."""
+
+    def __init__(self, policy: "MMEPolicy", goal: str, seed: int = 0) -> None:
+        self._policy = policy
+        self._generator = torch.Generator().manual_seed(seed)
+        self._images: Tensor | None = None
+        self._state: Tensor | None = None
+        self._video_over = False
+        self.goal = goal
+        self.subgoal: str | None = None
+        """The current language subgoal, for policies whose prompt has one; set it before `act`."""
+        memory = policy.memory
+        self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
+        self.stream = None if memory is None else memory.start_stream()
+        """What the memory carries from one `act` to the next, where it has something to carry."""
+        self.frames_seen = 0
+        self._chunk: np.ndarray | None = None
+        self._executed = np.zeros((0, 8), np.float32)
+
+    def observe(
+        self,
+        frames: Mapping[str, np.ndarray],
+        states: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+    ) -> None:
+        """Take frames in order, each once, the current one last; the conditioning video comes first.
+
+        Args:
+            frames: `image` and `wrist_image`, each [t, H, W, 3] uint8.
+            states: [t, 8]; seven joint angles and the first finger's position.
+            is_demo: whether the frames belong to the conditioning video; one bool, or [t].
+            actions: [t, 8] absolute actions that led to these frames. By default they are the first t of the last
+                chunk, one action a frame; give them where something else was executed.
+
+        Raises:
+            UserError: a missing view, a wrong dtype or shape, or a video frame after execution has begun.
+        """
+        # Everything is checked before anything is remembered: after an error the same frames can be given again.
+        front, wrist = (self._checked_view(frames, view) for view in VIEWS)
+        states = np.asarray(states, np.float32)
+        demo = np.asarray(is_demo, bool)
+        if states.shape != (len(front), 8) or len(wrist) != len(front) or demo.shape not in ((), (len(front),)):
+            raise UserError(
+                f"observe() needs as many wrist images, 8-number states and is_demo flags as front images: got "
+                f"{len(front)} front, {len(wrist)} wrist, states of shape {states.shape} and is_demo of {demo.shape}."
+            )
+        if not np.isfinite(states).all():
+            raise UserError("observe() got states that are not finite numbers.")
+        if len(front) == 0:
+            return
+        demo, executed = self._checked_course(len(front), demo, actions)
+        images = self._policy.require_processor().images([front[-1], wrist[-1]])
+        self._take(front, demo, executed)
+        self._images, self._state = images, torch.from_numpy(states[-1].copy())
+
+    def remember(
+        self, front: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
+    ) -> None:
+        """Take frames into memory alone, for a client that sends past frames and the current view apart.
+
+        Followed by `look` at the last of them it is what `observe` does.
+
+        Args:
+            front: [t, H, W, 3] uint8, in order, each once.
+            is_demo, actions: as for `observe`.
+
+        Raises:
+            UserError: a wrong dtype or shape, or a video frame after execution has begun.
+        """
+        front = self._checked_view({VIEWS[0]: front}, VIEWS[0])
+        demo = np.asarray(is_demo, bool)
+        if demo.shape not in ((), (len(front),)):
+            raise UserError(f"is_demo must be one flag or {len(front)}, one a frame; got {demo.shape}.")
+        if len(front):
+            self._take(front, *self._checked_course(len(front), demo, actions))
+
+    def look(self, image: np.ndarray, wrist_image: np.ndarray, state: np.ndarray) -> None:
+        """Set the current view and state, adding nothing to memory.
+
+        Args:
+            image, wrist_image: [H, W, 3] uint8.
+            state: [8]; seven joint angles and the first finger's position.
+
+        Raises:
+            UserError: pictures or a state of another form.
+        """
+        state = np.asarray(state, np.float32)
+        if state.shape != (8,) or not np.isfinite(state).all():
+            raise UserError(f"look() needs a state of 8 finite numbers, got shape {state.shape}.")
+        images = self._policy.require_processor().images([image, wrist_image])
+        self._images, self._state = images, torch.from_numpy(state.copy())
+
+    def _checked_course(
+        self, count: int, demo: np.ndarray, actions: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Flags [count] of the next frames and the actions that led to the execution frames among them."""
+        demo = np.broadcast_to(demo, (count,))
+        if demo.any() and (self._video_over or (np.diff(demo.astype(int)) > 0).any()):
+            raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
+        return demo, self._executed_now(int((~demo).sum()), actions)
+
+    def _take(self, front: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
+        """Append checked frames to the history, and note what was executed."""
+        if self.history is not None:
+            wanted = self.history.wanted(len(front))
+            self.history.append(front, self._policy.encode_frames(front[wanted]))
+            if not self._video_over:
+                self.history.exec_start = self.frames_seen + int(demo.sum())
+        longest = self._policy.require_processor().prompt_format.past_actions
+        past = np.concatenate([self._executed, executed])
+        self._executed = past[max(len(past) - longest, 0) :]
+        self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
+        self._video_over = self._video_over or not bool(demo[-1])
+        self.frames_seen += len(front)
+
+    def recall(self) -> HistoryTokens:
+        """The memory's selection at the current frame, unbatched."""
+        history = self.required_history()
+        return self._policy.require_memory().recall(history, len(history) - 1)
+
+    def required_history(self) -> OnlineHistory:
+        """The history, once there is something in it.
+
+        Raises:
+            UserError: the policy has no memory, or the episode has seen no frame.
+        """
+        self._policy.require_memory()
+        self._require_observation()
+        assert self.history is not None
+        return self.history
+
+    @property
+    def images(self) -> Tensor:
+        """The current views [v, 3, s, s] uint8."""
+        self._require_observation()
+        assert self._images is not None
+        return self._images
+
+    @property
+    def state(self) -> Tensor:
+        """The current state [8]."""
+        self._require_observation()
+        assert self._state is not None
+        return self._state
+
+    @property
+    def prompt(self) -> tuple[Tensor, Tensor]:
+        """Token ids and mask of the goal, and the subgoal where the policy reads one."""
+        processor = self._policy.require_processor()
+        return processor.prompt(self.goal, subgoal=self.subgoal, state=self._state, past_actions=self._executed)
+
+    def acted(self, chunk: np.ndarray) -> None:
+        """Note the chunk [h, 8] the policy chose; the frames that follow say how much of it was executed."""
+        self._chunk = chunk
+
+    def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
+        """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
+        if actions is None:
+            return np.zeros((0, 8), np.float32) if self._chunk is None else self._chunk[:count]
+        executed = np.asarray(actions, np.float32)[max(len(actions) - count, 0) :]
+        if executed.shape != (count, 8):
+            raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
+        return executed
+
+    def draw_noise(self) -> Tensor:
+        """The next chunk's starting noise [h, a], from this episode's own generator: batching cannot change it."""
+        config = self._policy.backbone.config
+        return torch.randn(config.horizon, config.action_dim, generator=self._generator)
+
+    def _require_observation(self) -> None:
+        if self._state is None:
+            raise UserError("The episode has seen no frame yet: call observe() with the current frame before act().")
+
+    def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
+        if view not in frames:
+            raise UserError(f"observe() needs the view {view!r}; got {sorted(frames)}.")
+        array = np.asarray(frames[view])
+        if array.ndim != 4 or array.shape[-1] != 3 or array.dtype != np.uint8:
+            raise UserError(f"View {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.")
+        return array

@@ -1,0 +1,262 @@
+"""Training data of the subgoal predictors, from demonstrations.
+
+`python -m mme_vla.subgoal.build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
+
+Writes one JSON-lines file for each set (`simple.jsonl`, `grounded.jsonl`, `memer.jsonl`) in the layout of ms-swift,
+with the pictures and videos beside it; paths in the rows are relative to the output folder. An interrupted run goes on
+with the episodes that are missing, and the same input always gives the same files.
+"""
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
+from mme_vla.data.layout import SAMPLE
+from mme_vla.data.progress import progress
+from mme_vla.errors import UserError
+from mme_vla.subgoal.finetuning.labels import Labels
+from mme_vla.subgoal.finetuning.media import write_mp4, write_png
+from mme_vla.subgoal.finetuning.rows import SETS, RowOptions, episode_rows
+from mme_vla.subgoal.finetuning.swift import write_arguments
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+PLAN, PARTS = "plan.json", "parts"
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode to build from: its labels, and its front pictures at some frames, both read when asked for."""
+
+    task: str
+    number: int
+    origin: str
+    labels: Callable[[], Labels]
+    pictures: Callable[[Sequence[int]], Iterator[np.ndarray]]
+
+    @property
+    def name(self) -> str:
+        """Unique among the episodes of one build; file names begin with it."""
+        return f"{self.task}_ep{self.number}"
+
+
+def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstration]:
+    """List the episodes of an HDF5 file, a folder of them, or a LeRobot dataset (`sample`: the embedded one).
+
+    Args:
+        tasks: JSON file {"<episode index>": "<Task>"} for a LeRobot dataset that does not tell its tasks.
+
+    Raises:
+        UserError: there is nothing of the kind, or a dataset whose tasks are unknown.
+    """
+    root = SAMPLE if str(entry) == "sample" else Path(entry)
+    if (root / "meta" / "info.json").is_file():
+        return _from_lerobot(EpisodeSource(root), tasks)
+    return [
+        Demonstration(ref.task, ref.index, f"{ref.file.name}:{ref.file.stat().st_size}", *_h5_readers(ref))
+        for ref in list_episodes(find_files([root]))
+    ]
+
+
+def build(
+    episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions | None = None
+) -> dict[str, int]:
+    """Build these sets; return the number of rows of each.
+
+    Raises:
+        UserError: no episode, an unknown set, two episodes of one name, or `output` holds something else.
+    """
+    options = options or RowOptions()
+    if not episodes or not sets:
+        raise UserError("There is nothing to build: name at least one episode and one of the sets.")
+    names = [episode.name for episode in episodes]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
+    origins = {episode.name: episode.origin for episode in episodes}
+    plan = json.loads(json.dumps({"sets": list(sets), "options": asdict(options), "episodes": origins}))
+    _claim(output, plan)
+    missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
+    if not all((output / f"{name}.jsonl").is_file() for name in sets):
+        with progress("subgoal data", len(episodes), len(episodes) - len(missing), "episodes") as advance:
+            for episode in missing:
+                _build_episode(episode, output, sets, options)
+                advance(1)
+        for name in sets:
+            draft = output / f"{name}.jsonl.partial"
+            draft.write_text("".join(_part(output, name, episode).read_text() for episode in episodes))
+            draft.replace(output / f"{name}.jsonl")
+    shutil.rmtree(output / PARTS, ignore_errors=True)
+    return {name: (output / f"{name}.jsonl").read_text().count("\n") for name in sets}
+
+
+def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], options: RowOptions) -> None:
+    labels = episode.labels()
+    wanted: dict[int, list[Path]] = {}
+    for name in sets:
+        built = episode_rows(name, labels, options)
+        for image, frame in built.images.items():
+            wanted.setdefault(frame, []).append(output / image)
+        if built.video:
+            _write_once(output / built.video, lambda path: write_mp4(episode.pictures(range(labels.exec_start)), path))
+    missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(wanted.items())}
+    steps = [t for t, paths in missing.items() if paths]
+    for t, picture in zip(steps, episode.pictures(steps), strict=True):
+        for path in missing[t]:
+            _write_once(path, partial(write_png, picture))
+    for name in sets:  # the rows last: where they are, their pictures are
+        rows = episode_rows(name, labels, options).rows
+        part = _part(output, name, episode)
+        part.parent.mkdir(parents=True, exist_ok=True)
+        draft = part.with_suffix(".partial")
+        draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
+        draft.replace(part)
+
+
+def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(path)
+
+
+def _part(output: Path, name: str, episode: Demonstration) -> Path:
+    return output / PARTS / name / f"{episode.name}.jsonl"
+
+
+def _claim(output: Path, plan: dict[str, Any]) -> None:
+    """Make `output` the folder of this plan, or recognise it as such."""
+    record = output / PLAN
+    if output.exists() and any(output.iterdir()):
+        if not record.is_file() or json.loads(record.read_text()) != plan:
+            raise UserError(
+                f"{output} holds something else, or the result of other inputs, sets or options. Choose another "
+                "output, repeat that command to finish it, or remove the folder yourself."
+            )
+        return
+    output.mkdir(parents=True, exist_ok=True)
+    draft = output / f"{PLAN}.partial"
+    draft.write_text(json.dumps(plan, indent=1))
+    draft.replace(record)
+
+
+def _h5_readers(ref: EpisodeRef) -> tuple[Callable[[], Labels], Callable[[Sequence[int]], Iterator[np.ndarray]]]:
+    def labels() -> Labels:
+        with open_episode(ref) as episode:
+            texts = list(episode.subgoals())
+            return Labels(
+                ref.task,
+                ref.index,
+                episode.goals[0],
+                episode.exec_start,
+                [text["simple_subgoal"] for text in texts],
+                [text["grounded_subgoal"] for text in texts],
+                *episode.joints(),
+            )
+
+    def pictures(steps: Sequence[int]) -> Iterator[np.ndarray]:
+        with open_episode(ref) as episode:
+            for t in steps:
+                yield episode.front(t)
+
+    return labels, pictures
+
+
+def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstration]:
+    needed = ("simple_subgoal", "grounded_subgoal")
+    if lacking := [name for name in needed if name not in source.subgoal_names]:
+        raise UserError(f"{source.root} has no column {' and no '.join(lacking)}: nothing to learn subgoals from.")
+    given = {} if tasks is None else _read_tasks(tasks)
+    found = []
+    for e in range(len(source)):
+        task = given.get(str(e)) or source.task(e)
+        if not task:
+            raise UserError(
+                f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
+                'tasks=<file> with {"<episode index>": "<Task>", …}.'
+            )
+        record = source.records[e] if e < len(source.records) else {}
+        number = int(record.get("source_episode", e))
+        reader = partial(_lerobot_labels, source, e, task, number)
+        pictures = partial(_lerobot_pictures, source, e)
+        found.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, pictures))
+    return found
+
+
+def _read_tasks(path: Path) -> dict[str, str]:
+    try:
+        given = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(f"tasks={path} cannot be read as JSON: {error}.") from None
+    if not isinstance(given, dict) or not all(isinstance(task, str) for task in given.values()):
+        raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
+    return given
+
+
+def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
+    texts = [source.subgoals(episode, t) for t in range(int(source.lengths[episode]))]
+    return Labels(
+        task,
+        number,
+        source.goal(episode),
+        int(source.exec_starts[episode]),
+        [text["simple_subgoal"] for text in texts],
+        [text["grounded_subgoal"] for text in texts],
+        source.states(episode)[:, :7],
+        source.actions(episode)[:, :7],
+    )
+
+
+def _lerobot_pictures(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+    for start in range(0, len(steps), 64):  # what is decoded at once stays small
+        yield from source.frames(episode, list(steps[start : start + 64]))
+
+
+def run(cfg: "DictConfig") -> dict[str, int]:
+    """Build what configs/subgoal_build.yaml and the command line say."""
+    inputs = [cfg.input] if isinstance(cfg.input, str) else _list(cfg, "input", str)
+    tasks = None if cfg.tasks is None else Path(str(cfg.tasks))
+    numbers = None if cfg.episodes is None else set(_list(cfg, "episodes", int))
+    sets = _list(cfg, "sets", str)
+    for name in sets:
+        if name not in SETS:
+            raise UserError(f"sets: there is no {name!r}; known: {', '.join(SETS)}.")
+    noise = None if cfg.noise is None else tuple(_list(cfg, "noise", int))
+    options = RowOptions(noise=noise, seed=cfg.seed, **cfg.rows)
+    episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
+    episodes = [episode for episode in episodes if numbers is None or episode.number in numbers]
+    output = Path(cfg.output)
+    counts = build(episodes, output, sets, options)
+    for name, count in counts.items():
+        write_arguments(output, name)
+        print(f"{output / name}.jsonl: {count} rows of {len(episodes)} episodes")
+    return counts
+
+
+def _list(cfg: "DictConfig", key: str, kind: type) -> list[Any]:
+    """A key that is a list of whole numbers or of words."""
+    from omegaconf import ListConfig
+
+    given = cfg[key]
+    if not isinstance(given, ListConfig) or any(not isinstance(v, kind) or isinstance(v, bool) for v in given):
+        wanted, example = ("whole numbers", "[0,1]") if kind is int else ("words", f"[{given}]")
+        raise UserError(f"{key}={given} must be a list of {wanted}, such as {key}={example}.")
+    return list(given)
+
+
+def main() -> None:
+    """Run `python -m mme_vla.subgoal.build`."""
+    from mme_vla.config.composition import cli
+
+    cli("subgoal_build")(run)()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Fine-tuning a Qwen3-VL subgoal predictor with LoRA, as in the paper.
+
+`python -m mme_vla.subgoal.train rows=<folder>/grounded.jsonl` (several GPUs: `torchrun --nproc-per-node 4 -m …`)
+
+The adapter ends up in `<output>/adapter`: `subgoal=qwenvl subgoal.adapter=<output>/adapter` predicts with it.
+"""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError
+from mme_vla.subgoal.finetuning.examples import Collator, RowDataset
+from mme_vla.subgoal.models.qwen3vl import VLM, load_model
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+# All linear layers of the language model; the vision tower and the merger stay as they are.
+TARGETS = r".*language_model.*\.(q_proj|k_proj|v_proj|o_proj|gate_proj|up_proj|down_proj)"
+ADAPTER = "adapter"
+ZERO2 = {
+    "zero_optimization": {"stage": 2, "overlap_comm": True, "contiguous_gradients": True, "reduce_scatter": True},
+    "bf16": {"enabled": "auto"},
+    "gradient_clipping": "auto",
+    "gradient_accumulation_steps": "auto",
+    "train_batch_size": "auto",
+    "train_micro_batch_size_per_gpu": "auto",
+}
+
+
+def accumulation(batch: int, per_device: int, processes: int) -> int:
+    """Batches added up before a step, so that all processes together see `batch` rows.
+
+    Raises:
+        UserError: the numbers do not divide.
+    """
+    together = per_device * processes
+    if batch % together:
+        raise UserError(
+            f"batch={batch} is no multiple of per_device_batch={per_device} times {processes} processes; "
+            f"choose numbers that divide."
+        )
+    return batch // together
+
+
+def find_checkpoint(output: Path, resume: str | None) -> str | None:
+    """Where to go on from: a checkpoint's path, or None to start.
+
+    Raises:
+        UserError: `output` holds a run that is not to be resumed, or there is no such checkpoint.
+    """
+    found = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
+    if resume is None:
+        if found or (output / ADAPTER).exists():
+            raise UserError(f"{output} holds a run: go on with resume=auto, or choose another output.")
+        return None
+    if resume == "auto":
+        return str(found[-1]) if found else None
+    if not Path(resume).is_dir():
+        raise UserError(f"resume={resume!r}: there is no such checkpoint folder; auto takes the newest of the run.")
+    return resume
+
+
+def run(cfg: "DictConfig") -> Path:
+    """Train as configs/subgoal_train.yaml and the command line say; return the adapter's folder."""
+    from peft import LoraConfig, get_peft_model
+    from transformers import Trainer, set_seed
+
+    output = Path(cfg.output)
+    checkpoint = find_checkpoint(output, cfg.resume)
+    device = str(find_device(str(cfg.device)))
+    set_seed(cfg.seed)
+    model, processor = load_model(cfg.vlm, "bfloat16" if device != "cpu" else "float32")
+    lora = LoraConfig(
+        r=cfg.lora.rank,
+        lora_alpha=cfg.lora.alpha,
+        lora_dropout=cfg.lora.dropout,
+        target_modules=TARGETS,
+        task_type="CAUSAL_LM",
+    )
+    vlm = VLM(get_peft_model(model, lora), processor)
+    vlm.model.config.use_cache = False
+    rows = RowDataset(cfg.rows, processor.tokenizer, cfg.max_length)
+    if rows.left_out:
+        print(f"{rows.left_out} rows are longer than max_length={cfg.max_length} tokens and are left out.")
+    trainer = Trainer(
+        model=vlm.model, args=_arguments(cfg, output, device), train_dataset=rows, data_collator=Collator(vlm)
+    )
+    trainer.train(resume_from_checkpoint=checkpoint)
+    if trainer.is_world_process_zero():
+        vlm.model.save_pretrained(output / ADAPTER)
+        print(f"{output / ADAPTER}: subgoal=qwenvl subgoal.adapter={output / ADAPTER} predicts with it.")
+    return output / ADAPTER
+
+
+def _arguments(cfg: "DictConfig", output: Path, device: str) -> Any:
+    from transformers import TrainingArguments
+
+    processes = int(os.environ.get("WORLD_SIZE", "1"))
+    deepspeed = ZERO2 if cfg.deepspeed == "zero2" else cfg.deepspeed
+    return TrainingArguments(
+        output_dir=str(output),
+        per_device_train_batch_size=cfg.per_device_batch,
+        gradient_accumulation_steps=accumulation(cfg.batch, cfg.per_device_batch, processes),
+        num_train_epochs=cfg.epochs,
+        max_steps=-1 if cfg.steps is None else cfg.steps,
+        learning_rate=cfg.lr,
+        lr_scheduler_type="cosine",
+        warmup_steps=cfg.warmup,  # below 1 it is a share of all steps
+        weight_decay=cfg.weight_decay,
+        adam_beta2=0.95,
+        max_grad_norm=1.0,
+        bf16=device != "cpu",
+        use_cpu=device == "cpu",
+        gradient_checkpointing=cfg.gradient_checkpointing,
+        gradient_checkpointing_kwargs={"use_reentrant": False},
+        dataloader_num_workers=cfg.workers,
+        remove_unused_columns=False,
+        seed=cfg.seed,
+        data_seed=cfg.seed,
+        logging_steps=cfg.log_every,
+        save_steps=cfg.save_every,
+        save_total_limit=cfg.keep,
+        report_to=[] if cfg.report_to is None else [cfg.report_to],
+        deepspeed=deepspeed,
+    )
+
+
+def main() -> None:
+    """Run `python -m mme_vla.subgoal.train`."""
+    from mme_vla.config.composition import cli
+
+    cli("subgoal_train")(run)()
+
+
+if __name__ == "__main__":
+    main()

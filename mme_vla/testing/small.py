@@ -1,0 +1,127 @@
+"""Small policies, batches and episodes for testing a memory or an integration: the library's own tests use them."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from mme_vla.config.composition import compose
+from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
+from mme_vla.policy.build import build_from_config, policy_words
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.normalisers import NormStats, QuantileStats
+from mme_vla.types import Batch, HistoryTokens
+
+PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
+RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
+NEURAL = [*PERCEPTUAL, *RECURRENT]
+MODELS = ["pi05", *NEURAL]
+# The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
+ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hybrid"]
+SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp_dim": 64, "num_heads": 2}
+
+
+def unit_stats() -> NormStats:
+    """Statistics that leave numbers about as they are."""
+
+    def quantiles() -> QuantileStats:
+        return QuantileStats(q01=-np.ones(8), q99=np.ones(8), mean=np.zeros(8), std=np.ones(8))
+
+    return NormStats(state=quantiles(), actions=quantiles())
+
+
+def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
+    """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive norms are shut)."""
+    policy = build_from_config(_composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed)
+    policy.require_processor().stats = unit_stats()
+    open_gates(policy)
+    return policy
+
+
+@cache
+def _composed(*words: str) -> DictConfig:
+    """Composing takes several times as long as building a tiny policy, and tests build the same ones over and over."""
+    return compose("policy", words)
+
+
+def open_gates(policy: MMEPolicy, scale: float = 0.5) -> None:
+    """Draw the adaptive norms at random, the same in every variant."""
+    generator = torch.Generator().manual_seed(7)
+    with torch.no_grad():
+        for name, parameter in sorted(policy.named_parameters()):
+            if name.endswith(("norm.dense.weight", "norm.dense.bias")) and ".experts.memory." not in name:
+                std = scale * (parameter.shape[-1] ** -0.5 if parameter.ndim == 2 else 1)
+                parameter.copy_(torch.randn(parameter.shape, generator=generator) * std)
+
+
+def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> HistoryTokens | None:
+    """`valid` random tokens at random places, the rest padding; whole frames where padding goes in front."""
+    if policy.memory is None:
+        return None
+    generator = torch.Generator().manual_seed(seed)
+    patches, d = policy.memory.storage.grid**2, policy.backbone.config.vlm.width
+    if policy.memory.pad_left:
+        valid = -(-valid // patches) * patches
+    n = policy.memory.padded_length(valid)
+    mask = torch.zeros(batch, n, dtype=torch.bool)
+    mask[:, slice(n - valid, n) if policy.memory.pad_left else slice(valid)] = True
+    features = torch.randn(batch, n, d, generator=generator) * mask[..., None]
+    positions = torch.randint(0, 64, (batch, n, 3), generator=generator).float() * mask[..., None]
+    return HistoryTokens(features, positions, mask)
+
+
+def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:
+    """A batch of noise pictures, short prompts and random actions."""
+    generator = torch.Generator().manual_seed(seed)
+    config = policy.backbone.config
+    size, length = config.vision.image_size, 16
+    prompt_mask = torch.zeros(batch, length, dtype=torch.bool)
+    prompt_mask[:, : length // 2] = True
+    return Batch(
+        images=torch.randint(0, 256, (batch, 2, 3, size, size), generator=generator, dtype=torch.uint8),
+        image_mask=torch.ones(batch, 2, dtype=torch.bool),
+        prompt=torch.randint(4, 100, (batch, length), generator=generator) * prompt_mask,
+        prompt_mask=prompt_mask,
+        history=random_history(policy, batch, valid, seed),
+        actions=torch.randn(batch, config.horizon, config.action_dim, generator=generator),
+    )
+
+
+def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
+    """Frames [count, size, size, 3] uint8 of a still background and a bright square that wanders."""
+    rng = np.random.default_rng(seed)
+    background = rng.integers(0, 200, (size, size, 3), dtype=np.uint8)
+    frames = np.repeat(background[None], count, 0)
+    for t in range(count):
+        y, x = (3 * t) % (size - 12), (5 * t) % (size - 12)
+        frames[t, y : y + 12, x : x + 12] = rng.integers(0, 256, 3, dtype=np.uint8)
+    return frames
+
+
+def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -> CachedHistory:
+    """What a cache of this whole episode would hold, encoded in one go."""
+    memory = policy.require_memory()
+    spec, scorer = memory.storage, memory.make_scorer()
+    kept = spec.kept_frames(len(frames))
+    tokens = policy.encode_frames(frames[kept])
+    rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
+    scored = [(t, values) for t, values in rows if values is not None]
+    scores = (
+        FrameScores(np.array([t for t, _ in scored]), np.stack([v for _, v in scored]).astype(np.float32))
+        if scored
+        else None
+    )
+    stored = tokens.view(torch.uint16).numpy() if tokens.dtype == torch.bfloat16 else tokens.numpy()
+    return CachedHistory(spec, stored, kept, len(frames), scores, exec_start)
+
+
+def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
+    """The same episode as an environment would deliver it, `chunk` frames at a time."""
+    memory = policy.require_memory()
+    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
+    for start in range(0, len(frames), chunk):
+        part = frames[start : start + chunk]
+        history.append(part, policy.encode_frames(part[history.wanted(len(part))]))
+    return history

@@ -1,0 +1,75 @@
+"""Normalisation statistics that lie beside foreign checkpoints."""
+
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from mme_vla.errors import UserError
+from mme_vla.policy.tensor_files import read_safetensors
+from mme_vla.processing.normalisers import NormStats, QuantileStats
+
+_PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+_FEATURES = {"state": "observation.state", "actions": "action"}
+
+
+def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None:
+    """The statistics in a checkpoint folder, or None where it has none.
+
+    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, and the file that LeRobot's
+    processor description names as the state of its normaliser. LeRobot's speak of the actions it was trained on:
+    they fit this library's joint deltas if that policy used relative actions with an absolute gripper.
+
+    Args:
+        folder: the checkpoint (for released runs: the step).
+        asset: which of several datasets' statistics.
+
+    Raises:
+        UserError: there are several and `asset` does not choose, or a damaged file.
+    """
+    folder = Path(folder)
+    files = stats_files(folder)
+    if asset is not None or len(files) > 1:
+        if asset not in files:
+            raise UserError(
+                f"{folder} holds statistics of {', '.join(files) or 'no dataset'}: "
+                + (f"there are none of {asset!r}." if asset else "say which: --asset, or read_stats(folder, asset).")
+            )
+        return NormStats.load(files[asset])
+    if files:
+        return NormStats.load(next(iter(files.values())))
+    if (folder / "norm_stats.json").is_file():
+        return NormStats.load(folder / "norm_stats.json")
+    return next(_lerobot_stats(folder), None)
+
+
+def stats_files(folder: Path) -> dict[str, Path]:
+    """The statistics that openpi keeps in a checkpoint, by the name of their dataset."""
+    assets = folder / "assets"
+    return {file.parent.relative_to(assets).as_posix(): file for file in sorted(assets.glob("**/norm_stats.json"))}
+
+
+def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
+    for name in _PROCESSORS:
+        if not (folder / name).is_file():
+            continue
+        try:
+            steps = json.loads((folder / name).read_text())["steps"]
+            files = [step["state_file"] for step in steps if step.get("state_file")]
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UserError(f"{folder / name} does not describe a LeRobot processor: {error!r}") from None
+        for file in files:
+            tensors = read_safetensors(folder / file)
+            if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
+                yield NormStats(**{ours: _quantiles(tensors, theirs) for ours, theirs in _FEATURES.items()})
+
+
+def _quantiles(tensors: Mapping[str, Tensor], feature: str) -> QuantileStats:
+    values: dict[str, Any] = {}
+    for key in ("mean", "std", "q01", "q99"):
+        tensor = tensors.get(f"{feature}.{key}")
+        values[key] = None if tensor is None else np.asarray(tensor.double().flatten()).tolist()
+    return QuantileStats.from_dict(values, feature)
