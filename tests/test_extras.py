@@ -57,7 +57,7 @@ SUFFICE = [
     Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
     Case(("vlm",), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
                    "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
-    Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --multirun --cfg hydra", "hydra_joblib_launcher"),
+    Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
     Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
     Case(("sim",), "mme_vla.envs.record --help", "episodes"),
