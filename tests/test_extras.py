@@ -25,6 +25,10 @@ FOLDER = REPOSITORY / "tests" / "extras"
 NEW = "uv sync --inexact --extra {}"
 
 
+# The first test to run waits for all commands.
+pytestmark = pytest.mark.timeout(600)
+
+
 class Case(NamedTuple):
     """A command, the extras that are there, and how it ends: `says` is a text it prints."""
 
@@ -98,7 +102,7 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> dict[Case, tuple[int, str
                  "PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "compiled")}  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(FOLDER / "commands.py")], input=json.dumps(asked), env=variables,
-        cwd=folder, capture_output=True, text=True, timeout=290,
+        cwd=folder, capture_output=True, text=True, timeout=550,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     answers = [tuple(answer) for answer in json.loads(done.stdout.splitlines()[-1])]
