@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, missing_extra
 
 MODES = ("full", "expert_only", "lora")
 ADAPTER = "default"  # peft's name of the one adapter a policy carries
@@ -110,7 +110,7 @@ def add_adapters(
     try:
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
-        raise UserError("LoRA needs peft, which is not installed: pip install 'mme-vla[vlm]'.") from None
+        raise missing_extra("LoRA", "vlm") from None
     config = LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=chosen)  # type: ignore[arg-type]
     inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "targets": targets}
