@@ -15,6 +15,7 @@ from mme_vla.config import cli, log_to_terminal
 from mme_vla.devices import find_device
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.loading import load_policy, words_of
+from mme_vla.variant import composition_digest
 
 if TYPE_CHECKING:
     import torch
@@ -58,6 +59,7 @@ def main(cfg: DictConfig) -> None:
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
         None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
+        composition_digest(policy.config),
     )  # fmt: skip
     if not settings.render:
         logger.warning("render=false: the policy sees black pictures; only the time of the simulation means anything")
@@ -65,7 +67,7 @@ def main(cfg: DictConfig) -> None:
     logger.info("%d episodes into %s%s", len(jobs), output, f", of which shard {shard.index}/{shard.count}"
                 if shard.count > 1 else "")  # fmt: skip
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
-    notes["policy"] = policy_facts(policy.config)
+    notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
     _end_on_sigterm()
     _spawn_as_usual()
     try:

@@ -13,7 +13,7 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.demo import demo_records
-from mme_vla.evaluation.record_log import find_records, read_records
+from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.scopes import Protocol
 from mme_vla.evaluation.subgoal_score import subgoal_tables
 from mme_vla.evaluation.submission import read_runs, training_details
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> None:
     if args.demo:
         records = demo_records(DEMO)
     else:
-        records = [record for path in find_records(args.runs) for record in read_records(path)]
+        records = read_folders(find_records(args.runs))
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
         results.notes.insert(0, "Made-up records, drawn from the paper's rates: not a result of anything.")
