@@ -7,10 +7,11 @@ work starts, and come back as one `UserError` with the near names.
 import functools
 import importlib
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import zip_longest
 from pathlib import Path
 
@@ -27,7 +28,8 @@ from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config_errors import COMPOSITION_ERRORS, ConfigTree
+from mme_vla.config_errors import COMPOSITION_ERRORS, ConfigTree, paths
+from mme_vla.config_help import help_page, unknown_option
 from mme_vla.errors import UserError
 from mme_vla.variant import Sections, decisive, variant_name
 
@@ -149,7 +151,7 @@ def _name_under_hydra(*, _root_: DictConfig) -> str:
     # A job's main tree is asked first, whatever the order in which Hydra searches.
     main = [Path(s.path) for s in running.runtime.config_sources if s.provider == "main" and s.schema == "file"]
     ordered = tuple(dict.fromkeys(tree.resolve() for tree in (*main, *trees)))
-    return _true_name(_root_, running.job.config_name, ordered) if ordered else str(_root_.name)
+    return _true_name(_root_, str(running.job.config_name), ordered) if ordered else str(_root_.name)
 
 
 OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
@@ -216,11 +218,51 @@ def cli[T](
 
 
 def _check_command_line(config_name: str, tree: Path) -> None:
-    args = get_args_parser().parse_args()
+    args, rest = get_args_parser().parse_known_args()
+    if rest:
+        raise unknown_option(rest[0], sys.argv[1:], known_keys(config_name, tree))
+    if args.help:
+        extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
+        _show(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
+        raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
+
+
+def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
+    """What a command answers to `--help` and these words (`mme_vla.config_help`).
+
+    Args:
+        trees: folders of YAML files, the library's first.
+
+    Raises:
+        UserError: a word that is neither a group nor an override that fits.
+    """
+
+    def chosen(overrides: Sequence[str]) -> dict[str, str]:
+        compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
+        with _own_hydra(trees[0], trees[1:]):
+            cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
+            taken = cfg.hydra.runtime.choices.items()
+            words = {group: "null" if name is None else str(name) for group, name in taken}
+            return {group: name for group, name in words.items() if not group.startswith("hydra/")}
+
+    return help_page(config_name, words, trees, chosen)
+
+
+def _show(text: str) -> None:
+    with suppress(BrokenPipeError):  # `--help | head` has read enough
+        print(text, flush=True)
+        return
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def known_keys(config_name: str, tree: Path) -> list[str]:
+    """Every dotted key of a command's configuration as it is by default."""
+    with _own_hydra(tree, []):
+        return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
 
 
 def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:

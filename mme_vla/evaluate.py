@@ -39,6 +39,7 @@ def main(cfg: DictConfig) -> None:
         UserError: anything in the settings, the checkpoint or the machine that cannot work.
     """
     from mme_vla.envs.make import require_simulator
+    from mme_vla.envs.which import named_tasks
     from mme_vla.evaluation.rollout_plan import choose_episodes, choose_shard
     from mme_vla.evaluation.rollout_run import RunFacts, checkpoint_label, default_output, evaluate, memory_budget
     from mme_vla.evaluation.rollout_settings import RolloutSettings
@@ -48,7 +49,7 @@ def main(cfg: DictConfig) -> None:
     assert isinstance(config, dict)
     plain = {str(key): value for key, value in config.items()}
     settings = RolloutSettings.from_config(plain)
-    jobs = choose_episodes(plain["tasks"], plain["episodes"], settings.split)
+    jobs = choose_episodes(named_tasks(plain), plain["episodes"], settings.split)
     shard = choose_shard(plain["shard"])
     if settings.env == "mme_vla":
         require_simulator()

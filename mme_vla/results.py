@@ -60,10 +60,7 @@ def run(args: argparse.Namespace) -> None:
     )
     if args.demo == bool(args.runs):
         raise UserError("Name files or folders of episode records, or --demo for made-up ones (not both).")
-    if args.demo:
-        records = demo_records(DEMO)
-    else:
-        records = read_folders(find_records(args.runs))
+    records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
         results.notes.insert(0, "Made-up records, drawn from the paper's rates: not a result of anything.")

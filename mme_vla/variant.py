@@ -1,8 +1,8 @@
 """What a composition is called, and a digest that tells compositions apart.
 
-A model's name stands in folders, cards and records, so it must be true: `memory=framesamp integration=modulator` on top
-of another model is `framesamp_modul`, and a composition that no file of `configs/model` describes gets a name of its own,
-built from its parts and from what differs (`framesamp_modul-pooling_max`).
+A model's name stands in folders, cards and records, so it must be true: `memory=framesamp integration=modulator` on
+top of another model is `framesamp_modul`, and a composition that no file of `configs/model` describes gets a name of
+its own, built from its parts and from what differs (`framesamp_modul-pooling_max`).
 """
 
 import hashlib

@@ -193,9 +193,7 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
             digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
     only = {run: next(iter(found)) for run, found in digests.items() if len(found) == 1}
     return [
-        replace(record, composition=only[record.run])
-        if record.composition is None and record.run in only
-        else record
+        replace(record, composition=only[record.run]) if record.composition is None and record.run in only else record
         for record in records
     ]
 
