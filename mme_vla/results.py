@@ -23,11 +23,11 @@ from mme_vla.evaluation.tables import (
     detail,
     leaderboard,
     overview,
+    print_table,
     runs_table,
     to_csv,
     to_latex,
     to_markdown,
-    to_rich,
 )
 from mme_vla.evaluation.tasks import PAPER_ORDER, TEST_EPISODES
 
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
     # Piped into a file there is no terminal to fit: as wide as the tables are.
     console = Console(width=None if sys.stdout.isatty() else 200)
     for table in _tables(results, comparisons, detailed=not args.brief):
-        console.print(to_rich(table))
+        print_table(table, console.width)
     for comparison in comparisons:
         console.print(comparison.verdict, markup=False, highlight=False)
     for note in results.notes:

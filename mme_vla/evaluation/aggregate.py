@@ -12,7 +12,7 @@ import numpy as np
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation import paper
-from mme_vla.evaluation.intervals import Interval, bootstrap, mean_std, task_interval
+from mme_vla.evaluation.intervals import Interval, bootstrap, mean_std, task_interval, wilson
 from mme_vla.evaluation.paper import PaperMethod, PaperResult
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.scopes import Protocol, Scope, scopes
@@ -227,6 +227,11 @@ def _figure(
     else:
         episodes = {task: matrix.mean(1) for task, matrix in zip(tasks, matrices, strict=True)}
         interval = bootstrap(episodes, protocol.confidence, protocol.samples, protocol.seed)
+        if interval.low == interval.high:  # all episodes of a task alike, as with no success at all: nothing to draw
+            trials = sum(map(len, episodes.values()))
+            interval = wilson(
+                float(np.mean([values.mean() for values in episodes.values()])), trials, protocol.confidence
+            )
     percent = Interval(100 * interval.low, 100 * interval.high)
     return Figure(100 * mean, None if std is None else 100 * std, percent, **counts, paper=reported)
 
