@@ -227,8 +227,8 @@ class MMEPolicy(Saved):
             float32 [n, h, 8], or [h, 8] for one episode: absolute joint targets and gripper commands.
         """
         if isinstance(episodes, Episode):
-            chunk: np.ndarray = self.act([episodes], steps)[0]
-            return chunk
+            alone: np.ndarray = self.act([episodes], steps)[0]
+            return alone
         if not episodes:
             return np.zeros((0, self.backbone.config.horizon, 8), np.float32)
         processor = self.require_processor()
