@@ -1,11 +1,13 @@
 """Does the memory work? A stream whose answer was visible only in the conditioning video.
 
     python examples/memory_matters.py                         # every neural variant and pi05, two at a time
-    python examples/memory_matters.py framesamp_modul pi05 --seconds 60
+    python examples/memory_matters.py framesamp_modul --seconds 60
+    python examples/memory_matters.py my_model --config-dir configs    # a memory of your own, with its own options
 
 In the video a square of one of four colours passes over the scene; when execution begins it is gone, and the right
 action depends on its colour alone. The current view, the goal and the state say nothing, so a policy without memory can
-only guess. Prints the open-loop error of each policy on episodes it has not seen, and draws it.
+only guess: `pi05` is always trained beside what is named. Prints the open-loop error of each policy on episodes it has
+not seen, and draws it.
 
 The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp look at every 4th
 frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and
@@ -17,7 +19,7 @@ import argparse
 import json
 import multiprocessing
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ import numpy as np
 import torch
 
 from mme_vla import build_policy
+from mme_vla.config.composition import compose, print_user_errors
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
@@ -37,6 +40,7 @@ ANSWERS = np.array([[1, 1, 1, 1, -1, -1, -1, -1], [1, -1, 1, -1, 1, -1, 1, -1],
                     [-1, -1, 1, 1, 1, 1, -1, -1], [-1, 1, 1, -1, -1, 1, 1, -1]], np.float32)  # fmt: skip
 SIZE, SQUARE = 64, 40  # pixels
 VIDEO, LENGTH = 8, 12  # frames of conditioning video, and of the whole episode
+MEMORYLESS = "pi05"
 MEMORY = {"budget": 64, "grid": 4}
 OF_KIND: dict[str, dict[str, Any]] = {
     "framesamp": {},
@@ -58,6 +62,11 @@ class Stream:
 def memory_options(model: str) -> dict[str, Any]:
     """What this demonstration changes in the shipped memory of a model."""
     return MEMORY | OF_KIND[model.split("_")[0]] if model in NEURAL else {}
+
+
+def models_of(named: Sequence[str]) -> list[str]:
+    """What is trained: the models that are named, and the one without memory to hold them against."""
+    return list(dict.fromkeys([*named, MEMORYLESS]))
 
 
 def make_stream(rng: np.random.Generator) -> Stream:
@@ -123,17 +132,20 @@ def learn(
     lr: float = 1.5e-3,
     seed: int = 0,
     backbone: Mapping[str, Any] | None = None,
+    config_dir: Path | None = None,
 ) -> dict[str, Any]:
     """Train one policy until it answers for the episodes it trains on; its error on others, and what it took.
 
     Args:
         seconds: most CPU time, encoding included. steps: most updates. episodes: to learn from.
-        backbone: keys of the tiny backbone to change.
+        backbone: keys of the tiny backbone to change. config_dir: YAML files of your own.
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)
     options = {"memory": memory_options(model)} if model in NEURAL else {}
-    policy = build_policy(model, seed=seed, policy={"augment": False}, backbone=backbone or {}, **options)
+    policy = build_policy(
+        model, seed=seed, config_dir=config_dir, policy={"augment": False}, backbone=backbone or {}, **options
+    )
     policy.backbone.vision.requires_grad_(False)
     seen, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
     optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=lr, betas=(0.9, 0.95))
@@ -148,7 +160,7 @@ def learn(
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         done += 1
-        if done % 100 == 0 and model in NEURAL:
+        if done % 100 == 0 and policy.memory is not None:
             error = open_loop_error(policy, seen, 24)
             print(f"  {model}: {error:.2f} on the episodes it learns from after {done} steps", flush=True)
             if error < 0.08:
@@ -167,7 +179,7 @@ def plot(results: list[dict], path: Path) -> None:
     figure, axes = pyplot.subplots(figsize=(7, 0.4 * len(results) + 1.4), layout="constrained")
     names = [r["model"] for r in results]
     bars = axes.barh(
-        names, [r["error"] for r in results], color=["#9a9a9a" if n == "pi05" else "#2b6cb0" for n in names]
+        names, [r["error"] for r in results], color=["#9a9a9a" if n == MEMORYLESS else "#2b6cb0" for n in names]
     )
     axes.bar_label(bars, fmt="%.2f", padding=3)
     axes.axvline(0.75, color="#c05621", linestyle="--", linewidth=1, label="guessing a colour")
@@ -178,15 +190,17 @@ def plot(results: list[dict], path: Path) -> None:
     figure.savefig(path, dpi=130)
 
 
-def one_of_several(job: tuple[str, float]) -> dict[str, Any]:
+def one_of_several(job: tuple[str, float, Path | None]) -> dict[str, Any]:
     """A variant in a process of its own, on one core."""
     torch.set_num_threads(1)
-    return learn(*job)
+    model, seconds, config_dir = job
+    return learn(model, seconds, config_dir=config_dir)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("models", nargs="*", default=["pi05", *NEURAL], help="variants to train")
+    parser.add_argument("models", nargs="*", default=list(NEURAL), help="variants to train, beside pi05")
+    parser.add_argument("--config-dir", type=Path, help="a folder of your own YAML files")
     parser.add_argument(
         "--seconds", type=float, default=240, help="most CPU time of one variant: two minutes of two cores"
     )
@@ -194,8 +208,20 @@ def main() -> None:
     parser.add_argument("--plot", type=Path, default=Path("memory_matters.png"))
     parser.add_argument("--results", type=Path, help="JSON lines to add to; what stands there is not trained again")
     args = parser.parse_args()
-    results = read_results(args.results)
-    jobs = [(model, args.seconds) for model in args.models if model not in results]
+    with print_user_errors():
+        compare(args)
+
+
+def compare(args: argparse.Namespace) -> None:
+    """Train what is named, print and draw it.
+
+    Raises:
+        UserError: an unknown model; nothing is trained then.
+    """
+    models, results = models_of(args.models), read_results(args.results)
+    for model in models:
+        compose("policy", [f"model={model}"], extra_dirs=[args.config_dir] if args.config_dir else [])
+    jobs = [(model, args.seconds, args.config_dir) for model in models if model not in results]
     with multiprocessing.get_context("spawn").Pool(args.processes, maxtasksperchild=1) as pool:
         for result in pool.imap_unordered(one_of_several, jobs):
             results[result["model"]] = result
@@ -203,7 +229,7 @@ def main() -> None:
                 with args.results.open("a") as file:
                     file.write(json.dumps(result) + "\n")
     line = "{model:20} error {error:.3f} after {steps} steps, {cpu:.0f} s of CPU time, {wall:.0f} s of wall time"
-    shown = [results[model] for model in args.models]
+    shown = [results[model] for model in models]
     print("\n".join(line.format(**result) for result in shown))
     plot(shown, args.plot)
     print(f"plot: {args.plot}")

@@ -1,6 +1,7 @@
 """Every configuration key is explained where it stands, and the page in docs/ says the same."""
 
 import importlib.util
+import re
 
 import pytest
 from conftest import REPOSITORY
@@ -25,10 +26,23 @@ def test_every_key_has_a_comment_in_one_file_of_its_group(script):
         files = sorted(folder.glob("*.yaml"))
         groups = [[file] for file in files] if folder == script.CONFIGS else [files]
         for group in groups:
-            rows = [(file, *row) for file in group for row in script.keys(file)]
+            rows = [(file, key.name, key.default, key.comment) for file in group for key in script.keys(file)]
             explained = {key for _, key, _, comment in rows if comment}
             covered = explained | {
                 key for _, key, _, _ in rows if any(other.startswith(f"{key}.") for other in explained)
             }
             unexplained += [f"{file.name}: {key}" for file, key, _, _ in rows if key not in covered]
     assert sorted(set(unexplained)) == []
+
+
+def test_nothing_of_a_comment_is_lost_when_the_page_is_rendered(script):
+    """Outside of backticks and code blocks no tag opens, and a row of a table has as many columns as its head."""
+    text = re.sub(r"```.*?```", "", script.page(), flags=re.DOTALL)
+    assert re.findall(r"<[^>\n]*>", re.sub(r"`[^`]*`", "", text)) == []
+    for line in text.splitlines():
+        if line.startswith("|"):
+            assert len(re.findall(r"(?<!\\)\|", line)) == 4, line
+
+
+def test_comments_become_markdown(script):
+    assert script.prose("train | val, `a|b` in <folder>, 2*3") == r"train \| val, `a\|b` in &lt;folder&gt;, 2\*3"

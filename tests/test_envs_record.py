@@ -90,7 +90,7 @@ def test_a_folder_of_another_recording_is_refused(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (["task=PickXtime", "episodes=1"], "Did you mean 'PickXtimes'"),
-        (["task=PickXtimes", "episodes=0"], "at least one episode"),
+        (["task=PickXtimes", "episodes=0"], r"For number 0 alone write episodes=\[0\]"),
         (["task=PickXtimes", "episodes=[100]"], "100"),
         (["task=PickXtimes", "episodes=1", "workers=0"], "workers=0"),
         (["task=PickXtimes", "episodes=1", "split=training"], "train"),

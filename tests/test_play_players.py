@@ -209,7 +209,7 @@ def test_the_oracle_needs_this_librarys_tasks():
 
 def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
-    words = ["task=[VideoUnmask,VideoUnmaskSwap]", "episodes=0", "player=oracle", f"output={tmp_path / 'run'}"]
+    words = ["task=[VideoUnmask,VideoUnmaskSwap]", "episodes=[0]", "player=oracle", f"output={tmp_path / 'run'}"]
     done = subprocess.run(
         [sys.executable, "-m", "mme_vla.play", *words], capture_output=True, text=True, cwd=Path(__file__).parent.parent
     )
@@ -226,7 +226,7 @@ def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     ("words", "message"),
     [
         (["task=VideoUnmsk"], "VideoUnmask"),
-        (["task=VideoUnmask", "episodes=77"], "episodes 0 to 49"),
+        (["task=VideoUnmask", "episodes=77"], "first 77; VideoUnmask in 'test' has 50"),
         (["task=VideoUnmask", "player=gemni"], "gemini"),
         (["task=VideoUnmask", "player=random", "max_choices=0"], "max_choices=0"),
         ([], "task"),

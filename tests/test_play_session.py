@@ -215,28 +215,30 @@ def test_episodes_are_named_in_several_ways():
     def numbers(episodes, split="test"):
         return [which.episode for which in choose_episodes("BinFill", episodes, split)]
 
-    assert numbers(3) == [3]
+    assert numbers(3) == [0, 1, 2]
+    assert numbers([3]) == [3]
     assert numbers([4, 2]) == [4, 2]
-    assert numbers("0-2,7,1") == [0, 1, 2, 7]
+    assert numbers("0-2,7") == numbers(["0-2", 7]) == [0, 1, 2, 7]
     assert numbers("all", "train") == list(range(100))
-    assert [which.task for which in choose_episodes("BinFill, MoveCube", 0, "test")] == ["BinFill", "MoveCube"]
+    assert [which.task for which in choose_episodes("BinFill, MoveCube", 1, "test")] == ["BinFill", "MoveCube"]
     every = choose_episodes("all", "0-49", "test")
     assert len(every) == 800
     assert {which.task for which in every} == set(TASK_NAMES)
-    known = choose_episodes("VideoUnmask", 3, "test")[0]
+    known = choose_episodes("VideoUnmask", [3], "test")[0]
     assert (known.seed, known.difficulty) == (560300, "hard")
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("BinFil", 0, "test"), "Unknown task 'BinFil'.*BinFill"),
-        (("BinFill", 0, "tset"), "Unknown split 'tset'.*test"),
-        (("BinFill", 50, "test"), "episodes 0 to 49; asked for 50"),
-        (("BinFill", "5-2", "test"), "episodes 0 to 49; asked for 5-2"),
+        (("BinFil", 1, "test"), "Unknown task 'BinFil'.*BinFill"),
+        (("BinFill", 1, "tset"), "Unknown split 'tset'.*test"),
+        (("BinFill", [50], "test"), "no episode 50 in BinFill in 'test', which has 50: 0 to 49"),
+        (("BinFill", "5-2", "test"), "ends before it begins"),
         (("BinFill", "some", "test"), "not understood"),
-        (("BinFill", -1, "test"), "not understood"),
-        ((["BinFill"], [], "test"), "nothing to play"),
+        (("BinFill", -1, "test"), "first -1; .* has 50"),
+        (("BinFill", "0-999999999", "test"), "no episode 999999999"),
+        ((["BinFill"], [], "test"), "at least one"),
     ],
 )
 def test_episodes_that_are_not_there_are_refused(words, message):

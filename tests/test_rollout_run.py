@@ -190,9 +190,9 @@ def test_episodes_are_chosen_by_name_number_or_list() -> None:
     assert choose_episodes("StopCube", 2) == [Job("StopCube", "test", 0), Job("StopCube", "test", 1)]
     assert [job.episode for job in choose_episodes(["StopCube"], [4, 1])] == [4, 1]
     for tasks, episodes, said in (
-        ("StopCubes", None, "StopCube"), ([], None, "no task"), (["BinFill", "BinFill"], None, "twice"),
+        ("StopCubes", None, "StopCube"), ([], None, "at least one"), (["BinFill", "BinFill"], None, "once"),
         ("BinFill", 51, "has 50"), ("BinFill", [50], "0 to 49"), ("BinFill", [1, 1], "once"),
-        ("BinFill", "x", "a number"),
+        ("BinFill", "x", "not understood"),
     ):  # fmt: skip
         with pytest.raises(UserError, match=said):
             choose_episodes(tasks, episodes)

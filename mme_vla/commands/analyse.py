@@ -227,9 +227,10 @@ def _paper(table: str, model: str) -> dict[str, str]:
 def _print(title: str, columns: Sequence[str], rows: list[list[str]]) -> None:
     from rich.console import Console
 
-    from mme_vla.evaluation.results.tables import Table, to_rich
+    from mme_vla.evaluation.results.tables import Table, print_table
 
-    Console(width=None if Console().is_terminal else 160).print(to_rich(Table(title, columns, rows)))
+    console = Console()
+    print_table(Table(title, columns, rows), console.width if console.is_terminal else 160)
 
 
 def _save(args: argparse.Namespace, values: dict[str, Any]) -> None:

@@ -15,6 +15,7 @@ from mme_vla.commands.loading import load_policy, words_of
 from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.policy.variant import composition_digest
 
 if TYPE_CHECKING:
     import torch
@@ -37,6 +38,7 @@ def main(cfg: DictConfig) -> None:
     Raises:
         UserError: anything in the settings, the checkpoint or the machine that cannot work.
     """
+    from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
     from mme_vla.evaluation.results.submission import policy_facts
     from mme_vla.evaluation.rollout.evaluation import (
@@ -53,7 +55,7 @@ def main(cfg: DictConfig) -> None:
     assert isinstance(config, dict)
     plain = {str(key): value for key, value in config.items()}
     settings = RolloutSettings.from_config(plain)
-    jobs = choose_episodes(plain["tasks"], plain["episodes"], settings.split)
+    jobs = choose_episodes(named_tasks(plain), plain["episodes"], settings.split)
     shard = choose_shard(plain["shard"])
     if settings.env == "mme_vla":
         require_simulator()
@@ -64,6 +66,7 @@ def main(cfg: DictConfig) -> None:
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
         None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
+        composition_digest(policy.config),
     )  # fmt: skip
     if not settings.render:
         logger.warning("render=false: the policy sees black pictures; only the time of the simulation means anything")
@@ -71,7 +74,7 @@ def main(cfg: DictConfig) -> None:
     logger.info("%d episodes into %s%s", len(jobs), output, f", of which shard {shard.index}/{shard.count}"
                 if shard.count > 1 else "")  # fmt: skip
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
-    notes["policy"] = policy_facts(policy.config)
+    notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
     _end_on_sigterm()
     _spawn_as_usual()
     try:

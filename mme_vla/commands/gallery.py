@@ -9,9 +9,9 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from mme_vla.envs import metadata
+from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -100,14 +100,9 @@ def run(cfg: "DictConfig") -> None:
     """
     from mme_vla.data.progress import progress
 
-    tasks = [cfg.task] if isinstance(cfg.task, str) else list(cfg.task)
-    tasks = list(TASK_NAMES) if tasks == ["all"] else tasks
-    for task in tasks:
-        if task not in TASK_NAMES:
-            raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), ['all', *TASK_NAMES])}")
+    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
     if not isinstance(cfg.tiles, int) or cfg.tiles < 2:
         raise UserError(f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
-    specs = [metadata.episode(task, cfg.split, cfg.episode) for task in tasks]
     require_simulator()
     folder = Path(cfg.output)
     folder.mkdir(parents=True, exist_ok=True)
@@ -115,7 +110,8 @@ def run(cfg: "DictConfig") -> None:
     with progress("show", len(specs), unit="tasks") as advance:
         for spec in specs:
             env, snapshots = _demonstrated(spec)
-            picture = f"{spec.task}.jpg"
+            several = sum(other.task == spec.task for other in specs) > 1
+            picture = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
             strip(snapshots, cfg.tiles).save(folder / picture, quality=82)
             entries.append((spec.task, env.goals()[0], picture))
             env.close()

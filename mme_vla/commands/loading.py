@@ -50,7 +50,7 @@ def load_policy(
     """
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.mme import MMEPolicy
-    from mme_vla.training.checkpoint import resolve_checkpoint
+    from mme_vla.training.checkpoint import LATEST, resolve_checkpoint
 
     device = find_device(cfg.device) if device is None else device
     named = words_of(*_MODEL_KEYS)
@@ -58,7 +58,7 @@ def load_policy(
         if named:
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
         source = Path(str(cfg.checkpoint)).expanduser()
-        where = str(resolve_checkpoint(source)) if source.exists() else str(cfg.checkpoint)
+        where = str(resolve_checkpoint(source)) if source.exists() or source.name == LATEST else str(cfg.checkpoint)
         policy = MMEPolicy.from_pretrained(where, device=device, dtype=cfg.dtype, revision=cfg.revision)
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)

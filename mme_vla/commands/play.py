@@ -1,4 +1,4 @@
-"""`python -m mme_vla.play task=… episodes=…`: play the tasks yourself, or let a model play (configs/play.yaml)."""
+"""`python -m mme_vla.play tasks=… episodes=…`: play the tasks yourself, or let a model play (configs/play.yaml)."""
 
 import logging
 import sys
@@ -9,6 +9,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli, log_to_terminal
+from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.run_file import INDIFFERENT
@@ -33,7 +34,7 @@ def main(cfg: DictConfig) -> None:
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
-    wanted = choose_episodes(config["task"], config["episodes"], config["split"])
+    wanted = choose_episodes(named_tasks(config), config["episodes"], config["split"])
     for name in ("max_steps", "max_choices"):
         if isinstance(config[name], bool) or not isinstance(config[name], int) or config[name] < 1:
             raise UserError(f"{name}={config[name]!r}; expected a positive integer.")

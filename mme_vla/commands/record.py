@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mme_vla.envs import metadata
+from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -115,18 +114,10 @@ def plan(cfg: "DictConfig") -> list[Job]:
     Raises:
         UserError: an unknown task or split, an episode that does not exist, or a number that is not positive.
     """
-    tasks = [cfg.task] if isinstance(cfg.task, str) else list(cfg.task)
-    tasks = list(TASK_NAMES) if tasks == ["all"] else tasks
-    for task in tasks:
-        if task not in TASK_NAMES:
-            raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), ['all', *TASK_NAMES])}")
     for name in ("workers", "retries"):
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
-    episodes = list(range(cfg.episodes)) if isinstance(cfg.episodes, int) else [int(e) for e in cfg.episodes]
-    if not episodes:
-        raise UserError(f"episodes={cfg.episodes}: name at least one episode.")
-    specs = [metadata.episode(task, cfg.split, episode) for task in tasks for episode in episodes]
+    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
     return [
         Job(s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None, cfg.retries) for s in specs
     ]

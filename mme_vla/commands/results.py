@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mme_vla.config.composition import print_user_errors
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import find_records, read_records
+from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.demo import demo_records
@@ -22,11 +22,11 @@ from mme_vla.evaluation.results.tables import (
     detail,
     leaderboard,
     overview,
+    print_table,
     runs_table,
     to_csv,
     to_latex,
     to_markdown,
-    to_rich,
 )
 from mme_vla.evaluation.rollout.subgoal_score import subgoal_tables
 from mme_vla.evaluation.suites import PAPER_ORDER, TEST_EPISODES
@@ -60,10 +60,7 @@ def run(args: argparse.Namespace) -> None:
     )
     if args.demo == bool(args.runs):
         raise UserError("Name files or folders of episode records, or --demo for made-up ones (not both).")
-    if args.demo:
-        records = demo_records(DEMO)
-    else:
-        records = [record for path in find_records(args.runs) for record in read_records(path)]
+    records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
         results.notes.insert(0, "Made-up records, drawn from the paper's rates: not a result of anything.")
@@ -71,7 +68,7 @@ def run(args: argparse.Namespace) -> None:
     # Piped into a file there is no terminal to fit: as wide as the tables are.
     console = Console(width=None if sys.stdout.isatty() else 200)
     for table in _tables(results, comparisons, detailed=not args.brief):
-        console.print(to_rich(table))
+        print_table(table, console.width)
     for comparison in comparisons:
         console.print(comparison.verdict, markup=False, highlight=False)
     for note in results.notes:

@@ -11,6 +11,7 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
+from mme_vla.config.devices import find_device
 
 # Threads that wait for each other asleep: busy waiting slows a step tenfold when anything else runs on the same cores
 # (data workers do). It counts only when set before PyTorch is imported.
@@ -54,11 +55,13 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     from mme_vla.training.loop import Trainer
     from mme_vla.training.runs import CONFIG, open_run
     from mme_vla.training.settings import TrainSettings
-    from mme_vla.training.start import start_from
+    from mme_vla.training.start import start_from, weights_to_start_from
     from mme_vla.training.validation import Validation
 
     settings = TrainSettings.from_dict(config["train"], config["seed"])
     check_logger(config)
+    if settings.device == "cuda":
+        find_device("cuda")  # says so where there is none
     accelerator = Accelerator(cpu=settings.device == "cpu")
     chosen: list[Any] = [open_run(folder, config["resume"], config)]
     run = broadcast_object_list(chosen)[0]  # the clock is in the folder's name: the first process decides
@@ -68,10 +71,11 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     first = accelerator.is_main_process
     line = ProgressLine(settings.steps, run.step, shown=first)
     # A backbone whose weights are about to be replaced is not drawn first.
-    policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and not config["init_from"])
+    init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
+    policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
     check_frozen(policy, config["finetune"]["freeze_vision"])
-    if run.checkpoint is None and config["init_from"]:
-        line.say(start_from(policy, config["init_from"]))
+    if init_from is not None:
+        line.say(start_from(policy, init_from))
     apply_finetuning(policy, **config["finetune"])
     if run.checkpoint is not None:
         assign_tensors(policy, load_tensors(run.checkpoint), str(run.checkpoint))

@@ -7,10 +7,11 @@ work starts, and come back as one `UserError` with the near names.
 import functools
 import importlib
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import zip_longest
 from pathlib import Path
 
@@ -20,14 +21,17 @@ from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path, get_args_parser
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree
+from mme_vla.config.help import help_page, unknown_option
+from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
 from mme_vla.errors import UserError
+from mme_vla.policy.variant import Sections, decisive, variant_name
 
 VERSION_BASE = "1.3"
 
@@ -68,7 +72,8 @@ def compose(
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
-        return cfg
+    name_variant(cfg, config_name, directory, extra_dirs)
+    return cfg
 
 
 def check_overrides(
@@ -88,6 +93,68 @@ def check_overrides(
         # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
         chosen = [column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column]
         compose(config_name, chosen, directory=directory, extra_dirs=extra_dirs)
+
+
+def name_variant(cfg: DictConfig, config_name: str, directory: Path, extra_dirs: Sequence[Path] = ()) -> None:
+    """Set `name` to what the composition is (`mme_vla.policy.variant`); a tree without models has no such name."""
+    if {"name", "memory"} <= set(cfg):
+        trees = (directory.resolve(), *(folder.resolve() for folder in extra_dirs))
+        cfg.name = _true_name(cfg, config_name, trees)
+
+
+def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
+    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
+    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
+    theirs = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
+
+    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
+        # The library's own files do not change while a process runs; a user's may, between two cells of a notebook.
+        fixed = searched == (config_dir().resolve(),)
+        return (_cached_sections if fixed else _composed_sections)(config_name, words, searched)
+
+    def parts() -> Sections | None:
+        chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
+        words = (f"{group}={section.name if section else 'none'}" for group, section in chosen.items())
+        found = composed(tuple(words), trees)
+        return None if found is None else found[1]
+
+    return variant_name(
+        str(cfg.name),
+        decisive(cfg),
+        mine | theirs,
+        lambda model: composed((f"model={model}",), trees[:1] if model in theirs else trees),
+        parts,
+    )
+
+
+def _composed_sections(
+    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
+) -> tuple[str, Sections] | None:
+    """Name and decisive keys of a composition; None where these words do not compose."""
+    with _own_hydra(trees[0], trees[1:]):
+        try:
+            cfg = hydra.compose(config_name, list(overrides))
+            return str(cfg.name), decisive(cfg)
+        except COMPOSITION_ERRORS:
+            return None
+
+
+_cached_sections = functools.cache(_composed_sections)
+
+
+def _name_under_hydra(*, _root_: DictConfig) -> str:
+    """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on the run's folder."""
+    if not HydraConfig.initialized():
+        return str(_root_.name)  # `compose` and the command have set it
+    running = HydraConfig.get()
+    trees = [Path(source.path) for source in running.runtime.config_sources if source.schema == "file"]
+    # A job's main tree is asked first, whatever the order in which Hydra searches.
+    main = [Path(s.path) for s in running.runtime.config_sources if s.provider == "main" and s.schema == "file"]
+    ordered = tuple(dict.fromkeys(tree.resolve() for tree in (*main, *trees)))
+    return _true_name(_root_, str(running.job.config_name), ordered) if ordered else str(_root_.name)
+
+
+OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
 
 
 def import_plugins(cfg: DictConfig) -> None:
@@ -129,6 +196,8 @@ def cli[T](
         def job(cfg: DictConfig) -> T:
             with print_user_errors():
                 _require_values(cfg)
+                if {"name", "memory"} <= set(cfg):
+                    cfg.name = _name_under_hydra(_root_=cfg)
                 import_plugins(cfg)
                 return main(cfg)
 
@@ -149,11 +218,51 @@ def cli[T](
 
 
 def _check_command_line(config_name: str, tree: Path) -> None:
-    args = get_args_parser().parse_args()
+    args, rest = get_args_parser().parse_known_args()
+    if rest:
+        raise unknown_option(rest[0], sys.argv[1:], known_keys(config_name, tree))
+    if args.help:
+        extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
+        _show(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
+        raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
     extra = [Path(args.config_dir).resolve()] if args.config_dir else []
     check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
+
+
+def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
+    """What a command answers to `--help` and these words (`mme_vla.config.help`).
+
+    Args:
+        trees: folders of YAML files, the library's first.
+
+    Raises:
+        UserError: a word that is neither a group nor an override that fits.
+    """
+
+    def chosen(overrides: Sequence[str]) -> dict[str, str]:
+        compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
+        with _own_hydra(trees[0], trees[1:]):
+            cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
+            taken = cfg.hydra.runtime.choices.items()
+            words = {group: "null" if name is None else str(name) for group, name in taken}
+            return {group: name for group, name in words.items() if not group.startswith("hydra/")}
+
+    return help_page(config_name, words, trees, chosen)
+
+
+def _show(text: str) -> None:
+    with suppress(BrokenPipeError):  # `--help | head` has read enough
+        print(text, flush=True)
+        return
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def known_keys(config_name: str, tree: Path) -> list[str]:
+    """Every dotted key of a command's configuration as it is by default."""
+    with _own_hydra(tree, []):
+        return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
 
 
 def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from difflib import get_close_matches
 from typing import Any
 
 import hydra
@@ -101,15 +102,22 @@ def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
     if not isinstance(section, Mapping):
         return f"Unknown config key {key!r}: {where!r} is a value ({section!r}), not a section."
     options = {str(name) for name in section} | (set() if parents else set(groups) - {"hydra"})
-    elsewhere = [path for path in _paths(defaults) if path.split(".")[-1] == rest[0]]
+    everywhere = list(paths(defaults))
+    elsewhere = [path for path in everywhere if path.split(".")[-1] == rest[0]]
+    if not elsewhere and not parents:
+        # `train.device` where there is `device`, `mode` where there is `subgoal_mode`.
+        last = rest[-1]
+        elsewhere = [p for p in everywhere if last == p.split(".")[-1] or last in p.split(".")[-1].split("_")]
+        elsewhere += [name for name in get_close_matches(rest[0], options) if elsewhere and len(rest) == 1]
     if elsewhere:
         return f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, elsewhere[:3]))}?"
     within = f" In {where!r}:" if where else ""
     return f"Unknown config key {key!r}.{within} {did_you_mean(rest[0], options)}"
 
 
-def _paths(tree: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:
+def paths(tree: Any, prefix: str = "") -> Iterator[str]:
+    """Every dotted key of nested mappings, sections before what is in them."""
     for key, value in tree.items():
         yield f"{prefix}{key}"
         if isinstance(value, Mapping):
-            yield from _paths(value, f"{prefix}{key}.")
+            yield from paths(value, f"{prefix}{key}.")

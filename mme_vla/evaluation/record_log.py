@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO, Self
 
 from mme_vla.errors import UserError
-from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
 
 RECORDS = "episodes.jsonl"
 """Name of a run's file; its shards are called `episodes-<shard>.jsonl`."""
@@ -92,6 +92,18 @@ def read_records(path: Path) -> list[EpisodeRecord]:
                 continue
             raise UserError(f"{path}, line {number}, is not an episode record: {error}") from None
     return records
+
+
+def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
+    """Read files of records; those of one folder belong together (`complete_compositions`).
+
+    Raises:
+        UserError: as `read_records`.
+    """
+    folders: dict[Path, list[EpisodeRecord]] = {}
+    for path in paths:
+        folders.setdefault(path.resolve().parent, []).extend(read_records(path))
+    return [record for records in folders.values() for record in complete_compositions(records)]
 
 
 def find_records(paths: Iterable[Path]) -> list[Path]:

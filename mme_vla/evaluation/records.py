@@ -1,8 +1,8 @@
 """What is kept of an evaluated episode, and how records come together into runs."""
 
 import json
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple, Self
 
@@ -20,6 +20,7 @@ class RunKey(NamedTuple):
     checkpoint: int | str
     model_seed: int
     split: str
+    composition: str | None = None
 
     def __str__(self) -> str:
         name = self.model if self.subgoal is None else f"{self.model}+{self.subgoal}"
@@ -59,6 +60,8 @@ class EpisodeRecord:
     steps: actions executed. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
+    composition: `mme_vla.policy.variant.composition_digest` of the policy, so that no two configurations are averaged under
+        one name; None in records written before there was one, and of players that are no policy of this library.
     extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.
     """
@@ -79,6 +82,7 @@ class EpisodeRecord:
     action_space: str = "joint_angle"
     subgoal: str | None = None
     memory_budget: int | None = None
+    composition: str | None = None
     when: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
     extra: dict[str, Any] = field(default_factory=dict)
 
@@ -90,6 +94,8 @@ class EpisodeRecord:
             if not isinstance(value, kind) or isinstance(value, bool):
                 wanted = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
                 raise UserError(f"{name}={value!r} of a record must be {wanted}, not {type(value).__name__}.")
+        if self.composition is not None and not isinstance(self.composition, str):
+            raise UserError(f"composition={self.composition!r} of a record must be text, or null.")
         if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
             object.__setattr__(self, "checkpoint", int(self.checkpoint))
 
@@ -99,7 +105,8 @@ class EpisodeRecord:
 
     @property
     def run(self) -> RunKey:
-        return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split)
+        return RunKey(self.model, self.subgoal, self.memory_budget, self.checkpoint, self.model_seed, self.split,
+                      self.composition)  # fmt: skip
 
     @property
     def key(self) -> EpisodeKey:
@@ -172,6 +179,23 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
         if (conflicts == "last") == (new.when > old.when):
             kept[at] = new
     return list(kept.values())
+
+
+def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
+    """Give records without a digest the one that others of their run have; only for the records of one folder.
+
+    `run.json` sees to it that a folder holds one configuration: a run that was begun before records had digests and
+    ended after is one run. Where a run's other records have none, or several, nothing is assumed.
+    """
+    digests: dict[RunKey, set[str]] = {}
+    for record in records:
+        if record.composition is not None:
+            digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
+    only = {run: next(iter(found)) for run, found in digests.items() if len(found) == 1}
+    return [
+        replace(record, composition=only[record.run]) if record.composition is None and record.run in only else record
+        for record in records
+    ]
 
 
 def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:

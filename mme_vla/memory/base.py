@@ -99,7 +99,7 @@ def whole_frames(frames: np.ndarray, grid: int) -> np.ndarray:
 def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
     """(frame, patch) [n, 2] → (frame, row, column) [n, 3] float32, rows and columns at patch centres in grid lines.
 
-    An 8×8 patch y sits at 2y + 1, a 4×4 patch at 4y + 2 (policy.md, 5.2).
+    An 8×8 patch y sits at 2y + 1, a 4×4 patch at 4y + 2.
     """
     frame, patch = indices[:, 0], indices[:, 1]
     cell = GRID / grid

@@ -1,24 +1,18 @@
 """A run of episodes: which ones, where their records go, which are still to be played, and how they compare."""
 
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from mme_vla.envs.metadata import SPLITS
-from mme_vla.envs.metadata import episodes as episodes_of
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.run_file import claim_run
 from mme_vla.evaluation.suites import PAPER_ORDER
 from mme_vla.play.game import ChoiceSession, EpisodeId
-
-ALL = "all"
 
 
 def make_session(
@@ -143,45 +137,11 @@ class PlayRun:
         self._log.close()
 
 
-def choose_episodes(task: str | Sequence[str], episodes: Any, split: str) -> list[EpisodeId]:
-    """The episodes that the command line names, task by task.
-
-    Args:
-        task: a name, several, or `all`.
-        episodes: numbers of the split: 3, [0, 2], `0-9`, `0-3,7` or `all`.
-        split: `train`, `val` or `test`.
+def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str) -> list[EpisodeId]:
+    """The episodes that the command line names, task by task, by the grammar of all commands (`mme_vla.envs.episodes`).
 
     Raises:
         UserError: an unknown task or split, or episodes that the split has not.
     """
-    if split not in SPLITS:
-        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), SPLITS)}")
-    names = [name.strip() for name in task.split(",")] if isinstance(task, str) else [str(name) for name in task]
-    names = list(PAPER_ORDER) if names == [ALL] else names
-    for name in names:
-        if name not in TASK_NAMES:
-            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, ALL])}")
-    numbers = _numbers(episodes, SPLITS[split], split)
-    chosen = []
-    for name in dict.fromkeys(names):
-        table = episodes_of(name, split)
-        chosen += [EpisodeId(name, split, n, table[n].seed, table[n].difficulty) for n in numbers]
-    if not chosen:
-        raise UserError("There is nothing to play: name at least one task and one episode.")
-    return chosen
-
-
-def _numbers(episodes: Any, count: int, split: str) -> list[int]:
-    if episodes == ALL:
-        return list(range(count))
-    parts = episodes if isinstance(episodes, Sequence) and not isinstance(episodes, str) else str(episodes).split(",")
-    numbers: list[int] = []
-    for part in parts:
-        span = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", str(part))
-        if span is None:
-            raise UserError(f"episodes={episodes!r} is not understood; write 3, [0,2], 0-9, or all.")
-        first, last = int(span[1]), int(span[2] or span[1])
-        if first > last or last >= count:
-            raise UserError(f"The split {split!r} has the episodes 0 to {count - 1}; asked for {str(part).strip()}.")
-        numbers += range(first, last + 1)
-    return list(dict.fromkeys(numbers))
+    specs = choose_specs(tasks, episodes, split)
+    return [EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty) for spec in specs]

@@ -80,11 +80,11 @@ class Policy(Saved):
         """Begin an episode: its memory, its noise and its current view live in the returned object alone."""
         return Episode(self, goal, seed)
 
-    def act(self, episodes: Sequence[Episode], steps: int | None = None) -> np.ndarray:
-        """Choose the next chunk for many episodes in one batch, adding nothing to their memories.
+    def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
+        """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
 
         Returns:
-            float32 [n, h, width]: actions as the embodiment executes them.
+            float32 [n, h, width], or [h, width] for one episode: actions as the embodiment executes them.
         """
         raise NotImplementedError
 

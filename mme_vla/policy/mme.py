@@ -210,12 +210,15 @@ class MMEPolicy(Policy):
 
     # Episodes
 
-    def act(self, episodes: Sequence[Episode], steps: int | None = None) -> np.ndarray:
-        """Choose the next chunk for many episodes in one batch, adding nothing to their memories.
+    def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
+        """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
 
         Returns:
-            float32 [n, h, 8]: absolute joint targets and gripper commands.
+            float32 [n, h, 8], or [h, 8] for one episode: absolute joint targets and gripper commands.
         """
+        if isinstance(episodes, Episode):
+            alone: np.ndarray = self.act([episodes], steps)[0]
+            return alone
         if not episodes:
             return np.zeros((0, self.horizon, 8), np.float32)
         processor = self.require_processor()

@@ -113,12 +113,35 @@ def step_of(checkpoint: Path) -> int:
     return int(match[1]) if match else -1
 
 
+LATEST = "latest"
+"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
+
+
+def find_run(path: Path) -> Path:
+    """`path`, or the newest run where it ends in `latest`, as in `outputs/tokendrop_expert/latest`.
+
+    Raises:
+        UserError: there is no run with a checkpoint beside it.
+    """
+    if path.name != LATEST or path.exists():
+        return path
+    runs = [run for run in path.parent.glob("*") if checkpoints_in(run / "checkpoints")]
+    if not runs:
+        raise UserError(
+            f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another."
+        )
+    return max(runs, key=lambda run: (checkpoints_in(run / "checkpoints")[-1].stat().st_mtime_ns, run.name))
+
+
 def resolve_checkpoint(path: Path) -> Path:
     """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
+
+    A path that ends in `latest` stands for the newest run of its folder.
 
     Raises:
         UserError: there is no checkpoint.
     """
+    path = find_run(path)
     for folder in (path, path / "checkpoints"):
         found = checkpoints_in(folder)
         if found:

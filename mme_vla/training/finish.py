@@ -29,12 +29,31 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
         loggers.picture(settings.steps, "open_loop", folder / PLOT)
         summary["open_loop"] = result.summary()
         line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))
+        if verdict := worse_than_still(summary["open_loop"], settings.steps):
+            line.say(verdict)
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
     (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
     line.say(f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth of the run)")
     line.say(f"checkpoint: {trainer.last_checkpoint}")
     return summary
+
+
+def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
+    """A sentence on the joints that holding still would predict better; empty where there are none.
+
+    Args:
+        summary: of the open-loop check. steps: updates of the run.
+    """
+    pairs = zip(summary["mean_abs_error"], summary["mean_abs_error_holding_still"], strict=True)
+    worse = sum(error > still for error, still in pairs)
+    if not worse:
+        return ""
+    return (
+        f"{worse} of {len(summary['joints'])} joints are predicted worse than by holding still (the robot moves little "
+        f"within a chunk): {steps:,} updates on this data are too few for a policy. They show that everything runs; "
+        "raise train.steps, or train on more data, before evaluating."
+    )
 
 
 def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict[str, float]:

@@ -13,11 +13,13 @@ CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json",
 CHECKPOINTS = "checkpoints"
 
 MAY_DIFFER = (
-    "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
+    "name", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
     "train.save_every", "train.keep", "train.workers", "train.open_loop_chunks", "train.device",
     "data.cache",
 )  # fmt: skip
-"""Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss."""
+"""Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss.
+
+The name too: it follows from the sections that are compared, and runs of earlier versions may be called otherwise."""
 
 
 @dataclass(frozen=True)

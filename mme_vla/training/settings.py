@@ -71,7 +71,8 @@ class TrainSettings:
         _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
         betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
         _check("betas", self.betas, betas, "two numbers in [0, 1)")
-        _check("device", self.device, self.device in ("auto", "cpu"), "auto (a GPU where there is one) or cpu")
+        _check("device", self.device, self.device in ("auto", "cpu", "cuda"),
+               "auto (a GPU where there is one), cuda or cpu; which GPU is said by CUDA_VISIBLE_DEVICES")  # fmt: skip
         _check(
             "batch_size",
             self.batch_size,

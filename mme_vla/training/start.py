@@ -2,9 +2,26 @@
 
 from pathlib import Path
 
+from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
-from mme_vla.training.checkpoint import checkpoints_in, resolve_checkpoint
+from mme_vla.training.checkpoint import checkpoints_in, find_run, resolve_checkpoint
 from mme_vla.weights import transfer
+
+ASK, NONE = "ask", "none"
+
+
+def weights_to_start_from(init_from: str | None) -> str | None:
+    """What `init_from` names; None for random weights.
+
+    Raises:
+        UserError: a recipe that is meant for trained weights (`init_from: ask`) was given none.
+    """
+    if init_from == ASK:
+        raise UserError(
+            "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
+            "To train the whole network from random weights, say so: init_from=none."
+        )
+    return None if init_from in (None, NONE) else init_from
 
 
 def start_from(policy: Policy, source: str) -> str:
@@ -21,7 +38,7 @@ def start_from(policy: Policy, source: str) -> str:
         UserError: no checkpoint, another tokenizer, a weight of another shape, or weights missing that are not the
             memory's.
     """
-    folder = Path(source)
+    folder = find_run(Path(source))
     if checkpoints_in(folder) or checkpoints_in(folder / "checkpoints"):
         source = str(resolve_checkpoint(folder))
     return f"weights from {source}: {transfer(policy, source)}"

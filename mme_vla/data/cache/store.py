@@ -237,13 +237,14 @@ def run(cfg: "DictConfig") -> None:
     from mme_vla.data.cache.building import build_cache, clear_cache, estimate
     from mme_vla.data.sources import open_sources
     from mme_vla.policy.build import build_from_config
-    from mme_vla.training.start import start_from
+    from mme_vla.training.start import start_from, weights_to_start_from
 
     if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise UserError("rebuild=true removes files that other processes write: run it once without torchrun first.")
-    policy = build_from_config(cfg, fresh_backbone=cfg.init_from is None)
-    if cfg.init_from is not None:
-        print(start_from(policy, cfg.init_from))
+    init_from = weights_to_start_from(cfg.init_from)
+    policy = build_from_config(cfg, fresh_backbone=init_from is None)
+    if init_from is not None:
+        print(start_from(policy, init_from))
     device = _device(cfg.device)
     memory = policy.to(device).memory
     if memory is None:

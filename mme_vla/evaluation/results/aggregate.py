@@ -4,6 +4,7 @@ Nothing incomplete is averaged: a run enters a figure only if it has every episo
 says how many of its episodes there are.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -12,7 +13,7 @@ import numpy as np
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.intervals import Interval, bootstrap, mean_std, task_interval
+from mme_vla.evaluation.results.intervals import Interval, bootstrap, mean_std, task_interval, wilson
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
 from mme_vla.evaluation.results.scopes import Protocol, Scope, scopes
 from mme_vla.evaluation.suites import DIFFICULTIES, MAX_STEPS, PAPER_ORDER, task_facts
@@ -79,6 +80,7 @@ class Method:
     memory_budget: int | None
     runs: list[Run]
     paper: PaperMethod | None
+    composition: str | None = None
     figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
 
     @property
@@ -142,20 +144,38 @@ def aggregate(
             f"None of the {len(chosen)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
         )
     _check_environments(counted)
-    groups: dict[tuple[str, str | None, int | None], list[Run]] = {}
+    groups: dict[tuple[str, str | None, int | None, str | None], list[Run]] = {}
     for key, members in by_run(counted).items():
         run = Run(key, {record.key: record for record in members}, protocol)
-        groups.setdefault((key.model, key.subgoal, key.memory_budget), []).append(run)
+        groups.setdefault((key.model, key.subgoal, key.memory_budget, key.composition), []).append(run)
     methods = [_method(*group, runs, protocol) for group, runs in groups.items()]
-    return Results(methods, protocol, _notes(methods, protocol, len(chosen) - len(inside)))
+    apart = _tell_apart(methods)
+    return Results(methods, protocol, [*apart, *_notes(methods, protocol, len(chosen) - len(inside))])
 
 
-def _method(model: str, subgoal: str | None, budget: int | None, runs: list[Run], protocol: Protocol) -> Method:
+def _tell_apart(methods: Sequence[Method]) -> list[str]:
+    """Give methods of one name but different configurations labels of their own, and say so."""
+    notes = []
+    for label in [name for name, count in Counter(method.label for method in methods).items() if count > 1]:
+        same = [method for method in methods if method.label == label]
+        for method in same:
+            method.label = f"{label}#{(method.composition or 'unrecorded')[:10]}"
+        notes.append(
+            f"{len(same)} different configurations are called {label}; they are not averaged: "
+            f"{', '.join(method.label for method in same)} (the digest of `composition` in their records"
+            + ("; records without it are of an earlier version)." if any(m.composition is None for m in same) else ").")
+        )
+    return notes
+
+
+def _method(
+    model: str, subgoal: str | None, budget: int | None, composition: str | None, runs: list[Run], protocol: Protocol
+) -> Method:
     known = paper.paper_method(model, subgoal) if budget in (None, USUAL_BUDGET) else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
     runs = sorted(runs, key=lambda run: (str(run.key.checkpoint).zfill(12), run.key.model_seed))
-    method = Method(label, model, subgoal, budget, runs, known)
+    method = Method(label, model, subgoal, budget, runs, known, composition)
     for scope in scopes(protocol):
         reported = _reported(known, scope, protocol)
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
@@ -207,6 +227,11 @@ def _figure(
     else:
         episodes = {task: matrix.mean(1) for task, matrix in zip(tasks, matrices, strict=True)}
         interval = bootstrap(episodes, protocol.confidence, protocol.samples, protocol.seed)
+        if interval.low == interval.high:  # all episodes of a task alike, as with no success at all: nothing to draw
+            trials = sum(map(len, episodes.values()))
+            interval = wilson(
+                float(np.mean([values.mean() for values in episodes.values()])), trials, protocol.confidence
+            )
     percent = Interval(100 * interval.low, 100 * interval.high)
     return Figure(100 * mean, None if std is None else 100 * std, percent, **counts, paper=reported)
 

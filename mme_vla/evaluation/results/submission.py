@@ -41,6 +41,7 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
             about = [
                 run for run in runs
                 if (run["settings"].get("model"), run["settings"].get("checkpoint")) == (method.model, checkpoint)
+                and method.composition in ((run.get("notes") or {}).get("composition"), None)
             ]  # fmt: skip
             facts = next((run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")), None)
             seeds = sorted({run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint})

@@ -195,6 +195,15 @@ def to_rich(table: Table) -> "RichTable":
     return made
 
 
+def print_table(table: Table, width: int) -> None:
+    """Print for people: `width` columns, or as many as the table needs, so that no number is ever cut."""
+    from rich.console import Console
+
+    made = to_rich(table)
+    needed = Console(width=10_000).measure(made).maximum
+    Console(width=max(width, needed)).print(made)
+
+
 def to_markdown(table: Table) -> str:
     """A Markdown table under its title."""
     lines = [table.columns, [":---", *["---:"] * (len(table.columns) - 1)], *table.rows]

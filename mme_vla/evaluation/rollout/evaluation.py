@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -191,7 +192,10 @@ def default_output(facts: RunFacts) -> Path:
 def _done(output: Path, mine: Sequence[Job], facts: RunFacts) -> list[EpisodeRecord]:
     """What the folder has of these episodes, whichever shard wrote it; folders below it hold other runs."""
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
-    run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split)
+    run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
+                 facts.composition)  # fmt: skip
     wanted = {(job.task, job.episode) for job in mine}
     found = [record for path in sorted(output.glob("episodes*.jsonl")) for record in read_records(path)]
+    # run.json has seen to it that this is the same policy: records from before there were digests are of it too.
+    found = [replace(r, composition=facts.composition) if r.composition is None else r for r in found]
     return [record for record in merge(found, "first") if record.run == run and record.key in wanted]

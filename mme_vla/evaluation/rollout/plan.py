@@ -5,11 +5,11 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from mme_vla.envs import metadata
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.vector.jobs import Job
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import RECORDS
 
 
@@ -26,42 +26,13 @@ class Shard:
         return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
 
 
-def choose_episodes(
-    tasks: str | Sequence[str] = "all", episodes: int | Sequence[int] | None = None, split: str = "test"
-) -> list[Job]:
-    """The episodes of a run, task by task.
-
-    Args:
-        tasks: `all`, a name, or a list of names.
-        episodes: of every task: None for all of the split, a number for the first so many, or a list of them.
+def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test") -> list[Job]:
+    """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`).
 
     Raises:
         UserError: an unknown task, split or episode, or none at all.
     """
-    names = list(TASK_NAMES) if tasks == "all" else [tasks] if isinstance(tasks, str) else [str(t) for t in tasks]
-    if not names:
-        raise UserError("tasks=[] names no task; expected all, a task or a list of tasks.")
-    for name in names:
-        if name not in TASK_NAMES:
-            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, 'all'])}")
-    if len(set(names)) < len(names):
-        raise UserError(f"tasks={names} names a task twice.")
-    return [Job(name, split, number) for name in names for number in _numbers(name, episodes, split)]
-
-
-def _numbers(task: str, episodes: int | Sequence[int] | None, split: str) -> list[int]:
-    known = len(metadata.episodes(task, split))
-    if episodes is None:
-        return list(range(known))
-    if isinstance(episodes, int) and not isinstance(episodes, bool):
-        if not 1 <= episodes <= known:
-            raise UserError(f"episodes={episodes} asks for the first {episodes}; {task} has {known} in {split!r}.")
-        return list(range(episodes))
-    if isinstance(episodes, str) or not isinstance(episodes, Sequence):
-        raise UserError(f"episodes={episodes!r}; expected a number, or a list such as [0,1,2].")
-    if not episodes or len(set(episodes)) < len(episodes):
-        raise UserError(f"episodes={list(episodes)} must name each episode once, and at least one.")
-    return [metadata.episode(task, split, number).episode for number in episodes]
+    return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split)]
 
 
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:

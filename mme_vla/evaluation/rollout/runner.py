@@ -51,6 +51,7 @@ class RunFacts:
     max_steps: int = 1300
     subgoal: str | None = None
     memory_budget: int | None = None
+    composition: str | None = None
 
 
 @dataclass

@@ -1,0 +1,109 @@
+"""Which episodes a command is about: one grammar of `tasks=`, `episodes=` and `split=` for all of them."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from mme_vla.envs import metadata
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.errors import UserError, did_you_mean
+
+ALL = "all"
+GRAMMAR = "3 for the first three, [3] for number three, 0-9 for a range, [0-3,7] for several, or all"
+
+
+def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
+    """Names of tasks in the order they are named, each once.
+
+    Args:
+        tasks: `all`, a name, several in one text (`StopCube,BinFill`), or a list of names.
+
+    Raises:
+        UserError: an unknown task, one named twice, or none.
+    """
+    names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
+    names = [str(name).strip() for name in names]
+    names = list(TASK_NAMES) if names == [ALL] else names
+    for name in names:
+        if name not in TASK_NAMES:
+            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, ALL])}")
+    if not names or len(set(names)) < len(names):
+        raise UserError(f"tasks={tasks} must name each task once, and at least one.")
+    return names
+
+
+def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[int]:
+    """Numbers of episodes.
+
+    Args:
+        episodes: None or `all` for all there are, a number for the first so many, a list of numbers, or text of
+            numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three alone, `3` the first three.
+        count: how many episodes there are. what: of what, for messages.
+
+    Raises:
+        UserError: a number that there is not, one named twice, none, or another form.
+    """
+    if episodes is None or episodes == ALL:
+        return list(range(count))
+    if isinstance(episodes, int) and not isinstance(episodes, bool):
+        if not 1 <= episodes <= count:
+            alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
+            raise UserError(f"episodes={episodes} asks for the first {episodes}; {what} has {count}.{alone}")
+        return list(range(episodes))
+    if isinstance(episodes, str):
+        parts: list[Any] = episodes.split(",")
+    elif isinstance(episodes, Sequence):
+        parts = list(episodes)
+    else:
+        raise UserError(f"episodes={episodes!r} is not understood; write {GRAMMAR}.")
+    spans = [_span(part, episodes) for part in parts]
+    for span in spans:
+        if span.stop > count:
+            raise UserError(f"There is no episode {span.stop - 1} in {what}, which has {count}: 0 to {count - 1}.")
+    numbers = [number for span in spans for number in span]
+    if not numbers or len(set(numbers)) < len(numbers):
+        raise UserError(f"episodes={episodes} must name each episode once, and at least one.")
+    return numbers
+
+
+def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, split: str = "test") -> list[EpisodeSpec]:
+    """The episodes of a run, task by task.
+
+    Raises:
+        UserError: an unknown task or split, or as `choose_numbers`.
+    """
+    chosen = []
+    for task in choose_tasks(tasks):
+        known = metadata.episodes(task, split)
+        chosen += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
+    return chosen
+
+
+def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
+    """What `tasks=` says, or `task=`, which means the same.
+
+    Args:
+        config: a command's; `tasks` is `all` by default where the command needs no tasks, else None.
+
+    Raises:
+        UserError: both are given and differ, or neither is.
+    """
+    tasks, task = (config.get(key) for key in ("tasks", "task"))
+    if task is not None and tasks not in (None, ALL, task):
+        raise UserError(f"tasks={tasks} and task={task} mean the same: give one of them.")
+    given = tasks if task is None else task
+    if given is None:
+        raise UserError("Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
+    return given if isinstance(given, str) else [str(name) for name in given]
+
+
+def _span(part: Any, episodes: Any) -> range:
+    """The numbers of one part: a number, or `first-last`, both included."""
+    found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
+    if found is None or isinstance(part, bool | float):
+        raise UserError(f"episodes={episodes!r} is not understood; write {GRAMMAR}.")
+    first, last = int(found[1]), int(found[2] or found[1])
+    if first > last:
+        raise UserError(f"episodes={episodes}: the range {part} ends before it begins.")
+    return range(first, last + 1)

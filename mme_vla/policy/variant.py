@@ -1,0 +1,117 @@
+"""What a composition is called, and a digest that tells compositions apart.
+
+A model's name stands in folders, cards and records, so it must be true: `memory=framesamp integration=modulator` on
+top of another model is `framesamp_modul`, and a composition that no file of `configs/model` describes gets a name of
+its own, built from its parts and from what differs (`framesamp_modul-pooling_max`).
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
+"""Sections that make one variant another; the backbone's size and the training do not."""
+FREE = ("memory.budget", "processor.tokenizer")
+"""Keys in them that do not: a budget has a field of its own in records, the tokenizer goes with the backbone."""
+LONGEST = 32
+"""Letters that differences may take in a name; more are a digest."""
+
+Sections = dict[str, Any]
+"""Flat dotted keys of the decisive sections, those that are set."""
+Reference = Callable[[str], tuple[str, Sections] | None]
+"""From the file name of a model to its name and sections; None where it cannot be composed."""
+
+
+def decisive(cfg: DictConfig) -> Sections:
+    """The keys of a composed configuration that make it the variant it is."""
+    found: Sections = {}
+    for key in DECISIVE:
+        if key in cfg:
+            value = cfg[key]
+            plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            found |= _flat({key: plain})
+    return {key: value for key, value in found.items() if value is not None and key not in FREE}
+
+
+def variant_name(
+    given: str, sections: Sections, models: Iterable[str], reference: Reference, parts: Callable[[], Sections | None]
+) -> str:
+    """The name of a composition.
+
+    Args:
+        given: what the chosen model's file calls it. sections: `decisive` of the composition.
+        models: the files of the group `model`. reference: what each of them composes to.
+        parts: what the memory and the integration compose to with no value changed; None where that is not known.
+
+    Returns:
+        `given` if the user chose a name that is no model's, or if it is true; else the name of the model that equals
+        the composition; else that of the nearest model with the same parts (or the parts' names) with the differences.
+    """
+    names = sorted(models)
+    if given not in names:
+        return given
+    own = reference(given)
+    if own is not None and own[1] == sections:
+        return own[0]
+    known = [found for found in map(reference, names) if found is not None]
+    for name, theirs in known:
+        if theirs == sections:
+            return name
+    alike = [found for found in known if _parts(found[1]) == _parts(sections)]
+    if alike:
+        name, base = min(alike, key=lambda found: (found[0] != given, len(_differences(found[1], sections))))
+        return f"{name}-{_suffix(_differences(base, sections))}"
+    name = "_".join(part for part in _parts(sections) if part) or "memoryless"
+    plain = parts()
+    if plain == sections:
+        return name
+    return f"{name}-{_suffix(_differences(plain or {}, sections), words=plain is not None)}"
+
+
+def composition_digest(config: Mapping[str, Any]) -> str:
+    """Twelve letters that are equal for two policies exactly if they are composed alike, sizes included.
+
+    Args:
+        config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was trained on and in
+            which precision it computes do not count; nor do keys that are not set, so that a later option with an
+            empty default changes no digest.
+    """
+    kept = _flat({key: config.get(key) for key in (*DECISIVE, "backbone")})
+    kept = {key: value for key, value in kept.items() if value is not None and key != "processor.tokenizer"}
+    return _digest(kept, 12)
+
+
+def _parts(sections: Sections) -> tuple[str, str]:
+    return str(sections.get("memory.name", "")), str(sections.get("integration.name", ""))
+
+
+def _differences(base: Sections, sections: Sections) -> Sections:
+    keys = sorted(base.keys() | sections.keys())
+    return {key: sections.get(key) for key in keys if base.get(key) != sections.get(key)}
+
+
+def _suffix(differences: Sections, words: bool = True) -> str:
+    """The differences in words where these are short, else a digest of them."""
+    text = "-".join(f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items())
+    return text if words and len(text) <= LONGEST else _digest(differences, 6)
+
+
+def _word(value: Any) -> str:
+    plain = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return re.sub(r"[^\w.]+", "_", plain).strip("_.")
+
+
+def _digest(values: Mapping[str, Any], letters: int) -> str:
+    text = json.dumps(values, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:letters]
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
+    flat: Sections = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return flat

@@ -1,0 +1,94 @@
+"""What a newcomer meets between the first training and the first table."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import REPOSITORY
+
+from mme_vla.config.composition import compose
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.tables import Table, print_table
+from mme_vla.testing.small import small_policy
+from mme_vla.training.checkpoint import find_run, resolve_checkpoint
+from mme_vla.training.finish import worse_than_still
+from mme_vla.training.start import weights_to_start_from
+
+
+def test_latest_is_the_run_that_wrote_a_checkpoint_last(tmp_path: Path) -> None:
+    import os
+
+    for age, run in enumerate(("b", "a", "unfinished")):
+        step = tmp_path / run / "checkpoints" / "step_000010"
+        step.mkdir(parents=True)
+        if run != "unfinished":
+            (step / "training_state.json").write_text("{}")
+        os.utime(step, (1000 + age, 1000 + age))
+    assert find_run(tmp_path / "latest") == tmp_path / "a"
+    assert resolve_checkpoint(tmp_path / "latest") == tmp_path / "a" / "checkpoints" / "step_000010"
+    with pytest.raises(UserError, match="No run with a checkpoint in"):
+        resolve_checkpoint(tmp_path / "a" / "latest")
+
+
+def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
+    asked = compose("train", ["experiment=robomme"]).init_from
+    with pytest.raises(UserError, match="init_from=none"):
+        weights_to_start_from(asked)
+    assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=none"]).init_from) is None
+    assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=x/y"]).init_from) == "x/y"
+    assert weights_to_start_from(compose("train", []).init_from) is None
+
+
+def test_a_run_that_is_worse_than_holding_still_says_why() -> None:
+    summary = {"joints": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
+    assert worse_than_still(summary, 350).startswith("1 of 2 joints are predicted worse than by holding still")
+    assert "350 updates" in worse_than_still(summary, 350)
+    assert worse_than_still({**summary, "mean_abs_error": [0.05, 0.1]}, 350) == ""
+
+
+def test_one_episode_acts_as_it_does_in_a_list() -> None:
+    policy = small_policy("pi05")
+    frame, state = np.full((1, 256, 256, 3), 90, np.uint8), np.zeros((1, 8), np.float32)
+    chunks = []
+    for alone in (True, False):
+        episode = policy.start_episode("pick up the red cube", seed=3)
+        episode.observe({"image": frame, "wrist_image": frame}, state)
+        chunks.append(policy.act(episode) if alone else policy.act([episode])[0])
+    assert chunks[0].ndim == 2
+    np.testing.assert_array_equal(*chunks)
+
+
+@pytest.mark.parametrize("won", [False, True])
+def test_the_average_of_nothing_but_failures_has_an_interval(won: bool) -> None:
+    outcome = "success" if won else "fail"
+    records = [
+        EpisodeRecord("pi05", 1, 7, task, episode, episode, "easy", outcome, 9)
+        for task in ("BinFill", "StopCube")
+        for episode in range(2)
+    ]
+    figures = aggregate(records, Protocol(("BinFill", "StopCube"), 2)).methods[0].figures
+    average, task = figures["average"]["average"].interval, figures["task"]["BinFill"].interval
+    assert average is not None
+    assert task is not None
+    assert 30 < average.high - average.low < task.high - task.low
+
+
+def test_a_narrow_terminal_cuts_no_number(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(Table("t", ["method", *"abcdefgh"], [["framesamp_modul", *["64.94 ± 1.99"] * 8]]), 40)
+    printed = capsys.readouterr().out
+    assert printed.count("64.94 ± 1.99") == 8
+    assert "framesamp_modul" in printed
+
+
+def test_the_demonstration_takes_own_memories_and_always_shows_the_one_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(REPOSITORY / "examples")
+    import memory_matters
+
+    assert memory_matters.models_of(["mine"]) == ["mine", "pi05"]
+    assert memory_matters.models_of(["pi05", "ttt_modul"]) == ["pi05", "ttt_modul"]
+    monkeypatch.chdir(REPOSITORY / "examples" / "last_frames")
+    learned = memory_matters.learn("last_frames_context", steps=1, episodes=2, config_dir=Path("configs"))
+    assert (learned["model"], learned["steps"]) == ("last_frames_context", 1)
