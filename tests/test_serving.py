@@ -153,9 +153,9 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
         client = served.client()
         front = np.zeros((2000, 64, 64, 3), np.uint8)
         client._socket.send(pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((2000, 8), "f4")}))
-        wait_until(lambda: len(served.server.engine._videos) > 0 or served.busy)
+        wait_until(lambda: len(served.server.engine.turns.reading) > 0 or served.busy)
         client._socket.socket.shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: served.server.stats.connections == 0 and not served.server.engine._videos)
+        wait_until(lambda: served.server.stats.connections == 0 and not served.server.engine.turns.reading)
         with served.client() as other:
             by_challenge(other, course()[:1])
 
@@ -260,6 +260,7 @@ def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
             b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
             b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
         )
+        assert slow.recv(12) == b"HTTP/1.1 101"
         reset = pack({"reset": True})
         frame = b"\x82" + bytes([0x80 | len(reset)]) + b"\0\0\0\0" + reset
         slow.setblocking(False)
