@@ -4,7 +4,6 @@ import gc
 import socket
 import threading
 import time
-import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 
@@ -354,10 +353,3 @@ def test_unpacked_metadata_is_the_first_message(served):
         assert unpack(raw.recv(10))["server"] == "mme_vla"
         raw.send(pack({"reset": True}))
         assert unpack(raw.recv(10))["reset_finished"] is True
-
-
-def test_client_and_server_use_nothing_that_is_about_to_go(served):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with served.client() as client:
-            client.reset()

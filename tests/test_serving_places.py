@@ -5,6 +5,7 @@ import re
 import socket
 import threading
 import time
+import warnings
 import weakref
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -226,3 +227,10 @@ def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeyp
 def test_an_empty_key_is_none():
     assert ServeSettings.from_dict({"api_key": ""}).api_key is None
     assert ServeSettings.from_dict({"api_key": "right"}).api_key == "right"
+
+
+def test_the_client_uses_nothing_that_is_about_to_go(policy):
+    with Served(policy) as served, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with served.client() as client:
+            assert client.reset()["reset_finished"] is True
