@@ -15,7 +15,7 @@ PACKAGE = REPOSITORY / "mme_vla"
 
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
-    "play", "loading", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy",
+    "play", "loading", "testing", "evaluation", "serving", "batching", "training", "data", "envs", "weights", "build", "policy",
     "saving", "episode", "subgoal", "finetune", "card", "processing", "integration", "memory", "backbone",
     "config", "config_errors", "hub", "pretrained", "naming", "types", "registry", "devices", "files", "errors",
 ]  # fmt: skip

@@ -181,6 +181,15 @@ class Episode:
             raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
         return executed
 
+    @property
+    def noise_state(self) -> Tensor:
+        """Where the noise stands. Set back, it draws the same again: for a batch that failed and is repeated."""
+        return self._generator.get_state()
+
+    @noise_state.setter
+    def noise_state(self, state: Tensor) -> None:
+        self._generator.set_state(state)
+
     def draw_noise(self) -> Tensor:
         """The next chunk's starting noise [h, a], from this episode's own generator: batching cannot change it."""
         config = self._policy.backbone.config
