@@ -39,7 +39,7 @@ class Served:
         await self.server.start()
 
     def __exit__(self, *_: object) -> None:
-        if not self.server._stopping:
+        if not self.server.connections.stopping:
             self.on_loop(self.server.stop())
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join(10)
@@ -50,6 +50,11 @@ class Served:
     @property
     def address(self) -> tuple[str, int]:
         return "127.0.0.1", self.server.port
+
+    @property
+    def busy(self) -> int:
+        """Clients that wait for an answer."""
+        return sum(connection.busy for connection in self.server.connections.open)
 
     def client(self, **options: Any) -> Client:
         return Client(f"ws://127.0.0.1:{self.server.port}", **{"timeout": 60, **options})

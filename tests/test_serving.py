@@ -153,9 +153,9 @@ def test_a_client_that_goes_while_its_video_is_encoded_stops_the_work(policy):
         client = served.client()
         front = np.zeros((2000, 64, 64, 3), np.uint8)
         client._socket.send(pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((2000, 8), "f4")}))
-        wait_until(lambda: len(served.server.engine._videos) > 0 or served.server._busy)
+        wait_until(lambda: len(served.server.engine.turns.reading) > 0 or served.busy)
         client._socket.socket.shutdown(socket.SHUT_RDWR)
-        wait_until(lambda: served.server.stats.connections == 0 and not served.server.engine._videos)
+        wait_until(lambda: served.server.stats.connections == 0 and not served.server.engine.turns.reading)
         with served.client() as other:
             by_challenge(other, course()[:1])
 
@@ -238,18 +238,21 @@ def test_a_page_in_a_browser_is_refused(served):
 
 
 def test_a_full_server_says_so_and_has_room_again_later(policy):
-    with Served(policy, limits=Limits(connections=1)) as served:
-        first = served.client()
+    with Served(policy, encode_chunk=1, limits=Limits(connections=1)) as served:
+        busy = served.client()
+        front = np.zeros((2000, 64, 64, 3), np.uint8)
+        busy._socket.send(pack({"add_buffer": True, "images": front[:, None], "state": np.zeros((2000, 8), "f4")}))
+        wait_until(lambda: served.busy == 1)
         with pytest.raises(UserError, match="full"):
             served.client()
-        first.close()
+        busy._socket.socket.shutdown(socket.SHUT_RDWR)
         wait_until(lambda: served.server.stats.connections == 0)
         served.client().close()
 
 
 def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
     with Served(policy, limits=Limits(send_s=0.5)) as served:
-        for listening in served.server._listener.sockets:
+        for listening in served.server._uvicorn.servers[0].sockets:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # so that little has to go unread
         slow = socket.create_connection(served.address)
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -257,6 +260,7 @@ def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
             b"GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
             b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
         )
+        assert slow.recv(12) == b"HTTP/1.1 101"
         reset = pack({"reset": True})
         frame = b"\x82" + bytes([0x80 | len(reset)]) + b"\0\0\0\0" + reset
         slow.setblocking(False)
@@ -294,7 +298,7 @@ def test_a_long_video_does_not_keep_others_waiting(policy):
 
         thread = threading.Thread(target=watch)
         thread.start()
-        wait_until(lambda: len(served.server._busy) == 1)
+        wait_until(lambda: served.busy == 1)
         by_challenge(other, course())
         assert not done.is_set(), "the other client had to wait for the video"
         thread.join(60)
@@ -308,7 +312,7 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
         busy.reset()
         front = np.zeros((100, 64, 64, 3), np.uint8)
         answer = pool.submit(busy.infer, challenge(front, front, np.zeros((100, 8), np.float32), first=True))
-        wait_until(lambda: len(served.server._busy) == 1)
+        wait_until(lambda: served.busy == 1)
         served.on_loop(served.server.stop())
         assert answer.result(1)["actions"].shape == (16, 8)
         for client in (idle, busy):

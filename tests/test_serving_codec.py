@@ -1,5 +1,7 @@
 """The bytes on the wire, and what both message schemas accept."""
 
+import tracemalloc
+
 import msgpack
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ from serving_fakes import GOAL, challenge, observation, states
 
 from mme_vla.errors import UserError
 from mme_vla.serving import pack, unpack
+from mme_vla.serving.codec import check_size
 from mme_vla.serving.requests import AddBuffer, Infer, Reset, parse
 
 ARRAY = np.array([[1, -2], [300, 4]], np.int16)
@@ -145,8 +148,74 @@ def test_a_missing_key_is_named(key):
 
 @pytest.mark.parametrize(
     "message",
-    [None, [], 3, {}, {"reset": False}, {b"reset": True}, {"add_buffer": True}, {"observation/image": PICTURE}],
+    [
+        None,
+        [],
+        3,
+        {},
+        {"reset": False},
+        {"reset": "yes"},
+        {b"reset": True},
+        {"add_buffer": True},
+        {"add_buffer": False},
+        {"observation/image": PICTURE},
+    ],
 )
 def test_what_is_no_request_is_refused(message):
     with pytest.raises(UserError):
         parse(message, 10)
+
+
+def test_false_flags_beside_an_observation_are_as_good_as_none():
+    sent = observation(PICTURE, PICTURE, states(1)[0], reset=False, add_buffer=False)
+    assert isinstance(parse(sent, 10), Infer)
+    assert isinstance(parse({**sent, "reset": True}, 10), Reset)
+    with pytest.raises(UserError, match="add_buffer must be true or false"):
+        parse({**sent, "add_buffer": "no"}, 10)
+
+
+@pytest.mark.parametrize("goal", ["\ud800", "pick \udfff up", None, 7, b"pick", [None], {"a": 1}, np.zeros(2)])
+def test_a_prompt_that_is_no_text_is_refused_in_words(goal):
+    for sent in (observation(PICTURE, PICTURE, states(1)[0], prompt=goal),
+                 challenge([PICTURE], [PICTURE], states(1), True, task_goal=goal)):  # fmt: skip
+        with pytest.raises(UserError, match=r"(prompt|task_goal) (must be a text|holds half of a surrogate pair)"):
+            parse(sent, 10)
+
+
+def values(message: object) -> int:
+    if isinstance(message, dict):
+        return 1 + sum(values(key) + values(value) for key, value in message.items())
+    return 1 + (sum(map(values, message)) if isinstance(message, list) else 0)
+
+
+@pytest.mark.parametrize("message", [
+    None, 3, [], {}, [[]] * 3, {"a": {"b": [1, 2.5, "x" * 40]}}, list(range(-200, 70000, 7)), [2**40, -(2**40), 1e9],
+    ["x" * n for n in (0, 31, 32, 255, 256, 65535, 65536)], [b"x" * n for n in (0, 255, 256, 65536)],
+    {str(n): [] for n in range(70000)}, [[[[[{}]]]]], [True, False, None],
+])  # fmt: skip
+def test_values_are_counted_as_they_are(message):
+    data, count = msgpack.packb(message), values(message)
+    check_size(data, count)
+    if count > 1:
+        with pytest.raises(UserError, match="more than"):
+            check_size(data, count - 1)
+
+
+def test_a_message_of_nothing_but_empty_maps_is_refused_before_they_are_made():
+    many = 2**22
+    for data in (b"\xdd" + many.to_bytes(4, "big") + b"\x80" * many, b"\xdf\xff\xff\xff\xff"):
+        tracemalloc.start()
+        with pytest.raises(UserError, match="more than 1048576 values"):
+            unpack(data)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2**20
+    with pytest.raises(UserError, match="more than 1000 values"):  # many small lists count as one large
+        check_size(b"\xdc\x00\x40" + (b"\xdc\x00\x40" + b"\x80" * 64) * 64, 1000)
+
+
+def test_a_first_message_of_the_longest_episode_passes():
+    frames = 4096
+    lists = ("front_rgb_list", "wrist_rgb_list", "front_depth_list", "wrist_depth_list", "joint_state_list",
+             "gripper_state_list", "eef_state_list", "front_camera_extrinsic_list")  # fmt: skip
+    assert set(unpack(pack({key: [np.zeros(3, np.uint8)] * frames for key in lists}))) == set(lists)

@@ -22,7 +22,9 @@ from mme_vla.commands.loading import load_policy
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.serving import Client, Limits, pack, unpack
-from mme_vla.serving.web import BadRequestError, HttpRequest
+from mme_vla.serving.http_sessions import BusyError
+from mme_vla.serving.requests import AddBuffer, Reset
+from mme_vla.serving.session import NoEpisodeError
 
 LOGGER = logging.getLogger(__name__)
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}
@@ -125,17 +127,16 @@ def test_what_the_policy_cannot_do_is_a_500(policy):
             del policy.act
         assert status == 500 and b"ZeroDivisionError" in answer and b"Traceback" not in answer
         status, _, answer = ask(served, "POST", "/infer", pack(challenge(*course()[1], first=False)))
-        assert status == 400 and b"is_first_step" in answer, "an error ends the episode"
+        assert status == 409 and b"begin the episode again" in answer, "an error ends the episode"
 
 
-def test_a_key_is_asked_for_but_not_for_the_health(policy):
+def test_a_key_is_asked_for_but_not_for_health_and_metadata(policy):
     with Served(policy, api_key="right") as served:
-        assert ask(served, "GET", "/healthz")[0] == 200
-        for path in ("/metadata", "/stats"):
-            assert ask(served, "GET", path)[0] == 401
-            assert ask(served, "GET", path, Authorization="Api-Key wrong")[0] == 401
-            assert ask(served, "GET", path, Authorization="Bearer right")[0] == 401
-            assert ask(served, "GET", path, Authorization="Api-Key right")[0] == 200
+        for path in ("/healthz", "/metadata"):  # the challenge's client asks for the metadata without its key
+            assert ask(served, "GET", path)[0] == 200
+        for given in (None, "Api-Key wrong", "Bearer right", "Api-Key rïght"):
+            assert ask(served, "GET", "/stats", **({"Authorization": given} if given else {}))[0] == 401
+        assert ask(served, "GET", "/stats", Authorization="Api-Key right")[0] == 200
         assert ask(served, "POST", "/infer", b"x")[0] == 401
 
 
@@ -146,8 +147,8 @@ def test_a_page_in_a_browser_is_refused(served):
 def test_silent_sessions_are_freed(policy):
     with Served(policy, limits=Limits(idle_s=0.3)) as served:
         by_http(served, course()[:1])
-        assert len(served.server._http.sessions) == 1
-        wait_until(lambda: not served.server._http.sessions)
+        assert len(served.server.sessions.kept) == 1
+        wait_until(lambda: not served.server.sessions.kept)
 
 
 @pytest.mark.parametrize(
@@ -218,38 +219,38 @@ def test_the_command_loads_a_checkpoint(policy, tmp_path):
 
 
 def test_a_new_session_takes_the_place_of_the_longest_silent(served):
-    http, settings = served.server._http, served.server.settings
-    http.sessions.clear()
+    sessions, settings = served.server.sessions, served.server.settings
+    sessions.kept.clear()
     names = [("127.0.0.1", str(i)) for i in range(settings.limits.connections)]
-    kept = {name: http._session(name) for name in names}
+    kept = {name: sessions.find(name, Reset()) for name in names}
     kept[names[0]].requests = 1  # at work
     kept[names[3]].used -= 100
     newcomer = ("127.0.0.1", "new")
-    http._session(newcomer)
-    assert set(http.sessions) == {*names, newcomer} - {names[3]}
+    sessions.find(newcomer, Reset())
+    assert set(sessions.kept) == {*names, newcomer} - {names[3]}
     for name in names:
         kept[name].requests = 1
-    http.sessions[newcomer].requests = 1
-    with pytest.raises(BadRequestError, match="at work"):
-        http._session(("127.0.0.1", "another"))
-    http.sessions.clear()
+    sessions.kept[newcomer].requests = 1
+    with pytest.raises(BusyError, match="at work"):
+        sessions.find(("127.0.0.1", "another"), Reset())
+    sessions.kept.clear()
 
 
-def test_a_refused_request_that_waited_does_not_end_the_session_begun_meanwhile(served):
-    http, key = served.server._http, ("127.0.0.1", "twice")
+def test_a_request_that_waited_does_not_go_on_with_an_episode_that_failed_meanwhile(served):
+    sessions, name = served.server.sessions, ("127.0.0.1", "twice")
 
     async def meet():
-        first = http._session(key)
-        request = HttpRequest("POST", "/infer", {"x-session": "twice"}, "127.0.0.1", b"garbage")
+        first = sessions.find(name, Reset())
         await first.turn.acquire()
-        waiting = asyncio.ensure_future(http._answer(request))
+        waiting = asyncio.ensure_future(sessions.answer(name, AddBuffer([], 0), 0.0))
         await asyncio.sleep(0)
         assert first.requests == 1
-        del http.sessions[key]  # as an error of the request before it does
-        second = http._session(key)
+        sessions.drop(name)  # as an error of the request before it does
+        second = sessions.find(name, Reset())
         first.turn.release()
-        assert (await waiting).status == 400
-        return http.sessions.pop(key) is second
+        with pytest.raises(NoEpisodeError, match="begin the episode again"):
+            await waiting
+        return sessions.kept.pop(name) is second
 
     assert served.on_loop(meet())
 

@@ -1,10 +1,8 @@
 """The page in a browser: a few routes around a `Desk`."""
 
 import asyncio
-import ipaddress
 import json
 import logging
-import socket
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
@@ -13,6 +11,7 @@ from typing import Any
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.play.desk import Desk, StaleError
+from mme_vla.serving.listen import is_local, listen
 
 log = logging.getLogger("mme_vla.play")
 PAGE = {"": "index.html", "play.css": "play.css", "play.js": "play.js", "film.js": "film.js", "icon.svg": "icon.svg"}
@@ -150,36 +149,6 @@ def _host_of(scope: Any) -> str:
     if named.startswith("["):
         return named[1:].partition("]")[0]
     return named.partition(":")[0]
-
-
-def is_local(host: str) -> bool:
-    """Whether a host name or address is this machine's own loopback."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host.lower() == "localhost"
-
-
-def listen(host: str, port: int) -> socket.socket:
-    """A socket bound to this address.
-
-    Raises:
-        UserError: no such address, or the port is taken or not allowed.
-    """
-    if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
-        raise UserError(f"port={port!r} is no port; choose 0 (any free one) to 65535.")
-    bound = None
-    try:
-        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-        bound = socket.socket(family, kind, protocol)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-        bound.listen()
-    except OSError as error:
-        if bound is not None:
-            bound.close()
-        raise UserError(f"Cannot listen at {host}, port {port} ({error.strerror}); choose others.") from None
-    return bound
 
 
 def make_server(desk: Desk, local: bool = True) -> Any:

@@ -197,6 +197,15 @@ class Episode:
             raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
         return executed
 
+    @property
+    def noise_state(self) -> Tensor:
+        """Where the noise stands. Set back, it draws the same again: for a batch that failed and is repeated."""
+        return self._generator.get_state()
+
+    @noise_state.setter
+    def noise_state(self, state: Tensor) -> None:
+        self._generator.set_state(state)
+
     def draw(self) -> dict[str, Tensor]:
         """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
         return self._policy.sample_draws(self._generator)

@@ -1,7 +1,7 @@
 """`Client`: talk to a policy server from Python, in either schema."""
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from types import TracebackType
 from typing import Any, Self
 
@@ -49,6 +49,7 @@ class Client:
         self.url, self.timeout, self.open_timeout = url, timeout, open_timeout
         self._headers = {} if api_key is None else {"Authorization": f"Api-Key {api_key}"}
         self._socket: Any = None
+        self._ends = ExitStack()
         self.metadata: dict[str, Any] = {}
         """What the server said of itself when this client connected."""
         self.reconnect()
@@ -57,7 +58,7 @@ class Client:
         """Close the connection if there is one and open another, with an episode that has not begun."""
         self.close()
         try:
-            self._socket = connect(
+            opening = connect(
                 self.url,
                 additional_headers=self._headers,
                 compression=None,
@@ -66,6 +67,7 @@ class Client:
                 ping_timeout=self.timeout,
                 proxy=None,
             )
+            self._socket = self._ends.enter_context(opening)
         except InvalidURI as error:
             raise UserError(f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
         except InvalidHandshake as error:
@@ -121,9 +123,8 @@ class Client:
 
     def close(self) -> None:
         """Close the connection; the server frees the episode."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        self._socket = None
+        self._ends.close()
 
     def __enter__(self) -> Self:
         return self

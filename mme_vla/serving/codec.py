@@ -13,7 +13,7 @@ import numpy as np
 from mme_vla.errors import UserError, missing_extra
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
-MOST_ITEMS = 2**17  # entries of one list or map: msgpack reserves room for as many as a message claims
+MOST_OBJECTS = 2**20  # values of a message, whatever holds them; a frame with all its cameras takes about 130
 MOST_TEXT = 2**20  # characters of one text
 
 try:
@@ -40,14 +40,14 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
     """Decode a message. Arrays are read-only views on `data`: copy what is written to.
 
     Raises:
-        UserError: it is no msgpack, it is cut short, or an array in it is not what it says.
+        UserError: it is no msgpack, it is cut short, it holds more than `MOST_OBJECTS` values, or an array in it is not
+            what it says.
     """
+    check_size(data)
     try:
         return msgpack.unpackb(
             data,
             object_hook=_decode,
-            max_array_len=MOST_ITEMS,
-            max_map_len=MOST_ITEMS,
             max_str_len=MOST_TEXT,
             max_ext_len=0,
         )
@@ -55,6 +55,58 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
         raise
     except Exception as error:  # msgpack answers damage with many kinds of exception
         raise UserError(f"This is not a msgpack message ({type(error).__name__}: {error}).") from error
+
+
+def _sizes() -> tuple[tuple[int, int, int], ...]:
+    """For each first byte of a value: bytes it takes at least, width of the length after it, values it announces.
+
+    Where there is a width, the number written there counts bytes (values announced: 0) or entries of so many values.
+    """
+    sizes = [(1, 0, 0)] * 256
+    for kind in range(16):
+        sizes[0x80 + kind] = (1, 0, 2 * kind)
+        sizes[0x90 + kind] = (1, 0, kind)
+    for length in range(32):
+        sizes[0xA0 + length] = (1 + length, 0, 0)
+    for kind, width in ((0xC4, 1), (0xC5, 2), (0xC6, 4), (0xD9, 1), (0xDA, 2), (0xDB, 4)):  # bytes and texts
+        sizes[kind] = (1 + width, width, 0)
+    for kind, width in ((0xC7, 1), (0xC8, 2), (0xC9, 4)):  # extensions carry a type as well
+        sizes[kind] = (2 + width, width, 0)
+    for kind, width in ((0xDC, 2), (0xDD, 4)):
+        sizes[kind] = (1 + width, width, 1)
+        sizes[kind + 2] = (1 + width, width, 2)
+    for kind, bytes_after in zip((*range(0xCA, 0xD9),), (4, 8, 1, 2, 4, 8, 1, 2, 4, 8, 2, 3, 5, 9, 17), strict=True):
+        sizes[kind] = (1 + bytes_after, 0, 0)
+    return tuple(sizes)
+
+
+_SIZES = _sizes()
+
+
+def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -> None:
+    """Count the values of a message without making any: an empty map takes one byte here and 64 in memory.
+
+    A message that is cut short or malformed passes; `unpack` says what is wrong with it.
+
+    Raises:
+        UserError: there are more than `most`.
+    """
+    at, end, waiting, announced = 0, len(data), 1, 1
+    while waiting and at < end:
+        waiting -= 1
+        taken, width, more = _SIZES[data[at]]
+        if width:
+            number = int.from_bytes(data[at + 1 : at + 1 + width], "big")
+            if more:
+                more *= number
+            else:
+                taken += number
+        if more:
+            waiting += more
+            announced += more
+            if announced > most:
+                raise UserError(f"The message holds more than {most} values; a frame takes about 130. Send fewer.")
+        at += taken
 
 
 def _encode(value: Any) -> dict[bytes, Any]:

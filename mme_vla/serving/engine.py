@@ -11,13 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from mme_vla.policy.base import Policy
+from mme_vla.policy.batching import Read, Turns
 from mme_vla.policy.episode import Episode
 from mme_vla.serving.counters import ServerStats
 
 
 @dataclass(eq=False)
 class _Waiting[T]:
-    """A piece of work and who waits for it; a future that is done already belongs to a client that has gone."""
+    """A piece of work and who waits for it; a future that is done already belongs to a client that has gone.
+
+    pieces: those still to be run; 0 once it is done or nobody waits.
+    """
 
     work: T
     future: asyncio.Future
@@ -27,10 +31,7 @@ class _Waiting[T]:
 class Engine:
     """Runs the policy for all clients.
 
-    The event loop never computes. All computing happens in one thread, which takes turns: the new frames of everyone
-    who has only a few, then one batch of the episodes that wait for actions, then pieces of long videos for as long as
-    the rest of the turn took, at least one piece. So clients that replan at the same time travel together, and clients
-    with a thousand frames and clients with few each get half of the machine while there are both.
+    The event loop never computes. All computing happens in one thread, in the order of `mme_vla.policy.batching`.
 
     Args:
         policy: with statistics, on its device.
@@ -40,10 +41,9 @@ class Engine:
 
     def __init__(self, policy: Policy, max_batch: int = 16, flow_steps: int = 10, stats: ServerStats | None = None):
         self.policy = policy
-        self.max_batch, self.flow_steps = max_batch, flow_steps
+        self.flow_steps = flow_steps
         self.stats = stats or ServerStats()
-        self._acts: deque[_Waiting[Episode]] = deque()
-        self._videos: deque[_Waiting[Iterator[None]]] = deque()
+        self.turns: Turns[_Waiting[Iterator[None]], _Waiting[Episode]] = Turns(max_batch)
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
         self._readers = ThreadPoolExecutor(2, "decode")
@@ -59,21 +59,21 @@ class Engine:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        for future in [*(w.future for w in self._acts), *(w.future for w in self._videos)]:
+        for future in [*(w.future for w in self.turns.acting), *(w.future for w in self.turns.reading)]:
             future.cancel()
         self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
         """The next chunk [h, 8] of an episode, chosen in one batch with whoever waits at the same time."""
-        chunk: np.ndarray = await self._join(self._acts, episode)
+        chunk: np.ndarray = await self._join(self.turns.acting, episode)
         return chunk
 
     async def run(self, steps: Iterator[None], pieces: int = 1) -> None:
         """Run an iterator that pauses between its `pieces` in the policy's thread, with others' work in the pauses."""
-        await self._join(self._videos, steps, pieces)
+        await self._join(self.turns.reading, steps, pieces)
 
-    async def call(self, function: Callable[[], object]) -> object:
+    async def call[T](self, function: Callable[[], T]) -> T:
         """Run something short in the policy's thread, at once."""
         return await asyncio.get_running_loop().run_in_executor(self._thread, function)
 
@@ -91,53 +91,53 @@ class Engine:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            while self._acts or self._videos:
-                begun = time.perf_counter()
-                for waiting in [waiting for waiting in self._videos if waiting.pieces <= 1][: self.max_batch]:
-                    await self._piece(waiting)
-                await asyncio.sleep(0)  # those whose frames are in now ask for actions
-                if self._acts:
-                    await self._batch()
-                until = 2 * time.perf_counter() - begun
-                while long := next((waiting for waiting in self._videos if waiting.pieces > 1), None):
-                    await self._piece(long)
-                    if time.perf_counter() > until:
-                        break
+            while self.turns:
+                await self._turn()
 
-    async def _batch(self) -> None:
-        batch: list[_Waiting[Episode]] = []
-        while self._acts and len(batch) < self.max_batch:
-            waiting = self._acts.popleft()
-            if not waiting.future.done():
-                batch.append(waiting)
+    async def _turn(self) -> None:
+        for step in self.turns.turn():
+            if isinstance(step, Read):
+                await self._piece(step.work)
+                await asyncio.sleep(0)  # those whose frames are in now ask for actions
+            else:
+                await self._batch([waiting for waiting in step.batch if not waiting.future.done()])
+
+    async def _batch(self, batch: list[_Waiting[Episode]]) -> None:
         if not batch:
             return
         begun = time.perf_counter()
-        try:
-            chunks = await self.call(lambda: self.policy.act([waiting.work for waiting in batch], self.flow_steps))
-        except Exception as error:
-            for waiting in batch:
-                _fail(waiting.future, error)
-            return
+        chosen = await self.call(lambda: self._act([waiting.work for waiting in batch]))
         self.stats.took("batch", time.perf_counter() - begun)
         self.stats.count("batched", len(batch))
-        assert isinstance(chunks, np.ndarray)
-        for waiting, chunk in zip(batch, chunks, strict=True):
-            if not waiting.future.done():
+        for waiting, chunk in zip(batch, chosen, strict=True):
+            if isinstance(chunk, Exception):
+                _fail(waiting.future, chunk)
+            elif not waiting.future.done():
                 waiting.future.set_result(chunk)
 
+    def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
+        """Chunks [h, 8], or why there is none. Where a batch fails each is tried alone, so that none fails another."""
+        noise = [episode.noise_state for episode in episodes]
+        try:
+            return list(self.policy.act(episodes, self.flow_steps))
+        except Exception as error:
+            if len(episodes) == 1:
+                return [error]
+        for episode, state in zip(episodes, noise, strict=True):
+            episode.noise_state = state  # the same actions as if it had been alone from the start
+        return [chunk for episode in episodes for chunk in self._act([episode])]
+
     async def _piece(self, waiting: _Waiting[Iterator[None]]) -> None:
-        self._videos.remove(waiting)
         if waiting.future.done():
+            waiting.pieces = 0
             return
         try:
             finished = await self.call(lambda: next(waiting.work, _END)) is _END
         except Exception as error:
+            waiting.pieces = 0
             return _fail(waiting.future, error)
-        if not finished:
-            waiting.pieces -= 1
-            return self._videos.append(waiting)
-        if not waiting.future.done():
+        waiting.pieces = 0 if finished else max(1, waiting.pieces - 1)
+        if finished and not waiting.future.done():
             waiting.future.set_result(None)
         return None
 

@@ -71,11 +71,9 @@ def parse(message: Any, most_frames: int) -> Request:
     space = message.get("action_space", "joint_angle")
     if space != "joint_angle":
         raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with joint angles (joint_angle) only.")
-    if "reset" in message:
-        if message["reset"] is not True:
-            raise UserError("reset must be true; leave the key out of other requests.")
+    if _flag(message, "reset"):
         return Reset()
-    if "add_buffer" in message:
+    if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames)
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames)
@@ -84,6 +82,16 @@ def parse(message: Any, most_frames: int) -> Request:
     keys = [key for key in message if isinstance(key, str)][:10]
     near = did_you_mean(keys[0], KNOWN) if keys else f"Known: {', '.join(KNOWN)}."
     raise UserError(f"No known request has the keys {keys}. {near}")
+
+
+def _flag(message: dict[Any, Any], key: str) -> bool:
+    """Whether a message says `key`; false beside other keys is as good as leaving it out."""
+    value = message.get(key, False)
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if value is None or (type(value) is int and value in (0, 1)):
+        return value == 1
+    raise UserError(f"{key} must be true or false, got {type(value).__name__}.")
 
 
 def _add_buffer(message: dict[Any, Any], most_frames: int) -> AddBuffer:
@@ -209,4 +217,6 @@ def _text(key: str, value: Any) -> str:
         raise UserError(f"{key} must be a text (or a list that begins with one), got {type(value).__name__}.")
     if len(value) > MOST_GOAL:
         raise UserError(f"{key} has {len(value)} characters; at most {MOST_GOAL} are taken.")
+    if any("\ud800" <= character <= "\udfff" for character in value):
+        raise UserError(f"{key} holds half of a surrogate pair, which is no character: {value[:40]!a}.")
     return str(value)

@@ -13,7 +13,29 @@ from mme_vla.serving.engine import Engine
 from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset, parse
 from mme_vla.serving.settings import ServeSettings
 
-SMALL = 2**18  # bytes decoded on the event loop; larger messages are decoded in a thread
+SMALL = 2**16  # bytes decoded on the event loop; larger messages are decoded in a thread
+
+
+class NoEpisodeError(UserError):
+    """A request goes on with an episode that is not here."""
+
+
+async def read_request(engine: Engine, settings: ServeSettings, data: bytes | bytearray) -> Request:
+    """Decode and check a message; a large one beside the event loop.
+
+    Raises:
+        UserError: the request is malformed.
+    """
+
+    def read() -> Request:
+        return parse(unpack(data), settings.limits.frames)
+
+    return read() if len(data) <= SMALL else await engine.decode(read)
+
+
+def begins(request: Request) -> bool:
+    """Whether a request begins an episode, whatever was before it."""
+    return isinstance(request, Reset) or (isinstance(request, Infer) and request.first is True)
 
 
 class Session:
@@ -31,14 +53,15 @@ class Session:
         self._exec_start = 0
         self._seen_when_acting: int | None = None
 
-    async def answer(self, data: bytes) -> dict[str, Any]:
-        """Do what a packed request asks and return the answer, not yet packed.
+    async def answer(self, request: Request, begun: float) -> dict[str, Any]:
+        """Do what a request asks and return the answer, not yet packed.
+
+        Args:
+            begun: when the message was there whole (`time.perf_counter()`); the answer says how long it took.
 
         Raises:
-            UserError: the request is malformed, or does not fit the episode.
+            UserError: the request does not fit the episode.
         """
-        begun = time.perf_counter()
-        request = self._read(data) if len(data) <= SMALL else await self._engine.decode(lambda: self._read(data))
         if isinstance(request, Reset):
             self._begin()
             return {"reset_finished": True, "reset_time_ms": self._took("reset", begun)}
@@ -47,9 +70,6 @@ class Session:
             return {"add_buffer_finished": True, "add_buffer_time_ms": self._took("add_buffer", begun)}
         actions = await self._infer(request)
         return {"actions": actions, "infer_time_ms": self._took("infer", begun)}
-
-    def _read(self, data: bytes) -> Request:
-        return parse(unpack(data), self._settings.limits.frames)
 
     def _took(self, kind: str, begun: float) -> float:
         seconds = time.perf_counter() - begun
@@ -67,7 +87,7 @@ class Session:
         if request.first:
             self._begin()  # a client that repeats its first request means the same episode, not a longer one
         elif request.first is not None and self.episode.frames_seen == 0:
-            raise UserError(
+            raise NoEpisodeError(
                 "is_first_step is false but this episode has no frame here: its first request must come first. Was the "
                 "server restarted, or the connection lost? Reset and begin the episode again."
             )

@@ -1,11 +1,11 @@
 """What a server may be told, checked before it starts."""
 
-import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.serving.listen import is_local
 
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint")
 
@@ -19,6 +19,7 @@ class Limits:
     connections: int = 64
     send_s: float = 60
     receive_s: float = 120
+    pong_s: float = 600
     idle_s: float = 3600
     stop_s: float = 30
 
@@ -73,15 +74,15 @@ class ServeSettings:
     def from_dict(cls, config: Mapping[str, Any]) -> Self:
         """Build from a composed configuration; keys of other purposes are left aside."""
         known = {spec.name for spec in fields(cls)} - {"limits"}
-        return cls(**{key: config[key] for key in known & set(config)}, limits=Limits(**config.get("limits", {})))
+        found = {key: config[key] for key in known & set(config)}
+        if found.get("api_key") == "":  # an empty environment variable, as compose files leave it
+            found["api_key"] = None
+        return cls(**found, limits=Limits(**config.get("limits", {})))
 
     @property
     def local_only(self) -> bool:
         """Whether only programs on this machine can connect."""
-        try:
-            return ipaddress.ip_address(self.host).is_loopback
-        except ValueError:
-            return self.host == "localhost"
+        return is_local(self.host)
 
 
 def _positive(name: str, value: Any, whole: bool = False) -> None:

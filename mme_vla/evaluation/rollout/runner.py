@@ -23,6 +23,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_score import EXTRA
 from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
 from mme_vla.policy.base import Policy
+from mme_vla.policy.batching import Act, Turns
 from mme_vla.subgoal import SubgoalPredictor
 
 GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
@@ -93,10 +94,11 @@ class Rollout:
     workload: Workload = field(default_factory=Workload)
     _waiting: list[Job] = field(default_factory=list)
     _running: dict[int, RunningEpisode] = field(default_factory=dict)
-    _reading: list[RunningEpisode] = field(default_factory=list)
-    _ready: list[RunningEpisode] = field(default_factory=list)
     _tries: Counter[Job] = field(default_factory=Counter)
     _stillborn: int = 0
+
+    def __post_init__(self) -> None:
+        self._turns: Turns[RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
 
     def run(self, jobs: list[Job]) -> None:
         """Run these episodes.
@@ -108,8 +110,8 @@ class Rollout:
         self._waiting = list(jobs)
         for worker in range(self.envs.workers):
             self._start(worker)
-        while self.envs.busy or self._reading or self._ready:
-            for reply in self.envs.recv(0 if self._reading or self._ready else None):
+        while self.envs.busy or self._turns:
+            for reply in self.envs.recv(0 if self._turns else None):
                 self._take(reply)
             self._turn()
         self.workload.wall_s += time.perf_counter() - begun
@@ -152,29 +154,18 @@ class Rollout:
             running.begin(reply.observation, reply.info)
         else:
             running.go_on(reply.observation, reply.info)
-        self._reading.append(running)
+        self._turns.reading.append(running)
 
     def _turn(self) -> None:
-        """Short observations first, then one batch, then long videos for as long as that took; at least a piece."""
         begun = time.perf_counter()
-        for running in [running for running in self._reading if running.pieces <= 1]:
-            self._read(running)
-        if self._ready:
-            batch = self._ready[: self.settings.max_batch]
-            del self._ready[: len(batch)]
-            self._act(batch)
-        until = 2 * time.perf_counter() - begun
-        while self._reading:
-            self._read(self._reading[0])
-            if time.perf_counter() > until:
-                break
+        for step in self._turns.turn():
+            if isinstance(step, Act):
+                self._act(step.batch)
+            else:
+                step.work.read()
+                if not step.work.pieces:
+                    self._turns.acting.append(step.work)
         self.workload.policy_s += time.perf_counter() - begun
-
-    def _read(self, running: RunningEpisode) -> None:
-        running.read()
-        if not running.pieces:
-            self._reading.remove(running)
-            self._ready.append(running)
 
     def _act(self, batch: list[RunningEpisode]) -> None:
         begun = time.perf_counter()
