@@ -206,7 +206,10 @@ def test_whole_numbers_in_place_of_real_ones_are_refused_by_name(folder: Path) -
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("depth", 10**12), ("depth", 2), ("head_dim", 10**30), ("horizon", 7), ("depth", "2"), ("vlm", []), ("depth", None)],
+    [
+        ("depth", 10**12), ("depth", 2), ("head_dim", 10**30), ("horizon", 7), ("depth", "2"), ("vlm", []),
+        ("depth", None),
+    ],
 )  # fmt: skip
 def test_a_configuration_that_says_other_things_than_the_weights_is_refused(key: str, value: Any, folder: Path) -> None:
     change(folder / "config.json", lambda config: config["backbone"].update({key: value}))

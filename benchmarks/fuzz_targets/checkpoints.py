@@ -3,7 +3,9 @@
 import tempfile
 from pathlib import Path
 
+import huggingface_hub.serialization  # noqa: F401  (loaded once here, not again by every process that reads)
 import numpy as np
+import sentencepiece  # noqa: F401
 import torch
 from torch import Tensor, nn
 
