@@ -134,7 +134,7 @@ def test_damaged_json_is_one_short_paragraph(
         ("processor.json", {"prompt": []}), ("processor.json", {"views": [1]}), ("processor.json", {"horizon": 10**9}),
         ("processor.json", {"tokenizer": None}), ("processor.json", {"stats": 3}), ("processor.json", {"x" * 9999: 1}),
         ("processor.json", {"image_size": 3}), ("config.json", {"backbone": 3}), ("config.json", {"memory": [1]}),
-        ("config.json", {"policy": []}), ("config.json", {"adapters": {"rank": "x"}}), ("config.json", {"plugins": {"a": 1}}),
+        ("config.json", {"policy": []}), ("config.json", {"adapters": {"rank": 0}}), ("config.json", {"plugins": [1]}),
         ("config.json", {"plugins": 7}), ("config.json", {"integration": {"name": []}}),
         ("norm_stats.json", {"norm_stats": {"state": {"mean": [10**400]}, "actions": {}}}),
         ("norm_stats.json", {"norm_stats": {str(i): 0 for i in range(9999)}}),
