@@ -14,9 +14,11 @@ from conftest import REPOSITORY
 from mme_vla import MMEPolicy, UserError, analyse, build_policy, inspect
 from mme_vla.config import compose, import_plugins
 from mme_vla.envs import metadata
-from mme_vla.evaluation.record_log import read_records
+from mme_vla.evaluation.rollout import RunFacts
 from mme_vla.evaluation.rollout_plan import choose_episodes
-from mme_vla.plugins import TRUST_FLAG, TRUST_WORD, imported_plugins
+from mme_vla.evaluation.rollout_run import evaluate
+from mme_vla.evaluation.rollout_settings import RolloutSettings
+from mme_vla.plugins import TRUST_FLAG, TRUST_WORD, imported_plugins, trust_as_flag, trust_as_override
 from mme_vla.plugins import import_plugins as import_modules
 from mme_vla.testing import SMALL_VISION, random_batch, unit_stats
 from mme_vla.weights.convert import convert
@@ -160,26 +162,30 @@ def test_plugins_are_names_of_modules(names: str) -> None:
 
 
 @pytest.mark.skipif(find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed")
-def test_a_memory_and_a_task_of_ones_own_are_evaluated_in_worker_processes(stranger: Path, tmp_path: Path) -> None:
-    words = [
-        "checkpoint=checkpoint", "tasks=[Stay]", f"plugins=[{OWN}.task]", "episodes=2", "workers=2", "max_steps=3",
-        "render=false", "flow_steps=1", "execute=2", f"output={tmp_path}",
-    ]  # fmt: skip
-    command = [sys.executable, "-W", "ignore", "-m", "mme_vla.evaluate", TRUST_FLAG, *words]
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
-    done = subprocess.run(command, cwd=stranger, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    records = read_records(tmp_path / "episodes.jsonl")
-    assert [(r.model, r.task, r.outcome, r.steps) for r in records] == [("fading", "Stay", "timeout", 4)] * 2
+def test_a_memory_and_a_task_of_ones_own_are_evaluated_in_a_worker_process(stranger: Path, tmp_path: Path) -> None:
+    policy = MMEPolicy.from_pretrained(stranger / "checkpoint", trust_plugins=True)
+    import_modules([f"{OWN}.task"])
+    settings = RolloutSettings(max_steps=3, execute=2, flow_steps=1, workers=1, render=False)
+    facts = RunFacts("fading", 1, 42, max_steps=3)
+    records = evaluate(policy, choose_episodes("Stay", 1), tmp_path, facts, settings, shown=False).records
+    assert [(r.task, r.outcome, r.steps) for r in records] == [("Stay", "timeout", 4)]
+
+
+def test_both_spellings_of_trust_reach_every_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert trust_as_override([TRUST_FLAG, "seed=1"]) == [TRUST_WORD, "seed=1"]
+    assert trust_as_flag([TRUST_WORD, "x"]) == [TRUST_FLAG, "x"]
+    for name in ("train", "cache", "evaluate", "serve", "inspect"):
+        assert compose(name, [TRUST_WORD]).trust_plugins is True, name
+        assert compose(name).trust_plugins is False, name
 
 
 def test_episodes_of_an_own_task_have_seeds_of_their_own(stranger: Path) -> None:
     if find_spec("mani_skill") is None:
         pytest.skip("the simulator (extra `sim`) is not installed")
     import_modules([f"{OWN}.task"])
-    seeds = {spec.seed for split in metadata.SPLITS for spec in metadata.episodes("Stay", split)}
-    benchmark = {spec.seed for split in metadata.SPLITS for spec in metadata.episodes("PickXtimes", split)}
-    assert len(seeds) == 200
+    seeds = {spec.seed for split in ("val", "test") for spec in metadata.episodes("Stay", split)}
+    benchmark = {spec.seed for split in ("val", "test") for spec in metadata.episodes("PickXtimes", split)}
+    assert len(seeds) == 100
     assert not seeds & benchmark
     assert [job.episode for job in choose_episodes("Stay", [3], "val")] == [3]
 
