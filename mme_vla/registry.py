@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean
 
 
 class Registry[T]:
@@ -38,10 +38,9 @@ class Registry[T]:
         return decorate
 
     def __getitem__(self, name: str) -> T:
-        try:
-            return self._entries[name]
-        except KeyError:
-            raise UserError(f"Unknown {self.kind} {name!r}. {did_you_mean(str(name), self._entries)}") from None
+        if not isinstance(name, str) or name not in self._entries:
+            raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self._entries)}")
+        return self._entries[name]
 
     def __contains__(self, name: object) -> bool:
         return name in self._entries

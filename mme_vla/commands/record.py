@@ -9,10 +9,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.registry import TASKS
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -99,7 +101,8 @@ def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path |
     if workers == 1 or len(jobs) < 2:
         yield from (record_episode(job, folder, previews) for job in jobs)
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, import_plugins, (imported_plugins(),)) as pool:
         futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
         try:
             for future in as_completed(futures):
@@ -118,8 +121,8 @@ def plan(cfg: "DictConfig") -> list[Job]:
     tasks = [cfg.task] if isinstance(cfg.task, str) else list(cfg.task)
     tasks = list(TASK_NAMES) if tasks == ["all"] else tasks
     for task in tasks:
-        if task not in TASK_NAMES:
-            raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), ['all', *TASK_NAMES])}")
+        if task not in TASK_NAMES and task not in TASKS:
+            raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), ['all', *TASK_NAMES, *TASKS])}")
     for name in ("workers", "retries"):
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")

@@ -17,6 +17,7 @@ from mme_vla.evaluation.results.paper import paper_table
 from mme_vla.evaluation.run_file import claim_run
 from mme_vla.evaluation.suites import PAPER_ORDER
 from mme_vla.play.game import ChoiceSession, EpisodeId
+from mme_vla.registry import TASKS
 
 ALL = "all"
 
@@ -159,8 +160,8 @@ def choose_episodes(task: str | Sequence[str], episodes: Any, split: str) -> lis
     names = [name.strip() for name in task.split(",")] if isinstance(task, str) else [str(name) for name in task]
     names = list(PAPER_ORDER) if names == [ALL] else names
     for name in names:
-        if name not in TASK_NAMES:
-            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, ALL])}")
+        if name not in TASK_NAMES and name not in TASKS:
+            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, *TASKS, ALL])}")
     numbers = _numbers(episodes, SPLITS[split], split)
     chosen = []
     for name in dict.fromkeys(names):

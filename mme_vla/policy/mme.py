@@ -1,6 +1,7 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
 import hashlib
+import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Self
@@ -15,7 +16,7 @@ from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.backbone import Pi05Backbone, initialise
 from mme_vla.backbone.pi05.gemma import Conditioning, Hook, KVCache, Layout
 from mme_vla.backbone.pi05.sizes import BackboneConfig
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import Memory
 from mme_vla.policy.episode import Episode
@@ -94,7 +95,7 @@ class MMEPolicy(Saved):
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
-        return cls(backbone, memory, integration, processor, config, **config.get("policy", {}))
+        return cls(backbone, memory, integration, processor, config, **_policy_options(cls, config.get("policy", {})))
 
     @property
     def device(self) -> torch.device:
@@ -281,6 +282,17 @@ class MMEPolicy(Saved):
             digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
+    def check_processor(self, source: str) -> None:
+        """See `Saved`."""
+        processor, config = self.require_processor(), self.backbone.config
+        sizes = {"image_size": config.vision.image_size, "action_dim": config.action_dim, "horizon": config.horizon}
+        for name, expected in sizes.items():
+            if getattr(processor, name) != expected:
+                raise UserError(
+                    f"{source}: the processor's {name} is {brief(getattr(processor, name))}, the network's {expected}. "
+                    "The files are from two checkpoints, or one was changed."
+                )
+
     def require_memory(self) -> Memory:
         """Return the memory, or say that there is none."""
         if self.memory is None:
@@ -295,6 +307,19 @@ class MMEPolicy(Saved):
                 "build_policy() or load it with MMEPolicy.from_pretrained()."
             )
         return self.processor
+
+
+def _policy_options(cls: type, options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The section `policy`, whose keys are the constructor's keyword-only arguments.
+
+    Raises:
+        UserError: another key.
+    """
+    known = [p.name for p in inspect.signature(cls).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    for key in options:
+        if key not in known:
+            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
+    return options
 
 
 def _construct(registry: Any, section: Mapping[str, Any] | None, *args: Any, **fixed: Any) -> Any:

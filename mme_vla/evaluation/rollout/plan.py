@@ -11,6 +11,7 @@ from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.envs.vector.jobs import Job
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.record_log import RECORDS
+from mme_vla.registry import TASKS
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ def choose_episodes(
     """The episodes of a run, task by task.
 
     Args:
-        tasks: `all`, a name, or a list of names.
+        tasks: `all` of the benchmark, a name, or a list of names; tasks of the user's own are named.
         episodes: of every task: None for all of the split, a number for the first so many, or a list of them.
 
     Raises:
@@ -42,8 +43,8 @@ def choose_episodes(
     if not names:
         raise UserError("tasks=[] names no task; expected all, a task or a list of tasks.")
     for name in names:
-        if name not in TASK_NAMES:
-            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, 'all'])}")
+        if name not in TASK_NAMES and name not in TASKS:
+            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, *TASKS, 'all'])}")
     if len(set(names)) < len(names):
         raise UserError(f"tasks={names} names a task twice.")
     return [Job(name, split, number) for name in names for number in _numbers(name, episodes, split)]
