@@ -39,10 +39,9 @@ class Registry[T]:
         return decorate
 
     def __getitem__(self, name: str) -> T:
-        try:
-            return self._entries[name]
-        except KeyError:
-            raise UserError(f"Unknown {self.kind} {name!r}. {did_you_mean(str(name), self._entries)}") from None
+        if not isinstance(name, str) or name not in self._entries:
+            raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self._entries)}")
+        return self._entries[name]
 
     def build(self, section: Mapping[str, Any], *args: Any, **fixed: Any) -> Any:
         """Call the constructor that a section of the configuration names, with the section's other keys as options.

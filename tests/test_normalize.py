@@ -129,8 +129,8 @@ def test_statistics_survive_their_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "not a JSON"),
-        ("[]", "list"),
+        ("{", "not valid JSON"),
+        ("[]", "an object"),
         ('{"state": {}}', "must look like"),
         ('{"norm_stats": {"state": {}, "actions": {}}}', "lack 'mean'"),
         ('{"norm_stats": {"state": {"mean": [0], "std": [1], "q01": [0, 1], "q99": [1]}, "actions": {}}}', "lengths"),

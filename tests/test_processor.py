@@ -156,8 +156,8 @@ def test_a_folder_that_is_no_checkpoint_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"No processor\.json"):
         Processor.load(tmp_path)
     (tmp_path / "processor.json").write_text("{")
-    with pytest.raises(UserError, match="damaged"):
+    with pytest.raises(UserError, match="not valid JSON"):
         Processor.load(tmp_path)
     (tmp_path / "processor.json").write_text(json.dumps([1]))
-    with pytest.raises(UserError, match="list"):
+    with pytest.raises(UserError, match="must hold an object"):
         Processor.load(tmp_path)

@@ -272,7 +272,7 @@ def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.Capt
 
 
 def test_a_launcher_that_is_not_installed_is_named_with_its_extra() -> None:
-    if importlib.util.find_spec("hydra_plugins") is not None:
+    if importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is not None:
         pytest.skip("the extra `sweep` is installed")
     command = [sys.executable, "-m", "mme_vla.evaluate", "--multirun", "launcher=joblib", "model=pi05"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)

@@ -235,12 +235,17 @@ def test_auto_resumes_the_newest_unfinished_run_or_begins(tmp_path: Path) -> Non
     assert open_run(tmp_path / "b", "auto", config) == Run(tmp_path / "b")
 
 
+def write_unsummed(file: Path, text: str) -> None:
+    (file.parent / "SHA256SUMS").unlink()
+    file.write_text(text)
+
+
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
         (lambda folder: (folder / "training_state.json").unlink(), "nothing to resume"),
         (lambda folder: (folder / "training_state.json").write_text("{"), "damaged"),
-        (lambda folder: (folder / "training_state.json").write_text('{"format": "theirs"}'), "not written by"),
+        (lambda folder: write_unsummed(folder / "training_state.json", '{"format": "theirs"}'), "not written by"),
         (lambda folder: (folder / "optimizer.safetensors").unlink(), "lacks optimizer.safetensors"),
         (lambda folder: (folder / "raw.safetensors").write_bytes(b"broken"), "raw.safetensors is damaged"),
         (lambda folder: (folder / "model.safetensors").write_bytes(b"\0" * 64), "damaged"),

@@ -12,13 +12,16 @@ The first three run a policy over recorded episodes: --checkpoint FOLDER, or --m
 import argparse
 import csv
 import json
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.composition import print_user_errors
+from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.files import safe_name
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
@@ -31,8 +34,9 @@ BUDGETS = (64, 128, 256, 512, 1024)
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and run one analysis."""
-    args = _parser().parse_args(arguments)
+    args = _parser().parse_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
     with print_user_errors():
+        import_plugins(args.plugins)
         args.run(args)
 
 
@@ -210,8 +214,10 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
         raise UserError("Name one policy: --checkpoint FOLDER, or --model NAME for one with fresh weights.")
     source = EpisodeSource(args.dataset)
     if args.checkpoint is not None:
-        policy = MMEPolicy.from_pretrained(resolve_checkpoint(args.checkpoint), device=args.device)
-        return policy, source, str(policy.config.get("name") or args.checkpoint.name)
+        policy = MMEPolicy.from_pretrained(
+            resolve_checkpoint(args.checkpoint), device=args.device, trust_plugins=args.trust_plugins
+        )
+        return policy, source, safe_name(str(policy.config.get("name") or args.checkpoint.name), "the policy's name")
     print(f"{args.model} with fresh weights: what it shows is where a model starts, not what one learns.")
     return build_policy(args.model, backbone=args.backbone, device=args.device), source, args.model
 
@@ -254,6 +260,7 @@ def _parser() -> argparse.ArgumentParser:
         made = commands.add_parser(run.__name__, help=run.__doc__, description=run.__doc__)
         made.set_defaults(run=run)
         made.add_argument("--output", type=Path, help=output)
+        made.add_argument("--plugins", nargs="+", default=[], metavar="MODULE", help="your own modules, imported first")
         if run is not cost:
             made.add_argument("--rerun", type=Path, help="also for the Rerun viewer, step by step (.rrd; extra viz)")
         return made
@@ -261,6 +268,9 @@ def _parser() -> argparse.ArgumentParser:
     for run, output in ((attention, "JSON"), (modulation, "JSON"), (recurrence, "SVG, with a CSV beside it")):
         made = command(run, output)
         made.add_argument("--checkpoint", type=Path, help="a checkpoint or run folder of this library")
+        made.add_argument(
+            TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code"
+        )
         made.add_argument("--model", help="a model with fresh weights instead")
         made.add_argument("--backbone", default="tiny", help="of --model (default: %(default)s)")
         made.add_argument("--dataset", default="sample", help="LeRobot v3.0 folder (default: %(default)s, built in)")

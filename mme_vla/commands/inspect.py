@@ -31,7 +31,7 @@ def main(cfg: DictConfig) -> None:
     if (cfg.checkpoint is None) == (cfg.dataset is None):
         raise UserError("Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built in).")
     if cfg.checkpoint is not None:
-        return show_checkpoint(Path(cfg.checkpoint), console)
+        return show_checkpoint(Path(cfg.checkpoint), console, bool(cfg.trust_plugins))
     from mme_vla.data.episodes import EpisodeSource
 
     source = EpisodeSource(cfg.dataset, cfg.exec_starts)
@@ -46,13 +46,16 @@ def main(cfg: DictConfig) -> None:
     return None
 
 
-def show_checkpoint(folder: Path, console: "Console") -> None:
-    """Print a checkpoint's parts, training state and normalisation statistics."""
+def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = False) -> None:
+    """Print a checkpoint's parts, training state and normalisation statistics.
+
+    With `trust_plugins` the modules that the checkpoint names are imported.
+    """
     from mme_vla.policy.mme import MMEPolicy
     from mme_vla.training.checkpoint import STATE, read_state, resolve_checkpoint
 
     folder = resolve_checkpoint(folder)
-    policy = MMEPolicy.from_pretrained(folder)
+    policy = MMEPolicy.from_pretrained(folder, trust_plugins=trust_plugins)
     table = _table(str(folder), "part", "tensors", "parameters", "dtype")
     for part, tensors in _parts(policy).items():
         dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))

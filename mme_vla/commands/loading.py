@@ -59,7 +59,9 @@ def load_policy(
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
         source = Path(str(cfg.checkpoint)).expanduser()
         where = str(resolve_checkpoint(source)) if source.exists() or source.name == LATEST else str(cfg.checkpoint)
-        policy = MMEPolicy.from_pretrained(where, device=device, dtype=cfg.dtype, revision=cfg.revision)
+        policy = MMEPolicy.from_pretrained(
+            where, device=device, dtype=cfg.dtype, revision=cfg.revision, trust_plugins=cfg.trust_plugins
+        )
         name = str(policy.config.get("name", "policy"))
         logger.info("%s from %s, on %s", name, where, device)
         return LoadedPolicy(policy, name, where)

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.errors import UserError
@@ -98,7 +99,8 @@ def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path |
     if workers == 1 or len(jobs) < 2:
         yield from (record_episode(job, folder, previews) for job in jobs)
         return
-    with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, import_plugins, (imported_plugins(),)) as pool:
         futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
         try:
             for future in as_completed(futures):

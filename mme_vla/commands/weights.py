@@ -11,13 +11,16 @@ own configuration. The full backbone is assumed unless `backbone=…` says other
 
 import argparse
 import shutil
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
+from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.saving import CONFIG
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
 from mme_vla.weights.foreign_statistics import read_stats
 from mme_vla.weights.load import read_as
@@ -38,13 +41,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
     parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
     parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
-    given = parser.parse_intermixed_args(arguments)
+    parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
+    given = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
     from mme_vla.config.composition import print_user_errors
 
     with print_user_errors():
         convert(
             given.source, given.destination, given.overrides, to=given.to, dtype=given.dtype, asset=given.asset,
-            revision=given.revision, dry_run=given.dry_run,
+            revision=given.revision, dry_run=given.dry_run, trust_plugins=given.trust_plugins,
         )  # fmt: skip
 
 
@@ -58,8 +62,11 @@ def convert(
     asset: str | None = None,
     revision: str | None = None,
     dry_run: bool = False,
+    trust_plugins: bool = False,
 ) -> None:
     """Convert a checkpoint; the destination appears whole or not at all.
+
+    With `trust_plugins` the modules that a checkpoint names are imported: code of whoever wrote it.
 
     Raises:
         UserError: the destination exists, the source is no checkpoint or does not fit the model, or the target format
@@ -69,7 +76,7 @@ def convert(
     if not dry_run and target.exists():
         raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
     found = open_source(source, revision)
-    policy = _policy(found, overrides)
+    policy = _policy(found, overrides, trust_plugins)
     check_target(policy, to)
     tensors = read_as(policy, found)
     if dry_run:
@@ -94,7 +101,7 @@ def convert(
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _policy(found: Source, overrides: Sequence[str]) -> MMEPolicy:
+def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> MMEPolicy:
     """The policy a source belongs to, on meta, with its processor if that can be had."""
     from mme_vla.config.composition import compose
     from mme_vla.processing.processor import Processor
@@ -105,9 +112,10 @@ def _policy(found: Source, overrides: Sequence[str]) -> MMEPolicy:
         config = {key: value for key, value in found.config.items() if key != "adapters"}
         if "backbone" not in config:
             raise UserError(f"{found.folder} holds our weights but no config.json that describes them.")
-        with torch.device("meta"):
-            policy = MMEPolicy.from_config(config)
+        import_trusted(config, str(found.folder), trust_plugins)
+        policy = MMEPolicy.from_saved(config, str(found.folder / CONFIG))
         policy.processor = Processor.load(found.folder)
+        policy.check_processor(str(found.folder))
         return policy
     words, said = list(overrides), found.model
     named = [word.partition("=")[2] for word in words if word.startswith("model=")]

@@ -12,8 +12,10 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib.machinery import ModuleSpec
 from itertools import zip_longest
 from pathlib import Path
+from types import ModuleType
 
 import hydra
 from hydra import version
@@ -28,12 +30,37 @@ from hydra.core.utils import JobRuntime
 from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.config import plugins
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
 from mme_vla.errors import UserError
 from mme_vla.policy.variant import Sections, decisive, variant_name
 
 VERSION_BASE = "1.3"
+
+
+def _keep_hydra_to_installed_plugins() -> None:
+    """Hide a folder `hydra_plugins` of the current directory, which Hydra would import, from Hydra's search.
+
+    `python -m` puts the current directory on the path, and somebody else's folder is a place one may stand in.
+    """
+    here = Path.cwd().resolve()
+    before = list(sys.path)
+    sys.path[:] = [place for place in sys.path if Path(place).resolve() != here]
+    try:
+        found = importlib.import_module("hydra_plugins")
+        # A plain list: a namespace's own path would follow sys.path again.
+        found.__path__ = [place for place in found.__path__ if Path(place).resolve().parent != here]
+    except ModuleNotFoundError:
+        found = ModuleType("hydra_plugins")
+        found.__spec__ = ModuleSpec("hydra_plugins", None, is_package=True)
+        found.__path__ = []
+        sys.modules["hydra_plugins"] = found
+    finally:
+        sys.path[:] = before
+
+
+_keep_hydra_to_installed_plugins()
 
 
 def config_dir() -> Path:
@@ -158,27 +185,12 @@ OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
 
 
 def import_plugins(cfg: DictConfig) -> None:
-    """Import the modules named by the key `plugins`, whose decorators register a user's own memories.
-
-    The current directory counts as importable, so that a file beside the command is enough.
+    """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`.
 
     Raises:
         UserError: there is no such module.
     """
-    names = cfg.get("plugins") or []
-    for name in [names] if isinstance(names, str) else names:
-        here = str(Path.cwd())
-        if here not in sys.path:
-            sys.path.insert(0, here)
-        try:
-            importlib.import_module(name)
-        except ModuleNotFoundError as error:
-            if error.name is None or not f"{name}.".startswith(f"{error.name}."):
-                raise  # the plugin was found, something it imports was not
-            raise UserError(
-                f"No module named {name!r} (from `plugins`). Looked in {here} and the installed packages; "
-                "give a dotted module name, not a file name."
-            ) from error
+    plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
 
 
 def cli[T](
@@ -204,8 +216,10 @@ def cli[T](
         @functools.wraps(main)
         def command(cfg: DictConfig | None = None) -> T | None:
             if cfg is not None:
+                import_plugins(cfg)
                 return main(cfg)
             tree = directory or config_dir()
+            sys.argv[1:] = plugins.trust_as_override(sys.argv[1:])
             with print_user_errors():
                 _check_command_line(config_name, tree)
             start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)

@@ -8,6 +8,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.metadata import EpisodeSpec
 from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.registry import TASKS
 
 ALL = "all"
 GRAMMAR = "3 for the first three, [3] for number three, 0-9 for a range, [0-3,7] for several, or all"
@@ -17,7 +18,8 @@ def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
     """Names of tasks in the order they are named, each once.
 
     Args:
-        tasks: `all`, a name, several in one text (`StopCube,BinFill`), or a list of names.
+        tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names; tasks of
+            one's own are named, after the plugin that registers them was imported.
 
     Raises:
         UserError: an unknown task, one named twice, or none.
@@ -26,8 +28,8 @@ def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
     names = [str(name).strip() for name in names]
     names = list(TASK_NAMES) if names == [ALL] else names
     for name in names:
-        if name not in TASK_NAMES:
-            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, ALL])}")
+        if name not in TASK_NAMES and name not in TASKS:
+            raise UserError(f"Unknown task {name!r}. {did_you_mean(name, [*TASK_NAMES, *TASKS, ALL])}")
     if not names or len(set(names)) < len(names):
         raise UserError(f"tasks={tasks} must name each task once, and at least one.")
     return names

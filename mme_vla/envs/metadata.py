@@ -19,11 +19,13 @@ from pathlib import Path
 
 from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.registry import TASKS
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split."""
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000)}
+_OWN = "own"
 _CYCLE = ("easy", "easy", "medium", "hard")
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 _PACKAGE_FOLDER = Path("env_metadata")
@@ -40,7 +42,8 @@ class EpisodeSpec:
     difficulty: str
     source: str
     """`official`: an official file or demonstration says so. `derived`: the first seed on which our demonstrator,
-    without its second tries, succeeds; wrong by a few where the official one fails on another."""
+    without its second tries, succeeds; wrong by a few where the official one fails on another. `own`: of a task of the
+    user's own, the seed of the formula."""
 
     @property
     def recovery(self) -> str | None:
@@ -49,16 +52,17 @@ class EpisodeSpec:
 
 
 def formula(task: str, split: str, episode: int) -> tuple[int, str]:
-    """Seed before any retry, and difficulty, of an episode."""
+    """Seed before any retry, and difficulty, of an episode; of a task of the user's own, as if it were number 0."""
     offset, stride = _FIRST_SEED[split]
-    return offset + stride * (TASK_NAMES.index(task) + 1) + 100 * episode, _CYCLE[episode % 4]
+    number = TASK_NAMES.index(task) + 1 if task in TASK_NAMES else 0
+    return offset + stride * number + 100 * episode, _CYCLE[episode % 4]
 
 
 def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
     """The episodes of a task in a split, in order.
 
     Args:
-        task: one of the 16 task names.
+        task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
         split: `train`, `val` or `test`.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
@@ -66,10 +70,12 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     Raises:
         UserError: an unknown task or split, or a folder without the file, or a file that is not of that layout.
     """
-    if task not in TASK_NAMES:
-        raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), TASK_NAMES)}")
+    if task not in TASK_NAMES and task not in TASKS:
+        raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
     if split not in SPLITS:
         raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), SPLITS)}")
+    if task not in TASK_NAMES:
+        return [EpisodeSpec(task, split, i, *formula(task, split, i), source=_OWN) for i in range(SPLITS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
         return _official(Path(folder), task, split)

@@ -3,6 +3,7 @@
 import hashlib
 import re
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mme_vla.errors import UserError
@@ -11,6 +12,7 @@ from mme_vla.files.reading import read_text
 from mme_vla.files.writing import write_atomically
 
 SUMS = "SHA256SUMS"
+_AT_ONCE = 4  # files
 _LINE = re.compile(r"([0-9a-f]{64})  ([^\n]+)")
 
 
@@ -20,12 +22,19 @@ def file_sum(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def write_sums(folder: Path, names: Iterable[str] | None = None) -> None:
-    """Write `SHA256SUMS` for these files of a folder, by default for all files in it and below."""
+def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = False) -> None:
+    """Write `SHA256SUMS` for these files of a folder, by default for all files in it and below.
+
+    Files are read once more for it, in blocks and several at a time. With `keep`, the sums that are there of other
+    files stay.
+    """
     found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     chosen = sorted(set(names) if names is not None else {name for name in found if name != SUMS})
+    table = _read_sums(folder / SUMS) if keep and (folder / SUMS).exists() else {}
+    with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
+        table |= zip(chosen, pool.map(lambda name: file_sum(folder / name), chosen), strict=True)
     with write_atomically(folder / SUMS) as draft:
-        draft.write_text("".join(f"{file_sum(folder / name)}  {name}\n" for name in chosen))
+        draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 
 
 def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
@@ -45,21 +54,28 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
     sums = folder / SUMS
     if not sums.exists():
         return False
-    table = {}
-    for number, line in enumerate(read_text(sums, "a list of checksums").splitlines(), start=1):
-        match = _LINE.fullmatch(line)
-        if match is None:
-            raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
-        table[match[2]] = match[1]
-    for name in sorted(table) if names is None else names:
-        if name not in table:
-            continue
-        path = inside(folder, name)
+    table = _read_sums(sums)
+    paths = {name: inside(folder, name) for name in (sorted(table) if names is None else names) if name in table}
+    for path in paths.values():
         if not path.is_file():
             raise UserError(f"{path} is missing, though {sums} lists it. Copy the whole folder again.")
-        if file_sum(path) != table[name]:
-            raise UserError(
-                f"{path} is damaged: its content is not what was written (SHA-256 differs from {SUMS}). Take an "
-                f"earlier checkpoint or copy the file again; if you changed it on purpose, delete {SUMS}."
-            )
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        for (name, path), found in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
+            if found != table[name]:
+                raise UserError(
+                    f"{path} is damaged: its content is not what was written (SHA-256 differs from {SUMS}). Take an "
+                    f"earlier checkpoint or copy the file again; if you changed it on purpose, delete {SUMS}."
+                )
     return True
+
+
+def _read_sums(sums: Path) -> dict[str, str]:
+    """The table in a list of checksums: name → SHA-256."""
+    table = {}
+    for number, line in enumerate(read_text(sums, "a list of checksums").split("\n"), start=1):
+        match = _LINE.fullmatch(line)
+        if match is not None:
+            table[match[2]] = match[1]
+        elif line:
+            raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
+    return table

@@ -9,6 +9,9 @@ from mme_vla.errors import UserError, brief
 def inside(folder: Path, name: str, what: str = "file") -> Path:
     """Return the path of `name` in `folder`, symbolic links followed.
 
+    A snapshot in the hub's cache is made of links to the files of its repository's folder, `../../blobs/…`: these count
+    as its own.
+
     Raises:
         UserError: the name is empty, absolute, or leads out of the folder, by `..` or by a link.
     """
@@ -17,7 +20,9 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
         found = place.resolve()
     except (OSError, ValueError, RuntimeError):  # a null character, a loop of links
         found = Path("/")
-    if not name or Path(name).is_absolute() or not found.is_relative_to(root) or found == root:
+    within = found.is_relative_to(root) and found != root
+    linked = ".." not in Path(name).parts and any(found.is_relative_to(blobs) for blobs in _blobs_of(root))
+    if not name or Path(name).is_absolute() or not (within or linked):
         raise UserError(
             f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
             "dataset's own folder is read for it; copy the file into the folder, or correct the name."
@@ -25,6 +30,16 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     return place
 
 
+def _blobs_of(root: Path) -> list[Path]:
+    """Where the hub's cache keeps the files of the snapshot that `root` is, or lies in; nowhere for other folders."""
+    for place in (root, *root.parents):
+        repository = place.parent.parent
+        if place.parent.name == "snapshots" and _HUB_REPOSITORY.match(repository.name):
+            return [repository / "blobs"]
+    return []
+
+
+_HUB_REPOSITORY = re.compile(r"(models|datasets|spaces)--")
 _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 
 

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, did_you_mean, missing_extra
+from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
 
 MODES = ("full", "expert_only", "lora")
 ADAPTER = "default"  # peft's name of the one adapter a policy carries
@@ -131,15 +131,24 @@ def merge_adapters(policy: Tunable) -> None:
 
 
 def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None) -> dict[str, Tensor]:
-    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes."""
+    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes.
+
+    Raises:
+        UserError: what is said of the adapters does not fit the weights.
+    """
     merged = {name.replace(".base_layer.", "."): tensor for name, tensor in tensors.items() if ".lora_" not in name}
-    if adapters:
+    if not adapters:
+        return merged
+    try:
         scale = adapters["alpha"] / adapters["rank"]
         for name, down in tensors.items():
             if f".lora_A.{ADAPTER}." in name:
                 up, target = tensors[name.replace(".lora_A.", ".lora_B.")], name.replace(f".lora_A.{ADAPTER}.", ".")
                 weight = merged[target]
                 merged[target] = (weight.float() + scale * (up.float() @ down.float())).to(weight.dtype)
+    except (KeyError, TypeError, ZeroDivisionError, RuntimeError) as error:
+        reason = brief(str(error), 200, quote=False)
+        raise UserError(f"A checkpoint's adapters {brief(adapters)} do not fit its weights ({reason}).") from error
     return merged
 
 

@@ -1,6 +1,7 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
 import hashlib
+import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Self
@@ -13,7 +14,7 @@ import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
-from mme_vla.errors import UserError, listed
+from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
@@ -98,7 +99,7 @@ class MMEPolicy(Policy):
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
-        return cls(backbone, memory, integration, processor, config, **config.get("policy", {}))
+        return cls(backbone, memory, integration, processor, config, **_policy_options(cls, config.get("policy", {})))
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
@@ -274,6 +275,17 @@ class MMEPolicy(Policy):
             digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
         return digest.hexdigest()
 
+    def check_processor(self, source: str) -> None:
+        """See `Saved`."""
+        processor = self.require_processor()
+        for name in ("image_size", "action_dim", "horizon"):
+            found, expected = getattr(processor, name), getattr(self.backbone, name)
+            if found != expected:
+                raise UserError(
+                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
+                    "two checkpoints, or one was changed."
+                )
+
     def parts(self) -> Mapping[str, str]:
         """The backbone's parts; the memory and its integration are the part `memory`."""
         return {"memory": r"memory\.|integration\.", **{
@@ -285,3 +297,16 @@ def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | No
     """Draws by name; a bare tensor is a flow's `noise`."""
     named = {"noise": draws} if isinstance(draws, Tensor) else dict(draws or {})
     return named | {name: value for name, value in more.items() if value is not None}
+
+
+def _policy_options(cls: type, options: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The section `policy`, whose keys are the constructor's keyword-only arguments.
+
+    Raises:
+        UserError: another key.
+    """
+    known = [p.name for p in inspect.signature(cls).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    for key in options:
+        if key not in known:
+            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
+    return options

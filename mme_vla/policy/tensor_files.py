@@ -1,18 +1,20 @@
-"""Folders of safetensors: written sharded where large, read strictly."""
+"""Folders of safetensors: written sharded where large; read strictly, whoever wrote them."""
 
-import json
 import shutil
-from collections.abc import Collection, Mapping
+import stat
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.files import check_sums, inside, read_json
 
 WEIGHTS = "model.safetensors"
 INDEX = "model.safetensors.index.json"
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+_HEADER_LIMIT = 16 * 2**20  # bytes; the header of the largest policy here, 1,000 names, has 0.1 MiB
 
 
 def save_tensors(
@@ -33,25 +35,44 @@ def load_tensors(folder: Path) -> dict[str, Tensor]:
     """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until used).
 
     Raises:
-        UserError: no weights there, or a file that is missing, damaged or not safetensors.
+        UserError: no weights there, or a file that is missing, damaged, outside of the folder or not safetensors.
     """
-    return {name: tensor for file in weight_files(folder) for name, tensor in read_safetensors(file).items()}
+    return read_files(folder, weight_files(folder))
+
+
+def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
+    """Read safetensors files of a folder as one table, each compared with its checksum where there is one.
+
+    Raises:
+        UserError: a file that is missing, damaged or not safetensors, or a tensor that stands in two of them.
+    """
+    files = list(files)
+    check_sums(folder, [file.relative_to(folder).as_posix() for file in files])
+    tensors: dict[str, Tensor] = {}
+    for file in files:
+        found = read_safetensors(file)
+        twice = sorted(set(found) & set(tensors))
+        if twice:
+            raise UserError(f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.")
+        tensors |= found
+    return tensors
 
 
 def weight_files(folder: Path) -> list[Path]:
     """The safetensors files that hold a folder's weights.
 
     Raises:
-        UserError: there are none, or the index is damaged.
+        UserError: there are none, or the index is damaged or names files outside of the folder.
     """
     if (folder / INDEX).is_file():
-        try:
-            shards = json.loads((folder / INDEX).read_text())["weight_map"].values()
-            return [folder / name for name in sorted(set(shards))]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(f"{folder / INDEX} is not an index of safetensors files: {error!r}") from None
+        check_sums(folder, [INDEX])
+        table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
+        names = set(table.values()) if isinstance(table, dict) and _all_texts(table) else set()
+        if not names:
+            raise UserError(f"{folder / INDEX} is not an index of safetensors files: it lacks a `weight_map`.")
+        return [inside(folder, name, "weights") for name in sorted(names)]
     if (folder / WEIGHTS).is_file():
-        return [folder / WEIGHTS]
+        return [inside(folder, WEIGHTS, "weights")]
     raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
 
 
@@ -64,10 +85,34 @@ def read_safetensors(file: Path) -> dict[str, Tensor]:
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
+    check_header(file)
     try:
         return load_file(file)
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{file} is damaged or not a safetensors file: {error}") from error
+    except (SafetensorError, OSError, ValueError, KeyError, RuntimeError) as error:  # KeyError: a dtype torch has not
+        raise UserError(
+            f"{file} is damaged or not a safetensors file: {brief(str(error), 300, quote=False)}"
+        ) from error
+
+
+def check_header(file: Path) -> None:
+    """Make sure that a safetensors file is one, and that its header is of a size worth parsing.
+
+    Raises:
+        UserError: it is missing, a folder, a device or a pipe, or its header cannot be one.
+    """
+    try:
+        about = file.stat()
+        if not stat.S_ISREG(about.st_mode):
+            raise UserError(f"{file} is not a file; expected safetensors.")
+        with file.open("rb") as opened:
+            header = int.from_bytes(opened.read(8), "little")
+    except OSError as error:
+        raise UserError(f"{file} cannot be read as a safetensors file: {error.strerror or error}.") from None
+    if header > min(_HEADER_LIMIT, about.st_size - 8):
+        raise UserError(
+            f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "
+            f"{about.st_size:,}, and headers have at most {_HEADER_LIMIT:,}."
+        )
 
 
 def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
@@ -81,8 +126,8 @@ def dtype_of(name: str, what: str = "dtype") -> torch.dtype:
     Raises:
         UserError: another name.
     """
-    if name not in DTYPES:
-        raise UserError(f"{what}={name!r}: choose one of {', '.join(DTYPES)}.")
+    if not isinstance(name, str) or name not in DTYPES:
+        raise UserError(f"{what}={brief(name)}: choose one of {', '.join(DTYPES)}.")
     return DTYPES[name]
 
 
@@ -95,7 +140,7 @@ def check_fit(
     """Compare names and shapes.
 
     Raises:
-        UserError: lists every tensor that is missing (and not `optional`), left over or misshapen.
+        UserError: lists the tensors that are missing (and not `optional`), left over or misshapen; of many, the first.
     """
     missing = sorted(set(expected) - set(found) - set(optional))
     unexpected = sorted(set(found) - set(expected))
@@ -105,12 +150,26 @@ def check_fit(
         if tuple(found[name].shape) != tuple(expected[name])
     ]
     problems = [
-        f"{len(names)} {what}:\n  " + "\n  ".join(names)
+        f"{len(names):,} {what}:\n  {listed(names, 5)}"
         for what, names in (("missing", missing), ("unexpected", unexpected), ("misshapen", misshapen))
         if names
     ]
     if problems:
         raise UserError(f"The weights in {source} do not fit this policy.\n" + "\n".join(problems))
+
+
+def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
+    """Make sure that tensors hold numbers a network can compute with.
+
+    Raises:
+        UserError: names the tensors that hold NaN or infinities.
+    """
+    broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
+    if broken:
+        raise UserError(
+            f"{source} holds NaN or infinities in {len(broken):,} tensors: {listed(sorted(broken), 5)}. Its actions "
+            "would mean nothing: the training diverged or the file is damaged; take an earlier checkpoint."
+        )
 
 
 def assign_tensors(
@@ -121,13 +180,32 @@ def assign_tensors(
     `dtype` is what floating-point tensors are brought to; by default each keeps its own.
 
     Raises:
-        UserError: lists every tensor that does not fit, before anything is changed.
+        UserError: lists the tensors that do not fit, are of another kind of number, or hold NaN, before anything is
+            changed.
     """
-    check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}, source)
+    own = module.state_dict()
+    check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in own.items()}, source)
+    check_kinds(tensors, own, source)
+    check_values(tensors, source)
     trainable = {name: p.requires_grad for name, p in module.named_parameters()}
     module.load_state_dict({name: cast(t, dtype) for name, t in tensors.items()}, strict=True, assign=True)
     for name, parameter in module.named_parameters():
         parameter.requires_grad_(trainable[name])
+
+
+def check_kinds(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], source: str) -> None:
+    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are.
+
+    Raises:
+        UserError: names the tensors that are not.
+    """
+    wrong = [
+        f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of {str(own[name].dtype).removeprefix('torch.')}"
+        for name, tensor in tensors.items()
+        if name in own and _kind(tensor) != _kind(own[name])
+    ]
+    if wrong:
+        raise UserError(f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.")
 
 
 def replace_folder(built: Path, target: Path) -> None:
@@ -138,3 +216,24 @@ def replace_folder(built: Path, target: Path) -> None:
         target.rename(old)
     built.rename(target)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def _all_texts(table: Mapping[str, object]) -> bool:
+    return all(isinstance(name, str) for name in table.values())
+
+
+def _kind(tensor: Tensor) -> str:
+    if tensor.is_complex():
+        return "complex"
+    return "real" if tensor.is_floating_point() else str(tensor.dtype)
+
+
+def _finite(tensor: Tensor) -> bool:
+    """Whether every number is finite, without a second tensor of that size."""
+    if tensor.is_complex():
+        tensor = torch.view_as_real(tensor.resolve_conj())
+    if not tensor.is_floating_point() or tensor.is_meta or not tensor.numel():
+        return True
+    if tensor.element_size() == 1:  # eight-bit numbers know no order
+        tensor = tensor.float()
+    return all(bool(extreme.isfinite()) for extreme in tensor.detach().aminmax())

@@ -8,7 +8,8 @@ from typing import Any, Self
 import numpy as np
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.files import read_json
 
 EPSILON = 1e-6  # keeps a dimension that never moves finite
 BINS = 5000
@@ -40,13 +41,14 @@ class QuantileStats:
         arrays = {}
         for field in fields(cls):
             if data.get(field.name) is None:
-                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {sorted(data)}.")
+                held = listed(sorted(data))
+                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {held}.")
             try:
                 array = np.asarray(data[field.name], dtype=np.float64)
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 array = np.full(1, np.nan)
             if array.ndim != 1 or not np.isfinite(array).all():
-                raise UserError(f"{name}.{field.name} must be a list of finite numbers, got {data[field.name]}.")
+                raise UserError(f"{name}.{field.name} must be a list of finite numbers, got {brief(data[field.name])}.")
             arrays[field.name] = array
         if len({len(array) for array in arrays.values()}) > 1:
             raise UserError(f"{name}: the lists have different lengths { {k: len(v) for k, v in arrays.items()} }.")
@@ -77,7 +79,7 @@ class NormStats:
         if not isinstance(inner, dict) or not all(isinstance(inner.get(key), dict) for key in ("state", "actions")):
             raise UserError(
                 'Normalisation statistics must look like {"norm_stats": {"state": {…}, "actions": {…}}}; '
-                f"got the keys {sorted(inner if isinstance(inner, dict) else data)}."
+                f"got the keys {listed(sorted(inner if isinstance(inner, dict) else data))}."
             )
         return cls(**{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")})
 
@@ -95,13 +97,11 @@ class NormStats:
         path = Path(path)
         if not path.is_file():
             raise UserError(f"No normalisation statistics at {path}.")
+        data = read_json(path, "normalisation statistics", limit=2**24)
         try:
-            data = json.loads(path.read_text())
-        except ValueError as error:
-            raise UserError(f"{path} is not a JSON file: {error}.") from None
-        if not isinstance(data, dict):
-            raise UserError(f"{path} holds a {type(data).__name__}, not normalisation statistics.")
-        return cls.from_dict(data)
+            return cls.from_dict(data)
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
 
 
 def normalize(x: Tensor, stats: QuantileStats) -> Tensor:

@@ -10,16 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.files import check_sums, inside, read_json
 from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
 from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
-from mme_vla.processing.tokenizer import HUB, Tokenizer
+from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
 
 CONFIG_FILE = "processor.json"
 STATS_FILE = "norm_stats.json"
 TOKENIZER_FILE = "tokenizer.model"
+LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
 VIEWS = ("base_0_rgb", "left_wrist_0_rgb")  # π0.5's names of the front and the wrist camera
 
 
@@ -63,10 +65,12 @@ class Processor:
             **({} if subgoal_length is None else {"subgoal_length": subgoal_length}),
         }
         for name, value in sizes.items():
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise UserError(f"processor.{name} must be a positive whole number, got {value!r}.")
-        if isinstance(views, str) or not views:
-            raise UserError(f"processor.views must be a list of camera names, got {views!r}.")
+            if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST:
+                raise UserError(f"processor.{name} must be a positive whole number to {LARGEST}, not {brief(value)}.")
+        if isinstance(views, str) or not views or not all(isinstance(view, str) for view in views):
+            raise UserError(f"processor.views must be a list of camera names, got {brief(views)}.")
+        if not isinstance(prompt, str):
+            raise UserError(f"processor.prompt must be a name, got {brief(prompt)}.")
         self.prompt_format = PROMPTS[prompt]()
         self.prompt_name = prompt
         self.tokenizer = tokenizer
@@ -208,13 +212,12 @@ class Processor:
         }
 
     @classmethod
-    def from_config(cls, config: Mapping[str, Any], folder: Path | str | None = None) -> Self:
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
         """Build a processor.
 
         Args:
             config: the constructor's arguments by name, two of them in words: `tokenizer` as `Tokenizer.load` takes it,
                 `stats` as the path of a `norm_stats.json` or None. `tokenizer_fingerprint`, if given, is checked.
-            folder: where files named in `config` are looked for first.
 
         Raises:
             UserError: an unknown, missing or impossible entry.
@@ -223,52 +226,64 @@ class Processor:
         known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint"}
         for key in settings:
             if key not in known:
-                raise UserError(f"Unknown processor setting {key!r}. {did_you_mean(str(key), known)}")
+                raise UserError(f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}")
         for key in ("image_size", "tokenizer"):
             if key not in settings:
-                raise UserError(f"The processor's settings lack {key!r}; they hold {sorted(settings)}.")
-        PROMPTS[settings.get("prompt", "plain")]  # a misspelt name is told before any file is read
+                raise UserError(f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
+        PROMPTS[str(settings.get("prompt", "plain"))]  # a misspelt name is told before any file is read
         fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
-        tokenizer = Tokenizer.load(_inside(folder, settings.pop("tokenizer")))
+        tokenizer = Tokenizer.load(settings.pop("tokenizer"))
         if fingerprint is not None and tokenizer.fingerprint != fingerprint:
             raise UserError(
-                f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {fingerprint} was used "
-                "in training: its ids would mean other words. Give the file that was used."
+                f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {brief(fingerprint)} "
+                "was used in training: its ids would mean other words. Give the file that was used."
             )
         return cls(
             **settings,
             tokenizer=tokenizer,
-            stats=None if stats is None else NormStats.load(_inside(folder, stats)),
+            stats=None if stats is None else NormStats.load(stats),
         )
 
-    def save(self, folder: Path | str) -> None:
-        """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub, into `folder`."""
+    def save(self, folder: Path | str) -> list[str]:
+        """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the names of the files."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
-        config = self.to_config()
+        config, written = self.to_config(), [CONFIG_FILE]
         (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n")
         if config["tokenizer"] == TOKENIZER_FILE:
             self.tokenizer.save(folder / TOKENIZER_FILE)
+            written.append(TOKENIZER_FILE)
         if self.stats is not None:
             self.stats.save(folder / STATS_FILE)
+            written.append(STATS_FILE)
+        return written
 
     @classmethod
-    def load(cls, folder: Path | str) -> Self:
-        """Read what `save` wrote.
+    def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
+        """Read what `save` wrote. Nothing outside of the folder is read for it, and of the hub only π0.5's tokenizer.
+
+        Args:
+            folder: of a checkpoint, which may be a stranger's.
+            tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes it.
 
         Raises:
-            UserError: `folder` holds no processor, or a damaged one.
+            UserError: `folder` holds no processor, a damaged one, or one that names files elsewhere.
         """
-        path = Path(folder) / CONFIG_FILE
+        folder = Path(folder)
+        path = folder / CONFIG_FILE
         if not path.is_file():
             raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
+        check_sums(folder, [CONFIG_FILE])
+        config = read_json(inside(folder, CONFIG_FILE), "a processor's settings", limit=2**20)
+        named, stats = config.get("tokenizer", ""), config.get("stats")
+        if tokenizer is None:
+            tokenizer = _own_tokenizer(folder, named)
+        if stats is not None:
+            stats = _own_file(folder, stats, "statistics")
         try:
-            config = json.loads(path.read_text())
-        except ValueError as error:
-            raise UserError(f"{path} is damaged: {error}.") from None
-        if not isinstance(config, dict):
-            raise UserError(f"{path} holds a {type(config).__name__}, not a processor's settings.")
-        return cls.from_config(config, Path(folder))
+            return cls.from_config({**config, "tokenizer": tokenizer, "stats": stats})
+        except UserError as error:
+            raise UserError(f"{path}: {error}") from None
 
     def require_stats(self) -> NormStats:
         """Return the statistics, or say where they come from."""
@@ -280,11 +295,32 @@ class Processor:
         return self._stats
 
 
-def _inside(folder: Path | str | None, name: Path | str) -> str:
-    """Return the file's path in `folder` if it is there, else `name` as given."""
-    if folder is not None and not str(name).startswith(HUB) and (Path(folder) / name).is_file():
-        return str(Path(folder) / name)
-    return str(name)
+def _own_file(folder: Path, name: Any, what: str) -> Path:
+    """The path of a file that a checkpoint names in itself, compared with its checksum where there is one."""
+    if not isinstance(name, str):
+        raise UserError(f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
+    path = inside(folder, name, what)
+    check_sums(folder, [name])
+    return path
+
+
+def _own_tokenizer(folder: Path, name: Any) -> str | Path:
+    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address.
+
+    Raises:
+        UserError: it names another file of the hub, which nothing is asked for on a stranger's word.
+    """
+    if name in (SAMPLE, PALIGEMMA):
+        return str(name)
+    if isinstance(name, str) and name.startswith(HUB):
+        if (folder / TOKENIZER_FILE).is_file():
+            return _own_file(folder, TOKENIZER_FILE, "tokenizer")
+        raise UserError(
+            f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not fetched on a "
+            f"checkpoint's word. If you trust it: from_pretrained(…, tokenizer={brief(name, 200)}), or download that "
+            f"file into the folder as {TOKENIZER_FILE}."
+        )
+    return _own_file(folder, name, "tokenizer")
 
 
 def _float(x: np.ndarray | Tensor) -> Tensor:

@@ -5,10 +5,12 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Self
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 
 SAMPLE = "sample"
 HUB = "hf://"
+_LARGEST = 64 * 2**20  # bytes; PaliGemma's has 4 MiB
+PALIGEMMA = "hf://google/paligemma-3b-pt-224/tokenizer.model"  # π0.5's own
 
 
 class Tokenizer:
@@ -49,9 +51,11 @@ class Tokenizer:
         path = _download(spec) if spec.startswith(HUB) else Path(spec).expanduser()
         if not path.is_file():
             raise UserError(
-                f"No tokenizer at {spec!r}. Give {SAMPLE!r}, the path of a SentencePiece .model file, or "
+                f"No tokenizer at {brief(spec, 300)}. Give {SAMPLE!r}, the path of a SentencePiece .model file, or "
                 f"{HUB}owner/repository/file.model (PaliGemma's: {HUB}google/paligemma-3b-pt-224/tokenizer.model)."
             )
+        if path.stat().st_size > _LARGEST:
+            raise UserError(f"{path} has {path.stat().st_size:,} bytes; a tokenizer has at most {_LARGEST:,}.")
         return cls(path.read_bytes(), spec)
 
     @property

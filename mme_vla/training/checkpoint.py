@@ -5,6 +5,7 @@
         raw.safetensors          the trained weights themselves; frozen ones are in model.safetensors
         optimizer.safetensors    Adam's moments and step counts
         training_state.json      step, configuration, versions
+        SHA256SUMS               of each of these files (the last pass of writing reads them once more)
 
 All randomness is a function of (seed, step), so there is no generator state and no data position to keep. Nothing is
 pickled: a checkpoint from a stranger cannot run code.
@@ -22,9 +23,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, listed
+from mme_vla.files import check_sums, inside, read_json, write_sums
 from mme_vla.policy.base import Policy
-from mme_vla.policy.tensor_files import load_tensors, replace_folder
+from mme_vla.policy.tensor_files import check_values, load_tensors, read_files, replace_folder
 from mme_vla.training.ema import EMA
 from mme_vla.training.settings import KeepRule
 
@@ -67,6 +69,7 @@ def save_checkpoint(
     save_file(moments, draft / OPTIMIZER)
     about = {"format": FORMAT, "step": step, "config": dict(config), "versions": _versions()}
     (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    write_sums(draft, (RAW, OPTIMIZER, STATE), keep=True)
     _flush(draft)
     replace_folder(draft, target)
     _prune(folder, keep)
@@ -85,6 +88,8 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
     _check_fit(folder / RAW, raw, parameters)
     like = {f"{name}/{key}": p for name, p in parameters.items() for key in _MOMENTS if f"{name}/{key}" in moments}
     _check_fit(folder / OPTIMIZER, moments, like, scalar="/step")
+    for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
+        check_values(tensors, str(path))
     ema.load(averaged)
     policy.load_state_dict({**averaged, **raw})
     state = optimizer.state_dict()
@@ -166,12 +171,14 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
             f"{checkpoint} holds weights but no training state, so there is nothing to resume. "
             f"To start a new run from its weights use init_from={checkpoint}."
         )
-    try:
-        state = json.loads(path.read_text())
-    except ValueError as error:
-        raise UserError(f"{path} is damaged: {error}. Resume from an older checkpoint.") from None
-    if not isinstance(state, dict) or state.get("format") != FORMAT:
+    check_sums(checkpoint, [STATE])
+    state: dict[str, Any] = read_json(inside(checkpoint, STATE), "a training state", limit=2**24)
+    if state.get("format") != FORMAT:
         raise UserError(f"{path} was not written by this library's training (format {FORMAT!r} expected).")
+    step = state.get("step")
+    sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
+    if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:
+        raise UserError(f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older one.")
     for name in (RAW, OPTIMIZER):
         if not (checkpoint / name).is_file():
             raise UserError(f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint.")
@@ -207,13 +214,10 @@ def _on_cpu(tensor: Tensor) -> Tensor:
 
 
 def _read(path: Path) -> dict[str, Tensor]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
     try:
-        return load_file(path)
-    except (SafetensorError, OSError) as error:
-        raise UserError(f"{path} is damaged or missing: {error}. Resume from an older checkpoint.") from None
+        return read_files(path.parent, [inside(path.parent, path.name)])
+    except UserError as error:
+        raise UserError(f"{error} Resume from an older checkpoint.") from None
 
 
 def _check_fit(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, Tensor], scalar: str = "") -> None:
@@ -227,7 +231,7 @@ def _check_fit(path: Path, found: Mapping[str, Tensor], expected: Mapping[str, T
     ]
     if wrong:
         raise UserError(
-            f"{path} does not fit this policy: {len(wrong)} tensors differ, such as {', '.join(wrong[:4])}. "
+            f"{path} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
             "It belongs to another model or other settings."
         )
 

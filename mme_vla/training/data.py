@@ -11,6 +11,7 @@ from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
+from mme_vla.files import check_sums, inside
 from mme_vla.policy.base import Policy
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
@@ -48,7 +49,8 @@ def prepare_data(
     split = split_episodes(sources, data["val_fraction"], data["val_episodes"])
     processor, offset = policy.require_processor(), data["action_offset"]
     if stats_from is not None:
-        processor.stats = NormStats.load(stats_from / STATS_FILE)
+        check_sums(stats_from, [STATS_FILE])
+        processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
         processor.stats = compute_norm_stats(sources, split.train, processor.horizon, offset, seed)
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 from mme_vla.training.checkpoint import checkpoints_in, read_state, resolve_checkpoint, step_of
 
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
@@ -15,7 +15,7 @@ CHECKPOINTS = "checkpoints"
 MAY_DIFFER = (
     "name", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
     "train.save_every", "train.keep", "train.workers", "train.open_loop_chunks", "train.device",
-    "data.cache",
+    "data.cache", "trust_plugins",
 )  # fmt: skip
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss.
 
@@ -59,7 +59,11 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     state = read_state(checkpoint)
     changed = differing_keys(state["config"], config)
     if changed:
-        lines = "\n".join(f"  {key}: {old!r} then, {new!r} now" for key, (old, new) in changed.items())
+        pairs = [
+            f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now" for key, (old, new) in changed.items()
+        ]
+        more = [f"  … and {len(pairs) - 7:,} more"] if len(pairs) > 7 else []
+        lines = "\n".join([*pairs[:7], *more])
         raise UserError(
             f"{checkpoint} was trained with other settings, so going on from it would be another run:\n{lines}\n"
             f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."

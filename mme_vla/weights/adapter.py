@@ -60,11 +60,20 @@ class Adapter:
         Raises:
             UserError: lists every foreign tensor that is missing, left over or misshapen; or a constant is another.
         """
+        self.check_fit(theirs, ours, source)
+        check(self.derived, theirs)
+        derived = {constant.path for constant in self.derived}
+        return read(self.table, {name: tensor for name, tensor in theirs.items() if name not in derived})
+
+    def check_fit(self, theirs: Mapping[str, Tensor], ours: Mapping[str, Tensor], source: str) -> None:
+        """Compare names and shapes alone, so that foreign tensors may still be on meta: not read yet.
+
+        Raises:
+            UserError: as `translate`.
+        """
         shapes, derived = self.shapes(ours), {constant.path for constant in self.derived}
         found = {name: tensor for name, tensor in theirs.items() if name not in derived}
         check_fit(found, shapes, source, optional=set(shapes) - self.needed())
-        check(self.derived, theirs)
-        return read(self.table, found)
 
 
 def pi05_of(policy: Policy) -> Pi05Backbone:

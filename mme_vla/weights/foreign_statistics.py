@@ -1,6 +1,5 @@
 """Normalisation statistics that lie beside foreign checkpoints."""
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.files import check_sums, inside, read_json
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalisers import NormStats, QuantileStats
 
@@ -35,14 +35,18 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     if asset is not None or len(files) > 1:
         if asset not in files:
             raise UserError(
-                f"{folder} holds statistics of {', '.join(files) or 'no dataset'}: "
-                + (f"there are none of {asset!r}." if asset else "say which: --asset, or read_stats(folder, asset).")
+                f"{folder} holds statistics of {listed(files) or 'no dataset'}: "
+                + (
+                    f"there are none of {brief(asset)}."
+                    if asset
+                    else "say which: --asset, or read_stats(folder, asset)."
+                )
             )
-        return NormStats.load(files[asset])
+        return NormStats.load(_own(folder, files[asset]))
     if files:
-        return NormStats.load(next(iter(files.values())))
+        return NormStats.load(_own(folder, next(iter(files.values()))))
     if (folder / "norm_stats.json").is_file():
-        return NormStats.load(folder / "norm_stats.json")
+        return NormStats.load(_own(folder, folder / "norm_stats.json"))
     return next(_lerobot_stats(folder), None)
 
 
@@ -56,15 +60,22 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
     for name in _PROCESSORS:
         if not (folder / name).is_file():
             continue
-        try:
-            steps = json.loads((folder / name).read_text())["steps"]
-            files = [step["state_file"] for step in steps if step.get("state_file")]
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(f"{folder / name} does not describe a LeRobot processor: {error!r}") from None
-        for file in files:
-            tensors = read_safetensors(folder / file)
+        steps = read_json(_own(folder, folder / name), "a LeRobot processor").get("steps")
+        if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
+            raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
+        for file in (step["state_file"] for step in steps if step.get("state_file")):
+            if not isinstance(file, str):
+                raise UserError(f"{folder / name}: state_file={brief(file)} must be the name of a file.")
+            tensors = read_safetensors(inside(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
                 yield NormStats(**{ours: _quantiles(tensors, theirs) for ours, theirs in _FEATURES.items()})
+
+
+def _own(folder: Path, file: Path) -> Path:
+    """A file of a checkpoint, which must lie in it, compared with its checksum where there is one."""
+    name = file.relative_to(folder).as_posix()
+    check_sums(folder, [name])
+    return inside(folder, name, "statistics")
 
 
 def _quantiles(tensors: Mapping[str, Tensor], feature: str) -> QuantileStats:

@@ -1,19 +1,19 @@
 """The front door: any checkpoint into a policy, whole or as a start for another variant."""
 
-import json
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import inside, read_json
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
-from mme_vla.policy.tensor_files import assign_tensors, check_fit, dtype_of
+from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
@@ -65,6 +65,7 @@ def load_weights(
     if policy.processor is not None and found.format != "lerobot" and len(datasets) < 2:
         stats = read_stats(found.folder)
     assign_tensors(policy, read_as(policy, found), str(source), kind)
+    policy.compute_unsaved()
     if stats is not None and policy.processor is not None:
         policy.processor.stats = stats
     elif len(datasets) > 1:
@@ -82,10 +83,11 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     Raises:
         UserError: as `load_weights`.
     """
-    tensors = source.tensors()
     if source.format == "ours":
-        return merge_state(tensors, source.config.get("adapters"))
-    return ADAPTERS[source.format](policy).translate(tensors, policy.state_dict(), str(source.folder))
+        return merge_state(source.tensors(), source.config.get("adapters"))
+    adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
+    tensors = source.tensors(lambda found: adapter.check_fit(found, state, str(source.folder)))
+    return adapter.translate(tensors, state, str(source.folder))
 
 
 @dataclass(frozen=True)
@@ -122,19 +124,32 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
     if policy.device.type == "meta":
         raise UserError("Build the policy on a real device to start from a checkpoint: its memory needs fresh values.")
     found = open_source(source, revision)
-    theirs, own, state = found.tensors(), memory_parameters(policy), policy.state_dict()
+    own, state = memory_parameters(policy), policy.state_dict()
     if found.format == "ours":
-        theirs = merge_state(theirs, found.config.get("adapters"))
+        theirs = merge_state(found.tensors(), found.config.get("adapters"))
         _check_tokenizer(policy, found.folder)
         left = sorted(name for name in set(theirs) - set(state) if _OF_MEMORY.search(name))
         ours = {name: tensor for name, tensor in theirs.items() if name not in left}
         check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
     else:
         of_format = partial_adapter(policy) if found.format == "released" else ADAPTERS[found.format](policy)
+
+        def behind(theirs: Mapping[str, Tensor]) -> list[str]:
+            shapes = _reduced(of_format, own, theirs).shapes(state)
+            return sorted(name for name in set(theirs) - set(shapes) if _MEMORY_LEAF.search(name))
+
+        def fits(theirs: Mapping[str, Tensor]) -> None:
+            left = set(behind(theirs))
+            here = {name: tensor for name, tensor in theirs.items() if name not in left}
+            _reduced(of_format, own, theirs).check_fit(here, state, str(source))
+
+        theirs = found.tensors(fits)
+        left = behind(theirs)
         adapter = _reduced(of_format, own, theirs)
-        left = sorted(name for name in set(theirs) - set(adapter.shapes(state)) if _MEMORY_LEAF.search(name))
         theirs = {name: tensor for name, tensor in theirs.items() if name not in left}
         ours = adapter.translate(theirs, state, str(source))
+    check_kinds(ours, state, str(source))
+    check_values(ours, str(source))
     policy.load_state_dict(ours, strict=False)
     return Start(sorted(ours), sorted(set(state) - set(ours)), left)
 
@@ -144,19 +159,16 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     file = folder / CONFIG_FILE
     if policy.processor is None or not file.is_file():
         return
-    try:
-        theirs = json.loads(file.read_text()).get("tokenizer_fingerprint")
-    except (ValueError, AttributeError) as error:
-        raise UserError(f"{file} is damaged: {error}.") from None
+    theirs = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
     ours = policy.processor.tokenizer
     if theirs is not None and theirs != ours.fingerprint:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({theirs}) than {ours.spec!r} ({ours.fingerprint}): its ids "
-            "would mean other words. Set processor.tokenizer to that one."
+            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {ours.spec!r} ({ours.fingerprint}): "
+            "its ids would mean other words. Set processor.tokenizer to that one."
         )
 
 
-def _reduced(adapter: Adapter, own: set[str], theirs: dict[str, Tensor]) -> Adapter:
+def _reduced(adapter: Adapter, own: set[str], theirs: Mapping[str, Tensor]) -> Adapter:
     """Leave out the memory's parameters that the checkpoint does not hold."""
     table = {
         name: pieces

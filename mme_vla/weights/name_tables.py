@@ -12,7 +12,7 @@ import torch
 from einops import rearrange
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, listed
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
     if missing:
-        raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {', '.join(missing)}")
+        raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
     ours = {}
     for name, pieces in table.items():
         try:

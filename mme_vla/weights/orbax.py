@@ -8,8 +8,9 @@ The arrays lie in one OCDBT store or, in the plain layout, in a folder each. Lay
 """
 
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.errors import UserError, brief, missing_extra
+from mme_vla.files import inside, read_text
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 _ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
+_SMALL_PIECE = 2**20  # numbers
 _DICT_KEY = 2  # Orbax's number for "this step of the path is a dictionary's key"
 
 
@@ -39,32 +42,62 @@ def variant_of(params: Path) -> str | None:
     for folder in (params.parent, params.parent.parent):
         note = folder / "history_config.txt"
         if note.is_file():
-            return Path(note.read_text().strip()).name.removesuffix(".yaml")
+            said = read_text(inside(folder, note.name), "the name of a variant", limit=4096)
+            return Path(said.strip()).name.removesuffix(".yaml")
     return None
 
 
-def read_orbax(params: Path) -> dict[str, Tensor]:
+def read_orbax(params: Path, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
     """Read all arrays of a checkpoint, named by their path without the leading `params/` and the trailing `/value`.
 
+    Args:
+        params: the arrays' folder.
+        fits: called with tensors of the arrays' names and shapes on meta, before memory is taken for any.
+
     Raises:
-        UserError: tensorstore is not installed, or the store is incomplete or damaged.
+        UserError: tensorstore is not installed, or the store is incomplete or damaged, or leads out of its folder.
     """
     ts = _tensorstore()
+    for place in params.rglob("*"):
+        if place.is_symlink():
+            inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
     ocdbt = (params / MANIFEST).is_file()
     try:
         arrays = _list_arrays(ts, params, ocdbt)
         pending = {
-            name: ts.open({"driver": driver, "kvstore": _store(params, path, ocdbt)}, open=True, read=True)
+            # A part that is missing would otherwise be read as zeros. Orbax and this library write zeros like the rest.
+            name: ts.open(
+                {"driver": driver, "kvstore": _store(params, path, ocdbt), "fill_missing_data_reads": False},
+                open=True, read=True,
+            )
             for path, (name, driver) in arrays.items()
-        }
+        }  # fmt: skip
         # All are asked for before the first is waited for, so that reading overlaps.
-        reads = {name: opened.result().read() for name, opened in pending.items()}
+        stores = {name: opened.result() for name, opened in pending.items()}
+        _check_chunks(stores, params)
+        if fits is not None:
+            fits({name: torch.empty(store.shape, device="meta") for name, store in stores.items()})
+        reads = {name: store.read() for name, store in stores.items()}
         tree = {name: _to_tensor(read.result()) for name, read in reads.items()}
-    except ValueError as error:  # tensorstore's word for everything it cannot read
-        raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {error}") from error
+    except UserError:
+        raise
+    except (ValueError, TypeError, RuntimeError, OverflowError) as error:  # what tensorstore, or torch, cannot read
+        reason = brief(str(error).splitlines()[0], 500, quote=False)
+        raise UserError(f"The Orbax checkpoint {params} is damaged or incomplete: {reason}") from error
     if not tree:
         raise UserError(f"The Orbax checkpoint {params} holds no arrays: it was not written to its end.")
     return tree
+
+
+def _check_chunks(stores: Mapping[str, Any], params: Path) -> None:
+    """Refuse arrays whose pieces are larger than they are: a few bytes on disk would fill the memory."""
+    for name, store in stores.items():
+        piece = math.prod(store.chunk_layout.read_chunk.shape or ())
+        if piece > max(2 * math.prod(store.shape), _SMALL_PIECE):
+            raise UserError(
+                f"The Orbax checkpoint {params} is damaged: {brief(name)} of shape {brief(tuple(store.shape))} would "
+                f"lie in pieces of {piece:,} numbers."
+            )
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:

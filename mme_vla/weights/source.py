@@ -1,15 +1,16 @@
 """What a user points at: which format it is in, and its tensors under that format's names."""
 
-import json
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.policy.hub import local_folder
-from mme_vla.policy.tensor_files import INDEX, WEIGHTS, read_safetensors, weight_files
+from mme_vla.policy.saving import CONFIG, read_config
+from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.weights.orbax import find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
 
@@ -46,34 +47,37 @@ class Source:
     files: tuple[Path, ...] = ()
     params: Path | None = None
 
-    def tensors(self) -> dict[str, Tensor]:
+    def tensors(self, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
         """Read all tensors, under the one spelling that the format's name table knows.
+
+        Args:
+            fits: where reading takes memory (Orbax), called before with tensors of the same names and shapes on meta;
+                raises where they do not fit.
 
         Raises:
             UserError: a file that is damaged, incomplete or of another network.
         """
         if self.params is not None:
-            return read_orbax(self.params)
-        tensors = {name: tensor for file in self.files for name, tensor in read_safetensors(file).items()}
+            return read_orbax(self.params, fits)
+        tensors = read_files(self.folder, self.files)
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
     def config(self) -> dict[str, Any]:
         """What `config.json` beside the weights says; empty without one."""
-        file = self.folder / "config.json"
-        if not file.is_file():
-            return {}
-        try:
-            config = json.loads(file.read_text())
-        except ValueError as error:
-            raise UserError(f"{file} is not valid JSON: {error}") from None
-        return config if isinstance(config, dict) else {}
+        return read_config(self.folder) if (self.folder / CONFIG).is_file() else {}
 
     @property
     def model(self) -> str | None:
         """Our name of the variant a released run says it is, or None where it does not say."""
         said = variant_of(self.params) if self.params is not None else None
-        return None if said is None else VARIANTS.get(said, said)
+        if said is not None and said not in VARIANTS:
+            # The word would become part of a configuration, where it could ask for more than a name.
+            raise UserError(
+                f"history_config.txt beside {self.folder} says {brief(said)}, no variant of the released code. "
+                f"{did_you_mean(brief(said), VARIANTS)}"
+            )
+        return None if said is None else VARIANTS[said]
 
 
 def detect_format(source: str | Path) -> str:
@@ -116,7 +120,7 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         return Source("ours", folder, files)
     if any(name.startswith("PaliGemma/") for name in names):
         return Source("released", folder, files)
-    few = ", ".join(sorted(names)[:3]) or "none at all"
+    few = listed(sorted(names), 3) or "none at all"
     raise UserError(
         f"{files[0]} is not a π0.5 policy: its tensors are called {few}. Known: {'; '.join(FORMATS.values())}."
     )
@@ -126,8 +130,11 @@ def _names(file: Path) -> list[str]:
     """Tensor names in a safetensors file's header."""
     from safetensors import SafetensorError, safe_open
 
+    check_header(file)
     try:
         with safe_open(file, "pt") as opened:
             return list(opened.keys())
     except (SafetensorError, OSError) as error:
-        raise UserError(f"{file} is damaged or not a safetensors file: {error}") from error
+        raise UserError(
+            f"{file} is damaged or not a safetensors file: {brief(str(error), 300, quote=False)}"
+        ) from error

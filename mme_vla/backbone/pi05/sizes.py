@@ -1,10 +1,10 @@
 """Sizes as rows of a table: `pi05` is the real model, `tiny` a first-class citizen that trains on a laptop's CPU."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from typing import Any, Self
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean
 
 
 class _Config:
@@ -15,19 +15,32 @@ class _Config:
         known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
         unknown = [key for key in values if key not in known]
         if unknown:
-            raise UserError(f"{cls.__name__} has no key {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
+            raise UserError(f"{cls.__name__} has no key {brief(unknown[0])}. {did_you_mean(brief(unknown[0]), known)}")
         built: dict[str, Any] = {}
         for key, value in values.items():
             kind = known[key].type
             nested = isinstance(kind, type) and is_dataclass(kind)
+            if isinstance(value, bool) or not isinstance(value, (Mapping, kind) if nested else kind):  # type: ignore[arg-type]
+                wanted = "a section" if nested else "a whole number" if kind is int else "text"
+                raise UserError(f"{cls.__name__}.{key} must be {wanted}, not {brief(value)}.")
             built[key] = kind.from_dict(value) if nested and isinstance(value, Mapping) else value  # type: ignore[union-attr]
+        needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
+        for name in needed:
+            if name not in built:
+                raise UserError(f"{cls.__name__} needs the key {name!r}.")
         return cls(**built)
+
+
+LARGEST, DEEPEST = 2**24, 2**10
+"""Bounds of every size and of layers: far above any network here, and a damaged file's number ends in words."""
 
 
 def _check_positive(config: Any, prefix: str) -> None:
     for name, value in vars(config).items():
         if isinstance(value, int) and value < 1:
-            raise UserError(f"{prefix}{name}={value} must be at least 1.")
+            raise UserError(f"{prefix}{name}={brief(value)} must be at least 1.")
+        if isinstance(value, int) and value > (DEEPEST if name in ("depth", "horizon") else LARGEST):
+            raise UserError(f"{prefix}{name}={brief(value)} is larger than any network can be.")
 
 
 @dataclass(frozen=True)

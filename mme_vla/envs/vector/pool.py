@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs import metadata
 from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
@@ -189,7 +190,7 @@ class VecEnv:
         here, there = self._context.Pipe()
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
         process = self._context.Process(
-            target=protocol.serve, args=(there, block, self._factory, self._options), daemon=True
+            target=_work, args=(imported_plugins(), there, block, self._factory, self._options), daemon=True
         )
         process.start()
         there.close()
@@ -254,6 +255,12 @@ class VecEnv:
     def _require_open(self) -> None:
         if self._closed:
             raise UserError("The environments are closed; make new ones.")
+
+
+def _work(plugins: Sequence[str], *arguments: Any) -> None:
+    """A worker process: first what the user's own tasks are registered by, then its commands."""
+    import_plugins(plugins)
+    protocol.serve(*arguments)
 
 
 def make_vec_env(

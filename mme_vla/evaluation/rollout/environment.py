@@ -15,6 +15,7 @@ import numpy as np
 from mme_vla.envs.make import make_env
 from mme_vla.envs.task_names import STICK_TASKS
 from mme_vla.evaluation.rollout.film import EpisodeVideo, video_name
+from mme_vla.registry import TASKS
 
 REPORTED = (
     "status", "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "error_message", "exception_type",
@@ -200,7 +201,7 @@ def make_rollout_env(
         video = EpisodeVideo(lambda outcome, goal: Path(folder) / video_name(task, episode, outcome, goal), kept)
     return ChunkEnv(
         lambda: base(task=task, split=split, episode=episode, max_steps=max_steps, **options),
-        stick=task in STICK_TASKS,
+        stick=task in STICK_TASKS or (task in TASKS and bool(getattr(TASKS[task], "stick", False))),
         max_steps=max_steps,
         video=video,
     )

@@ -19,6 +19,7 @@ from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
 from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
+from mme_vla.files import safe_name
 from mme_vla.policy.base import Policy
 from mme_vla.processing.subgoal_text import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
@@ -182,7 +183,8 @@ def memory_budget(policy: Policy) -> int | None:
 
 def default_output(facts: RunFacts) -> Path:
     """A folder that the same command finds again: `outputs/evaluation/<model>/<checkpoint>/seed<seed>…`."""
-    name = facts.model if facts.memory_budget is None else f"{facts.model}-{facts.memory_budget}"
+    model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
+    name = model if facts.memory_budget is None else f"{model}-{facts.memory_budget}"
     run = f"seed{facts.model_seed}" + (f"-{facts.subgoal}" if facts.subgoal else "")
     run += "" if facts.split == "test" else f"-{facts.split}"
     return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
