@@ -1,7 +1,8 @@
 """One worker process of a `VecEnv`: builds environments, steps them, and hands frames over through shared memory."""
 
-import contextlib
+import os
 import pickle
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -70,10 +71,9 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
 
 def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
     """Run commands until told to close, until the other side is gone, or until the renderer has failed."""
-    with contextlib.suppress(ImportError):
-        import torch
-
-        torch.set_num_threads(1)  # the workers themselves are the parallelism
+    os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
     env: Any = None
     try:
         while True:
