@@ -1,6 +1,7 @@
 """The wrist camera's body is drawn with fewer triangles, and the pictures stay the same."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,7 +70,7 @@ def test_pictures_are_equal_and_where_the_body_shows_all_but_equal(monkeypatch: 
 
 def pictures() -> tuple[np.ndarray, int]:
     """Both views [2, 2, 256, 256, 3] at rest and with the body in the front view; pixels of it in the latter."""
-    env = make_env("PickXtimes", "test", 0)
+    env: Any = make_env("PickXtimes", "test", 0)
     env.reset()
     task = env.task
     body = task.agent.robot.links_map["camera_link"]._objs[0].entity.per_scene_id
