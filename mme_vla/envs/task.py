@@ -16,6 +16,7 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 
 from mme_vla.envs.choices import Choice
+from mme_vla.envs.rendering import keep_renderer
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.things import Thing
@@ -147,6 +148,11 @@ class Task(BaseEnv):
         """Count an object as part of the scene, so that a reset brings it back."""
         self.things.append(thing)
         return thing
+
+    def _setup_scene(self) -> None:
+        super()._setup_scene()
+        if self.scene.can_render():
+            keep_renderer(self._render_device)
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, sapien.Pose(ROBOT_BASE))
