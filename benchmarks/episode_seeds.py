@@ -1,10 +1,10 @@
-"""Which seed every episode of the benchmark has, found by demonstrating them as the benchmark's generator did.
+"""Whether the benchmark's seeds come out of its own rule: every episode demonstrated as its generator did.
 
     python benchmarks/episode_seeds.py [--splits test val train] [--tasks TASK ...] [--workers 2] [--output FILE]
 
 An episode has the seed of the formula unless the official demonstrator failed on it; then the seed was raised by one
 until it succeeded. Here our demonstrator, without its second tries, does the same, unrendered. An interrupted run goes
-on with the same command; `--write` then puts what was found into mme_vla/assets/robomme_metadata as `derived`.
+on with the same command; `--compare` reports where what was found differs from the benchmark's tables.
 """
 
 import argparse
@@ -15,26 +15,19 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.envs.make import make_task
-from mme_vla.envs.metadata import SPLITS, EpisodeSpec, episodes, formula, generate, write
+from mme_vla.envs.metadata import SPLITS, EpisodeSpec, episode, formula
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
 from mme_vla.envs.task_names import TASK_NAMES
 
 MOST_TRIES = 20
-PUBLISHED = {
-    ("VideoPlaceOrder", "train", 6): 11_603,
-    ("MoveCube", "train", 6): 14_602,
-    ("InsertPeg", "train", 6): 13_602,
-}
-"""The demonstrations of these seeds have the lengths that were published of these episodes; earlier seeds' have not."""
-TABLES = Path(__file__).resolve().parents[1] / "mme_vla" / "assets" / "robomme_metadata"
 
 
-def find_seed(task: str, split: str, episode: int) -> dict[str, Any]:
+def find_seed(task: str, split: str, index: int) -> dict[str, Any]:
     """The first seed from the formula's on with which the demonstration succeeds, and why those before it did not."""
-    first, difficulty = formula(task, split, episode)
-    recovery = EpisodeSpec(task, split, episode, first, difficulty, "formula").recovery
-    found = {"task": task, "split": split, "episode": episode, "difficulty": difficulty}
+    first, difficulty = formula(task, split, index)
+    recovery = EpisodeSpec(task, split, index, first, difficulty).recovery
+    found = {"task": task, "split": split, "episode": index, "difficulty": difficulty}
     failures: list[str] = []
     for seed in range(first, first + MOST_TRIES):
         reason, steps = demonstrate(task, seed, difficulty, recovery)
@@ -65,22 +58,21 @@ def missing(args: argparse.Namespace) -> Iterator[tuple[str, str, int]]:
     if args.output.exists():
         done = {(row["task"], row["split"], row["episode"]) for row in map(json.loads, args.output.open())}
     for split in args.splits:
-        for episode in range(SPLITS[split]):
-            yield from ((task, split, episode) for task in args.tasks if (task, split, episode) not in done)
+        for index in range(SPLITS[split]):
+            yield from ((task, split, index) for task in args.tasks if (task, split, index) not in done)
 
 
-def write_tables(output: Path) -> None:
-    """Replace the formula's seeds in the shipped tables by those that were found."""
-    known = [spec for task in TASK_NAMES for split in SPLITS for spec in episodes(task, split)]
-    official = {(s.task, s.split, s.episode): s for s in known if s.source == "official"}
-    for (task, split, index), seed in PUBLISHED.items():
-        official[task, split, index] = EpisodeSpec(task, split, index, seed, formula(task, split, index)[1], "official")
-    specs = {}
+def compare(output: Path) -> Iterator[str]:
+    """One line for each episode whose seed came out differently, and one for each split."""
+    counts: dict[str, list[int]] = {}
     for row in map(json.loads, output.open()):
-        if row["seed"] is not None:
-            place = row["task"], row["split"], row["episode"]
-            specs[place] = EpisodeSpec(*place, row["seed"], row["difficulty"], "derived")
-    write(generate((specs | official).values()), TABLES)
+        spec = episode(row["task"], row["split"], row["episode"])
+        differs, total = counts.setdefault(spec.split, [0, 0])
+        counts[spec.split] = [differs + (row["seed"] != spec.seed), total + 1]
+        if row["seed"] != spec.seed:
+            yield f"{spec.task} {spec.split} {spec.episode}: found {row['seed']}, the benchmark has {spec.seed}"
+    for split, (differs, total) in counts.items():
+        yield f"{split}: {differs} of {total} differ"
 
 
 def main() -> None:
@@ -92,10 +84,11 @@ def main() -> None:
     parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES))
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--output", type=Path, default=Path("outputs/episode_seeds.jsonl"))
-    parser.add_argument("--write", action="store_true", help="put what was found into the shipped tables")
+    parser.add_argument("--compare", action="store_true", help="report what was found beside the benchmark's tables")
     args = parser.parse_args()
-    if args.write:
-        write_tables(args.output)
+    if args.compare:
+        for line in compare(args.output):
+            print(line)
         return
     jobs = list(missing(args))
     args.output.parent.mkdir(parents=True, exist_ok=True)

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.envs.vector import worker as vector_worker
+
 FRAME = (256, 256, 3)
 
 
@@ -29,6 +31,9 @@ class LightEnv:
             time.sleep(60)
         if action == "raise":
             raise RuntimeError("the arm fell off")
+        if action == "lose the renderer":
+            vector_worker.renderer_works = lambda: False
+            raise RuntimeError("ErrorDeviceLost")
         self.steps += 1
         if isinstance(action, float):
             time.sleep(action)

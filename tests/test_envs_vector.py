@@ -117,6 +117,21 @@ def test_an_exception_is_reported_and_the_worker_stays(envs: VecEnv) -> None:
     assert "the arm fell off" in only(envs.recv()).info["error_message"]
 
 
+def test_a_worker_whose_renderer_failed_is_replaced(envs: VecEnv) -> None:
+    before = {child.pid for child in multiprocessing.active_children()}
+    envs.send(0, "lose the renderer")
+    failed = only(envs.recv())
+    assert failed.crashed and failed.info["exception_type"] == "RuntimeError"
+    assert "StopCube test episode 30: ErrorDeviceLost" in failed.info["error_message"]
+    assert len({child.pid for child in multiprocessing.active_children()} - before) == 1
+    envs.start(0, Job("StopCube", "test", 6))
+    assert not only(envs.recv()).crashed
+    envs.send(0, "raise")
+    assert only(envs.recv()).crashed
+    envs.start(0, Job("StopCube", "test", 6))
+    assert not only(envs.recv()).crashed
+
+
 def test_misuse_is_refused(envs: VecEnv) -> None:
     envs.jobs.append(Job("StopCube", "test", 1))
     with pytest.raises(UserError, match="expected 0 to 1"):

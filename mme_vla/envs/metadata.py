@@ -1,16 +1,14 @@
 """Which seed and difficulty every episode of the benchmark's splits has; importing this needs no simulator.
 
-A seed follows from task, split and episode by a formula, except where the official demonstrator failed on it: the seed
-was then raised by one until it succeeded. The shipped table was made by demonstrating every episode in the same way
-(benchmarks/episode_seeds.py), which is right where both demonstrators fail alike, and marks what is known from official
-episodes. With the official files at hand (the `robomme` package
-installed, or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`) theirs are used.
+The shipped tables are the benchmark's own. A seed follows from task, split and episode by a formula, except where the
+official demonstrator failed on it and the seed was raised until it succeeded (benchmarks/episode_seeds.py does the same
+with ours, and reports where it comes out elsewhere). With the official files at hand (the `robomme` package installed,
+or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`) theirs are used.
 """
 
 import csv
 import json
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -25,7 +23,6 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split."""
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000)}
-_OWN = "own"
 _CYCLE = ("easy", "easy", "medium", "hard")
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 _PACKAGE_FOLDER = Path("env_metadata")
@@ -40,10 +37,6 @@ class EpisodeSpec:
     episode: int
     seed: int
     difficulty: str
-    source: str
-    """`official`: an official file or demonstration says so. `derived`: the first seed on which our demonstrator,
-    without its second tries, succeeds; wrong by a few where the official one fails on another. `own`: of a task of the
-    user's own, the seed of the formula."""
 
     @property
     def recovery(self) -> str | None:
@@ -75,7 +68,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     if split not in SPLITS:
         raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), SPLITS)}")
     if task not in TASK_NAMES:
-        return [EpisodeSpec(task, split, i, *formula(task, split, i), source=_OWN) for i in range(SPLITS[split])]
+        return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(SPLITS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
         return _official(Path(folder), task, split)
@@ -97,37 +90,14 @@ def episode(task: str, split: str = "test", index: int = 0, folder: str | Path |
     return known[index]
 
 
-def generate(confirmed: Iterable[EpisodeSpec] = ()) -> dict[str, list[EpisodeSpec]]:
-    """The table of every split: the formula, overruled by what official episodes confirm."""
-    overruled = {(spec.task, spec.split, spec.episode): spec for spec in confirmed}
-    return {
-        split: [
-            overruled.get((task, split, index))
-            or EpisodeSpec(task, split, index, *formula(task, split, index), source="formula")
-            for task in TASK_NAMES
-            for index in range(count)
-        ]
-        for split, count in SPLITS.items()
-    }
-
-
-def write(table: dict[str, list[EpisodeSpec]], folder: Path) -> None:
-    """Write a table as one CSV file a split."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for split, specs in table.items():
-        with (folder / f"{split}.csv").open("w", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(["task", "episode", "seed", "difficulty", "source"])
-            writer.writerows([spec.task, spec.episode, spec.seed, spec.difficulty, spec.source] for spec in specs)
-
-
 @cache
 def _table(split: str) -> dict[str, list[EpisodeSpec]]:
     text = files("mme_vla").joinpath("assets", "robomme_metadata", f"{split}.csv").read_text()
     table: dict[str, list[EpisodeSpec]] = {task: [] for task in TASK_NAMES}
     for row in csv.DictReader(text.splitlines()):
-        index, seed = int(row["episode"]), int(row["seed"])
-        table[row["task"]].append(EpisodeSpec(row["task"], split, index, seed, row["difficulty"], row["source"]))
+        table[row["task"]].append(
+            EpisodeSpec(row["task"], split, int(row["episode"]), int(row["seed"]), row["difficulty"])
+        )
     return table
 
 
@@ -145,10 +115,7 @@ def _official(folder: Path, task: str, split: str) -> list[EpisodeSpec]:
     path = _file(folder, task, split)
     try:
         records = json.loads(path.read_text())["records"]
-        specs = [
-            EpisodeSpec(task, split, int(r["episode"]), int(r["seed"]), str(r["difficulty"]), "official")
-            for r in records
-        ]
+        specs = [EpisodeSpec(task, split, int(r["episode"]), int(r["seed"]), str(r["difficulty"])) for r in records]
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected official metadata of {task}, split {split!r}.") from None
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:

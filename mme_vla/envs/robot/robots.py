@@ -2,7 +2,7 @@
 
 The stock simulator describes both; here the wrist camera gets the benchmark's size, and the stick robot, which has no
 camera in stock, gets the mount of the gripper robot. Robots are also described without anything to look at, so that
-physics can run where there is no renderer.
+physics can run where there is no renderer, and the wrist camera's own body with no more detail than shows.
 """
 
 import hashlib
@@ -20,6 +20,8 @@ from mani_skill.agents.robots.panda.panda_stick import PandaStick
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 from mani_skill.sensors.camera import CameraConfig
 
+from mme_vla.envs.meshes import CELL, coarsen, read_stl, stl_bytes
+
 WRISTCAM = "mme_vla_panda_wristcam"
 """Agent id of the Panda with gripper and wrist camera."""
 STICK = "mme_vla_panda_stick"
@@ -30,6 +32,7 @@ ROBOT_BASE = (-0.615, 0.0, 0.0)
 CAMERA_LINK = "camera_link"
 MOUNT = ("camera_base_link", CAMERA_LINK)
 """The links by which the wrist camera hangs on the hand."""
+_CAMERA_MESH = "d415.stl"
 
 
 def _camera(agent: Any) -> list[CameraConfig]:
@@ -45,8 +48,7 @@ class WristCamPanda(PandaWristCam):
 
     @property
     def urdf_path(self) -> str:
-        stock = PandaWristCam.urdf_path
-        return stock if self.scene.can_render() else description(stock, visible=False)
+        return description(PandaWristCam.urdf_path, visible=self.scene.can_render())
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
@@ -84,11 +86,14 @@ def description(stock: str, mount_from: str | None = None, visible: bool = True)
     for link in robot.iter("link"):
         for visual in [] if visible else link.findall("visual"):
             link.remove(visual)
+    caches = Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / "robots"
     for mesh in robot.iter("mesh"):
         mesh.set("filename", str(source.parent / mesh.attrib["filename"]))
+    for mesh in robot.iterfind("link/visual/geometry/mesh"):
+        if Path(mesh.attrib["filename"]).name == _CAMERA_MESH:
+            mesh.set("filename", str(_coarse(Path(mesh.attrib["filename"]), caches)))
     text = ElementTree.tostring(robot)
-    caches = Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla"))
-    folder = caches / "robots" / hashlib.sha256(text).hexdigest()[:16]
+    folder = caches / hashlib.sha256(text).hexdigest()[:16]
     folder.mkdir(parents=True, exist_ok=True)
     _write(folder / source.with_suffix(".srdf").name, source.with_suffix(".srdf").read_bytes())
     _write(folder / source.name, text)
@@ -102,6 +107,16 @@ def _add_mount(robot: ElementTree.Element, donor: ElementTree.Element) -> None:
         for material in visual.findall("material"):  # the camera is white in the official pictures
             visual.remove(material)
     robot.extend([*links, *joints])
+
+
+def _coarse(mesh: Path, caches: Path) -> Path:
+    """The mesh with no more detail than shows; made once."""
+    key = hashlib.sha256(mesh.read_bytes() + str(CELL).encode()).hexdigest()[:16]
+    coarse = caches / key / mesh.name
+    if not coarse.exists():
+        coarse.parent.mkdir(parents=True, exist_ok=True)
+        _write(coarse, stl_bytes(coarsen(read_stl(mesh))))
+    return coarse
 
 
 def _write(path: Path, content: bytes) -> None:

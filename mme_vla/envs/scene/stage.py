@@ -11,6 +11,7 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 
+from mme_vla.envs.rendering import keep_renderer
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.things import Thing
 
@@ -67,6 +68,11 @@ class Stage(BaseEnv):
 
     def _load_agent(self, options: dict) -> None:
         super()._load_agent(options, sapien.Pose(ROBOT_BASE))
+
+    def _setup_scene(self) -> None:
+        super()._setup_scene()
+        if self.scene.can_render():
+            keep_renderer(self._render_device)
 
     def set_up(self) -> None:
         """Put up the table, with nothing on it."""

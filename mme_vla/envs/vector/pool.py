@@ -139,8 +139,8 @@ class VecEnv:
     def recv(self, timeout: float | None = None) -> list[Reply]:
         """Wait until at least one worker is ready, and take the replies of all that are.
 
-        A worker that died or hangs is replaced, and reported by a reply with `crashed` and the status `error`; the
-        others go on.
+        A worker that died or hangs, or whose renderer failed, is replaced, and reported by a reply with `crashed` and
+        the status `error`; the others go on.
 
         Args:
             timeout: seconds to wait at most; None waits as long as commands may take.
@@ -212,7 +212,7 @@ class VecEnv:
         try:
             protocol.send(state.connection, *message)
         except OSError:
-            self._lost.append(self._replace(worker, protocol.last_words(state.process)))
+            self._lost.append(self._crashed(worker, protocol.last_words(state.process)))
 
     def _poll(self, index: int, state: _Worker) -> Reply | None:
         """Take what a worker has sent; its reply if that is complete."""
@@ -233,19 +233,25 @@ class VecEnv:
                 elif kind == protocol.FAILURE:
                     state.running = False
                     return Reply.of_failure(index, state.begun, state.resetting, *content)
+                elif kind == protocol.LOST:
+                    return self._replace(index, *content)
         except (EOFError, OSError):
-            return self._replace(index, protocol.last_words(state.process))
+            return self._crashed(index, protocol.last_words(state.process))
         if time.monotonic() > state.deadline:
-            return self._replace(index, f"gave no result within {self.timeout:g} s")
+            return self._crashed(index, f"gave no result within {self.timeout:g} s")
         return None
 
-    def _replace(self, index: int, what: str) -> Reply:
-        """Put a new process in a worker's place; the reply that reports the old one's end."""
+    def _crashed(self, index: int, what: str) -> Reply:
+        """Replace a worker that ended or hangs."""
+        return self._replace(index, "WorkerCrash", f"the worker process {what}")
+
+    def _replace(self, index: int, kind: str, message: str) -> Reply:
+        """Put a new process in a worker's place; the reply that reports what became of the old one's command."""
         old = self._workers[index]
         old.connection.close()
         protocol.end(old.process)
         self._workers[index] = self._spawn()
-        return Reply.of_failure(index, old.begun, old.resetting, "WorkerCrash", f"the worker process {what}")
+        return Reply.of_failure(index, old.begun, old.resetting, kind, message)
 
     def _sleep(self, until: float) -> None:
         running = [state for state in self._workers if state.running]

@@ -1,12 +1,15 @@
 """One worker process of a `VecEnv`: builds environments, steps them, and hands frames over through shared memory."""
 
-import contextlib
+import os
 import pickle
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from mme_vla.envs.rendering import renderer_works
 
 LARGE = 4096
 """Arrays of at least this many bytes go through shared memory; everything else is pickled."""
@@ -15,8 +18,8 @@ BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 """Shared memory of one worker: long videos are handed over in pieces of this size."""
 
 # Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any answer. RESULT: the
-# outcome of a command. FAILURE: the command raised.
-PIECE, RESULT, FAILURE = "piece", "result", "failure"
+# outcome of a command. FAILURE: the command raised. LOST: it raised, and the process is of no further use.
+PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
 RESET, STEP, CLOSE, GO_ON = "reset", "step", "close", "go on"
 
@@ -67,11 +70,10 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
 
 
 def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
-    """Run commands until told to close, or until the other side is gone."""
-    with contextlib.suppress(ImportError):
-        import torch
-
-        torch.set_num_threads(1)  # the workers themselves are the parallelism
+    """Run commands until told to close, until the other side is gone, or until the renderer has failed."""
+    os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
     env: Any = None
     try:
         while True:
@@ -90,8 +92,11 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dic
                 else:
                     continue
             except Exception as error:
-                send(connection, FAILURE, type(error).__name__, str(error))
-                continue
+                works = renderer_works()
+                send(connection, FAILURE if works else LOST, type(error).__name__, str(error))
+                if works:
+                    continue
+                return
             _hand_over(connection, block, outcome)
     except (EOFError, BrokenPipeError, ConnectionResetError):
         return

@@ -1,0 +1,52 @@
+"""The renderer outlives its environments: later episodes begin quickly and look the same."""
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mani_skill", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+
+from mme_vla.envs import make_env
+from mme_vla.envs.rendering import renderer_works
+from mme_vla.envs.rendering_check import render_backend
+from mme_vla.errors import UserError
+
+QUICK = 6.0
+"""CPU seconds; building the renderer anew takes some twenty, an episode with a kept one less than two."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _can_render() -> None:
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(f"cannot render here: {error}")
+
+
+def first_pictures(episode: int) -> np.ndarray:
+    """Front and wrist picture an episode begins with, [2, 256, 256, 3]; its environment is gone afterwards."""
+    env = make_env("PickXtimes", "test", episode)
+    observation, _ = env.reset()
+    env.close()
+    return np.stack([observation[f"{view}_rgb_list"][-1] for view in ("front", "wrist")])
+
+
+def test_later_episodes_begin_quickly_and_an_episode_looks_the_same_again() -> None:
+    first = first_pictures(0)
+    begun = time.process_time()
+    other = first_pictures(1)
+    assert time.process_time() - begun < QUICK, "the renderer was built anew"
+    assert not np.array_equal(first, other)
+    assert np.array_equal(first, first_pictures(0))
+
+
+def test_a_renderer_that_cannot_take_pictures_any_more_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    first_pictures(0)
+    assert renderer_works()
+
+    def lost(_: object) -> None:
+        raise RuntimeError("vk::Queue::submit: ErrorDeviceLost")
+
+    monkeypatch.setattr("mme_vla.envs.rendering._take_picture", lost)
+    assert not renderer_works()
