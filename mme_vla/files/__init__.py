@@ -1,6 +1,6 @@
 """Files as they really are: damaged, shared, half written, from strangers. Nothing here knows what is in them."""
 
-from mme_vla.files.checksums import SUMS, Sums, check_sums, file_sum, write_sums
+from mme_vla.files.checksums import SUMS, Sums, check_sums, file_sum, sum_line, write_sums
 from mme_vla.files.foreign import decoding, require_file
 from mme_vla.files.locks import FolderLock
 from mme_vla.files.places import inside, safe_name
@@ -10,6 +10,6 @@ from mme_vla.files.writing import write_atomically, write_json
 
 __all__ = [
     "SUMS", "FolderLock", "Sums", "check_sums", "decoding", "file_sum", "inside", "parse_json", "plain", "read_json",
-    "read_json_lines", "read_text", "require_file", "safe_name", "sealed", "unsealed", "write_atomically", "write_json",
-    "write_sums",
+    "read_json_lines", "read_text", "require_file", "safe_name", "sealed", "sum_line", "unsealed", "write_atomically",
+    "write_json", "write_sums",
 ]  # fmt: skip

@@ -21,12 +21,17 @@ def file_sum(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+def sum_line(path: Path, name: str) -> str:
+    """The line of a list of checksums for a file that is, or will be, called `name`."""
+    return f"{file_sum(path)}  {name}\n"
+
+
 def write_sums(folder: Path, names: Iterable[str] | None = None) -> None:
     """Write `SHA256SUMS` for these files of a folder, by default for all files in it and below."""
     found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
     chosen = sorted(set(names) if names is not None else {name for name in found if name != SUMS})
     with write_atomically(folder / SUMS) as draft:
-        draft.write_text("".join(f"{file_sum(folder / name)}  {name}\n" for name in chosen))
+        draft.write_text("".join(sum_line(folder / name, name) for name in chosen))
 
 
 class Sums:
@@ -65,7 +70,9 @@ class Sums:
             return
         path = inside(self.folder, name)
         if not path.is_file():
-            raise UserError(f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again.")
+            raise UserError(
+                f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again."
+            )
         if file_sum(path) != self.table[name]:
             raise UserError(
                 f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "

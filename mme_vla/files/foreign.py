@@ -1,6 +1,5 @@
 """Where bytes go to another library's parser: what it makes of damaged ones becomes one clear sentence."""
 
-import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,7 +15,7 @@ def require_file(path: Path, what: str = "a file") -> Path:
         UserError: it is missing, a folder, a device or a pipe.
     """
     try:
-        mode = os.stat(path).st_mode
+        mode = path.stat().st_mode
     except FileNotFoundError:
         raise UserError(f"{path} is missing; expected {what}.") from None
     except (OSError, ValueError) as error:
@@ -43,4 +42,4 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     except Exception as error:
         said = " ".join(str(error).split())
         reason = f"{type(error).__name__}: {brief(said, 200, quote=False)}" if said else type(error).__name__
-        raise UserError(f"{path} cannot be read as {what} ({reason}). {remedy}") from error
+        raise UserError(f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}") from error
