@@ -4,12 +4,12 @@ from mme_vla.files.checksums import SUMS, Sums, check_sums, file_sum, sum_line, 
 from mme_vla.files.foreign import decoding, require_file
 from mme_vla.files.locks import FolderLock
 from mme_vla.files.places import inside, safe_name
-from mme_vla.files.reading import parse_json, read_json, read_json_lines, read_text
+from mme_vla.files.reading import is_text, parse_json, read_bytes, read_json, read_json_lines, read_text
 from mme_vla.files.seals import plain, sealed, unsealed
 from mme_vla.files.writing import write_atomically, write_json
 
 __all__ = [
-    "SUMS", "FolderLock", "Sums", "check_sums", "decoding", "file_sum", "inside", "parse_json", "plain", "read_json",
-    "read_json_lines", "read_text", "require_file", "safe_name", "sealed", "sum_line", "unsealed", "write_atomically",
-    "write_json", "write_sums",
+    "SUMS", "FolderLock", "Sums", "check_sums", "decoding", "file_sum", "inside", "is_text", "parse_json", "plain",
+    "read_bytes", "read_json", "read_json_lines", "read_text", "require_file", "safe_name", "sealed", "sum_line",
+    "unsealed", "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip
