@@ -15,6 +15,7 @@ from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from mme_vla.envs.names import TASK_NAMES
 from mme_vla.errors import UserError, brief, did_you_mean
@@ -137,9 +138,10 @@ def _file(folder: Path, task: str, split: str) -> Path:
 
 def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
     """Episode, seed and difficulty of one official record."""
-    found = record if isinstance(record, dict) else {}
-    numbers, difficulty = [found.get("episode"), found.get("seed")], found.get("difficulty")
-    if not all(type(n) is int and 0 <= n < 2**31 for n in numbers) or difficulty not in set(_CYCLE):
+    found: dict[str, Any] = record if isinstance(record, dict) else {}
+    numbers: list[Any] = [found.get("episode"), found.get("seed")]
+    difficulty: Any = found.get("difficulty")
+    if not all(type(n) is int and 0 <= n < 2**31 for n in numbers) or difficulty not in list(_CYCLE):
         raise UserError(
             f"{path} is not official metadata: a record has episode {brief(numbers[0])}, seed {brief(numbers[1])} and "
             f"difficulty {brief(difficulty)}; expected two whole numbers and one of {', '.join(sorted(set(_CYCLE)))}. "

@@ -257,7 +257,7 @@ def _read_reply(path: Path) -> Reply | None:
         return None
     try:
         kept = unsealed(read_json(path, "an answer that was kept"), str(path))
-        counts = [kept.get("input_tokens"), kept.get("output_tokens")]
+        counts: list[Any] = [kept.get("input_tokens"), kept.get("output_tokens")]
         if not isinstance(kept.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
             raise UserError(f"{path} lacks a text and two numbers of tokens")
         return Reply(kept["text"], *counts)
