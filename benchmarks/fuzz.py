@@ -142,7 +142,6 @@ def _quiet() -> None:
 
 
 def _read(target: Target, folder: Path, gib: float, answers: Connection) -> None:
-    from benchmarks.fuzz_targets.texts import Refused
     from mme_vla.errors import UserError
 
     pages = int(Path("/proc/self/statm").read_text().split()[0])
@@ -157,7 +156,7 @@ def _read(target: Target, folder: Path, gib: float, answers: Connection) -> None
             result = target.read(folder)
         told = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
         answers.send(("read", result, "\n".join([*told, log.getvalue()]).strip()))
-    except (UserError, Refused) as error:
+    except UserError as error:
         answers.send(("refused", None, str(error)))
     except BaseException:
         answers.send(("traceback", None, traceback.format_exc(limit=-4)[-LONGEST:]))

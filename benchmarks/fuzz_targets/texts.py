@@ -8,6 +8,7 @@ import numpy as np
 
 from benchmarks.fuzz_targets.base import Target, digest, every_file
 from mme_vla.envs import metadata
+from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.run_file import claim_run, read_run
@@ -90,11 +91,7 @@ def read_said(folder: Path) -> object:
             parse_choice(said["choice.json"], [Option("a", "pick", True)]),
         )  # fmt: skip
     except MalformedAnswer as error:
-        raise Refused(str(error)) from None
-
-
-class Refused(Exception):
-    """Refused in words, though not by a `UserError`."""
+        raise UserError(str(error)) from None
 
 
 class _Words:
