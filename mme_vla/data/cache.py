@@ -294,6 +294,8 @@ def run(cfg: "DictConfig") -> None:
                 f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
             )
             continue
+        if os.environ.get("RANK", "0") == "0":
+            source.verify()  # its pictures are all about to be read, and for the last time
         if cfg.rebuild:
             clear_cache(folder)
         batch_size = cfg.data.cache.batch_size

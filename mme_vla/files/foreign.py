@@ -40,6 +40,6 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        said = " ".join(str(error).split())
+        said = " ".join(str(error.__cause__ or error).split())  # some wrap what happened in a sentence without content
         reason = f"{type(error).__name__}: {brief(said, 200, quote=False)}" if said else type(error).__name__
         raise UserError(f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}") from error
