@@ -64,7 +64,7 @@ def targets() -> dict[str, Target]:
     return {target.name: target for target in found}
 
 
-def fuzz(target: Target, mutations: int, seed: int, seconds: float = 30, gib: float = 2) -> list[Case]:
+def fuzz(target: Target, mutations: int, seed: int, seconds: float = 60, gib: float = 2) -> list[Case]:
     """Damage one kind this often.
 
     Raises:
@@ -187,7 +187,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("kinds", nargs="*", metavar="KIND", help=f"default: all of {', '.join(known)}")
     parser.add_argument("--mutations", type=int, default=200, help="of each kind (default 200)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--seconds", type=float, default=30, help="for one reading (default 30)")
+    parser.add_argument("--seconds", type=float, default=60, help="for one reading (default 60)")
     parser.add_argument("--gib", type=float, default=2, help="memory for one reading (default 2)")
     parser.add_argument("--json", type=Path, help="also write every case to this file")
     args = parser.parse_args(words)
