@@ -1,5 +1,6 @@
 """Recordings, datasets and vision caches, as small as they can be."""
 
+import importlib
 import shutil
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,9 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import SUBGOALS, find_files, list_episodes, open_episode
 from mme_vla.files import write_sums
 from mme_vla.memory.tokendrop import TokenDrop
+
+for _name in ("av", "datasets", "lerobot.datasets.feature_utils", "PIL.Image", "pyarrow.parquet"):
+    importlib.import_module(_name)  # here, or every process that reads a damaged copy takes seconds to do so
 
 LENGTHS, VIDEO, SIDE = (12, 9), 4, 32  # steps of the episodes, of which so many are video; pixels
 H5 = "record_dataset_PickXtimes.h5"
