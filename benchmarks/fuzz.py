@@ -103,7 +103,7 @@ def _case(
     elif kind == "refused" and len(said) > LONGEST:
         outcome = "long"
     _remove(work)
-    return Case(target.name, number, path.as_posix(), mutation, outcome, said)
+    return Case(target.name, number, path.as_posix(), mutation, outcome, said.replace(str(work), "<folder>"))
 
 
 def _apart(target: Target, folder: Path, seconds: float, gib: float) -> tuple[str, object, str]:
