@@ -2,7 +2,6 @@
 
 import asyncio
 import ipaddress
-import json
 import logging
 import socket
 from collections.abc import AsyncIterator
@@ -12,6 +11,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from mme_vla.errors import UserError
+from mme_vla.files import parse_json
 from mme_vla.play.desk import Desk, StaleError
 
 log = logging.getLogger("mme_vla.play")
@@ -83,13 +83,7 @@ def make_app(desk: Desk, local: bool = True) -> Any:
             content += piece
             if len(content) > MOST:
                 raise UserError(f"The request is longer than {MOST} bytes.")
-        try:
-            found = json.loads(bytes(content) or b"{}")
-        except ValueError:
-            raise UserError("The request is not JSON.") from None
-        if not isinstance(found, dict):
-            raise UserError("The request is no JSON object.")
-        return found
+        return parse_json(bytes(content) or b"{}", "The request")
 
     async def choose(request: Request) -> Response:
         try:
