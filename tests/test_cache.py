@@ -156,7 +156,7 @@ def test_a_damaged_token_file_is_refused(source, tmp_path, damage) -> None:
 def test_a_damaged_score_file_is_refused(source, tmp_path, damage) -> None:
     memory = LastFrames(scored=True)
     damage(score_file(ensure(source, memory, tmp_path).folder, 1))
-    with pytest.raises(UserError, match=rf"{score_file(tmp_path, 1).name} is damaged .*{COMMAND} rebuild=true"):
+    with pytest.raises(UserError, match=rf"{score_file(tmp_path, 1).name} is damaged.*{COMMAND} rebuild=true"):
         ensure(source, memory, tmp_path).history(1)
 
 

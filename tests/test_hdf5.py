@@ -45,7 +45,7 @@ def test_subgoals_of_a_completed_task_stay_the_last_ones(tmp_path: Path) -> None
     [
         (lambda e: e.pop("timestep_3"), "without gaps"),
         (lambda e: e["timestep_0"].pop("obs/wrist_rgb"), "lacks timestep_0/obs/wrist_rgb"),
-        (lambda e: e["timestep_4"].pop("action/joint_action"), "timestep_4/action/joint_action cannot be read"),
+        (lambda e: e["timestep_4"].pop("action/joint_action"), "timestep_4/action/joint_action is damaged"),
         (lambda e: e["timestep_5/info/is_video_demo"].write_direct(np.array(True)), "video frames must come first"),
     ],
 )
@@ -60,7 +60,7 @@ def test_a_damaged_episode_is_named(tmp_path: Path, damage, message: str) -> Non
 
 def test_what_is_no_demonstration_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.h5").write_bytes(b"not HDF5")
-    with pytest.raises(UserError, match="cannot be opened as HDF5"):
+    with pytest.raises(UserError, match="cannot be read as HDF5"):
         list_episodes([tmp_path / "a.h5"])
     h5py.File(tmp_path / "b.h5", "w").close()
     with pytest.raises(UserError, match="no episode_<number> group"):

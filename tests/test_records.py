@@ -170,7 +170,7 @@ def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="changed by hand"):
         read_run(tmp_path)
     path.write_text("{")
-    with pytest.raises(UserError, match="damaged"):
+    with pytest.raises(UserError, match="not valid JSON"):
         read_run(tmp_path)
 
 

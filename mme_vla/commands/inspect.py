@@ -84,7 +84,12 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
 
 
 def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) -> None:
-    """Print a dataset's episodes, at most `most` of them, and its totals."""
+    """Print a dataset's episodes, at most `most` of them, and its totals.
+
+    Raises:
+        UserError: a file is not what its checksum says; all of them are compared.
+    """
+    compared = source.verify()
     table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
     for episode in range(min(len(source), most)):
         frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
@@ -100,6 +105,10 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
         f"{'video' if source.video_views else 'images'} · subgoals: {', '.join(source.subgoal_names) or 'none'}",
         highlight=False,
     )
+    console.print(
+        f"checksums: all {compared} files are as they were written" if compared else
+        "checksums: none, so damage to pictures or numbers cannot be noticed", highlight=False,
+    )  # fmt: skip
 
 
 def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Console") -> None:

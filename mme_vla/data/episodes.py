@@ -5,7 +5,6 @@ few numbers an episode.
 """
 
 import io
-import json
 import logging
 from collections.abc import Sequence
 from functools import cached_property
@@ -17,14 +16,18 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
+    VECTORS,
     VIEWS,
     check_features,
     content_fingerprint,
     read_exec_starts,
+    read_info,
     resolve_root,
 )
+from mme_vla.data.tables import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import Sums, decoding, read_json
 
 SIDE_FILE = "meta/robomme_episodes.json"
 log = logging.getLogger(__name__)
@@ -57,23 +60,26 @@ class EpisodeSource:
             UserError: not a v3.0 dataset, a feature is missing, the demonstration flag is missing and no side file
                 is given, or the parts of the dataset contradict each other.
         """
-        from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
-
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
-        meta = LeRobotDatasetMetadata(f"local/{self.name}", root=self.root)
-        columns = check_features(self.root, meta.features)
-        self.fps = float(meta.fps)
-        self.video_views = tuple(view for view in VIEWS if meta.features[view]["dtype"] == "video")
+        info = read_info(self.root)
+        features = info["features"]
+        columns = check_features(self.root, features)
+        self.fps = float(info["fps"])
+        self.video_views = tuple(view for view in VIEWS if features[view]["dtype"] == "video")
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
-        episodes = meta.episodes.with_format("arrow")[:]
-        self._starts = episodes["dataset_from_index"].to_numpy().astype(np.int64)
-        self.lengths = episodes["dataset_to_index"].to_numpy().astype(np.int64) - self._starts
-        self._goals = [texts[0].lower() for texts in episodes["tasks"].to_pylist()]
-        self._videos = {view: _VideoFiles(self.root, meta.video_path, view, episodes) for view in self.video_views}
-        self._table = _open_table(self.root, columns, meta.features)
+        self._check_tables()
+        episodes = read_episode_table(self.root, self.video_views)
+        self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
+        self._goals = list(episodes["goals"])
+        self._videos = {
+            view: _VideoFiles(self.root, info.get("video_path"), view, episodes) for view in self.video_views
+        }
+        self._table = open_table(self.root, columns, features)
         self._reader = VideoReader(max_open_videos)
         self._check_rows()
+        for vector in VECTORS:
+            check_vectors(self.root, self._table, vector, features[vector]["shape"][0])
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
     def __len__(self) -> int:
@@ -90,13 +96,46 @@ class EpisodeSource:
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
-        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty."""
+        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty.
+
+        Raises:
+            UserError: the file is damaged.
+        """
         side = self.root / SIDE_FILE
-        return json.loads(side.read_text())["episodes"] if side.is_file() else []
+        if not side.exists() and not side.is_symlink():
+            return []
+        found = read_json(side, "what is known of a dataset's episodes").get("episodes")
+        if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
+            raise UserError(f"{side} holds no list of episodes. {REMEDY}")
+        return found
 
     def task(self, episode: int) -> str:
         """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
-        return str(self.records[episode]["task"]) if episode < len(self.records) else ""
+        task = self.records[episode].get("task", "") if episode < len(self.records) else ""
+        if not isinstance(task, str):
+            raise UserError(f"{self.root / SIDE_FILE}: the task of episode {episode} is {brief(task)}. {REMEDY}")
+        return task
+
+    def verify(self) -> int:
+        """Compare every file with the checksums beside them, if there are any; reads the whole dataset.
+
+        Returns:
+            The number of files compared, 0 for a dataset that was written without checksums.
+
+        Raises:
+            UserError: a file is missing or is not what was written.
+        """
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        for name in sums.table:
+            sums.check(name)
+        return len(sums.table)
+
+    def _check_tables(self) -> None:
+        """The same for what every opening reads anyway; tables that hold pictures are left to `verify`."""
+        sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
+        for name in sums.table:
+            if name.startswith("meta/") or (name.startswith("data/") and len(self.video_views) == len(VIEWS)):
+                sums.check(name)
 
     def goal(self, episode: int) -> str:
         """The episode's goal in words, lower-case."""
@@ -144,7 +183,8 @@ class EpisodeSource:
 
         start = int(self._starts[episode])
         cells = [self._table[start + int(i) : start + int(i) + 1][view][0].as_py() for i in indices]
-        return np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB")) for cell in cells])
+        with decoding(f"{self.root}, episode {episode}, {view}", "pictures", REMEDY):
+            return np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB")) for cell in cells])
 
     def _rows(self, episode: int, start: int, stop: int | None) -> Any:
         length = int(self.lengths[episode])
@@ -161,10 +201,11 @@ class EpisodeSource:
     def _check_rows(self) -> None:
         """The tables hold the episodes back to back, as the metadata say."""
         index = _flat(self._table.with_format("arrow").select_columns("episode_index")[:]["episode_index"])
-        expected = np.repeat(np.arange(len(self)), self.lengths)
-        if not np.array_equal(index.to_numpy(), expected):
+        total = int(self.lengths.sum())  # before anything of that size is made
+        expected = np.repeat(np.arange(len(self)), self.lengths) if len(index) == total else None
+        if expected is None or not np.array_equal(index.to_numpy(zero_copy_only=False), expected):
             raise UserError(
-                f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {len(expected)} in "
+                f"{self.root}: the tables hold {len(index)} rows where meta/episodes describes {total} in "
                 f"{len(self)} episodes; the dataset is incomplete or mixed up. Copy, download or convert it again."
             )
 
@@ -202,33 +243,14 @@ class EpisodeSource:
 class _VideoFiles:
     """Which file, and from which second on, holds an episode's pictures of one view."""
 
-    def __init__(self, root: Path, template: str, view: str, episodes: Any) -> None:
+    def __init__(self, root: Path, template: object, view: str, episodes: dict[str, Any]) -> None:
         self._root, self._template, self._view = root, template, view
-        chunk, file, self._offsets = (
-            episodes[f"videos/{view}/{key}"].to_numpy() for key in ("chunk_index", "file_index", "from_timestamp")
-        )
-        self._files = np.stack([chunk, file], axis=1).astype(np.int64)
+        self._files = np.stack([episodes[f"{view}/{key}"] for key in ("chunk_index", "file_index")], axis=1)
+        self._offsets = episodes[f"{view}/from_timestamp"]
 
     def locate(self, episode: int) -> tuple[Path, float]:
         chunk, file = (int(x) for x in self._files[episode])
-        name = self._template.format(video_key=self._view, chunk_index=chunk, file_index=file)
-        return self._root / name, float(self._offsets[episode])
-
-
-def _open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> Any:
-    """Memory-map these columns of all tables, as LeRobot does, through the cache folder of the `datasets` library."""
-    from contextlib import nullcontext
-
-    from datasets import Dataset, Features
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
-    from lerobot.utils.utils import SuppressProgressBars
-
-    wanted = get_hf_features_from_features({name: features[name] for name in columns})
-    large = any(features[name]["dtype"] == "image" for name in columns)
-    files = [str(path) for path in sorted(root.glob("data/*/*.parquet"))]
-    with nullcontext() if large else SuppressProgressBars():
-        table = Dataset.from_parquet(files, columns=list(columns), features=Features(wanted))
-    return table.with_format("arrow")
+        return video_file(self._root, self._template, self._view, chunk, file), float(self._offsets[episode])
 
 
 def _flat(column: Any) -> Any:

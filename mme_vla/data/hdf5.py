@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import decoding, require_file
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
+_REMEDY = "Download or copy the file again."
 _REQUIRED = (
     "obs/front_rgb", "obs/wrist_rgb", "obs/joint_state", "obs/gripper_state", "action/joint_action",
     "info/is_video_demo", "info/is_completed", *(f"info/{name}" for name in SUBGOALS),
@@ -73,8 +75,8 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     refs = []
     for file in files:
         task = re.sub(r"^record_dataset_", "", file.stem)
-        with _open(file) as handle:
-            numbers = sorted(int(name[8:]) for name in handle if re.fullmatch(r"episode_\d+", name))
+        with _open(file) as handle, decoding(file, "HDF5", _REMEDY):
+            numbers = sorted(int(name[8:]) for name in handle if re.fullmatch(r"episode_\d{1,9}", name))
         if not numbers:
             raise UserError(f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.")
         refs += [EpisodeRef(file, number, task) for number in numbers]
@@ -87,41 +89,88 @@ class RawEpisode:
     def __init__(self, ref: EpisodeRef, group: Any) -> None:
         self.ref = ref
         self._group = group
-        steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d+", name))
+        with decoding(f"{ref.file} {ref.group}", "an episode", _REMEDY):
+            steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name))
         if steps != list(range(len(steps))) or not steps:
             raise UserError(
                 f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
                 f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged."
             )
         self.length = len(steps)
-        missing = [name for name in ("setup/task_goal", *(f"timestep_0/{x}" for x in _REQUIRED)) if name not in group]
+        with decoding(f"{ref.file} {ref.group}", "an episode", _REMEDY):
+            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in _REQUIRED))
+            missing = [name for name in needed if name not in group]
         if missing:
             raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
-        demo = np.array([bool(self._step(k, "info/is_video_demo")) for k in range(self.length)])
+        demo = np.array([self._flag(k, "info/is_video_demo") for k in range(self.length)])
         self.exec_start = int(demo.sum())
         if demo[self.exec_start :].any() or self.exec_start == self.length:
             raise UserError(f"{ref.file} {ref.group}: video frames must come first, then at least one execution frame.")
 
     def _step(self, step: int, name: str) -> Any:
-        try:
-            return self._group[f"timestep_{step}/{name}"][()]
-        except (KeyError, OSError) as error:
+        return self._value(f"timestep_{step}/{name}")
+
+    def _value(self, name: str) -> Any:
+        place = f"{self.ref.file} {self.ref.group}/{name}"
+        with decoding(place, "a dataset of HDF5", _REMEDY):
+            return self._group[name][()]
+
+    def _numbers(self, step: int, name: str, least: int) -> np.ndarray:
+        """A list of at least `least` finite numbers."""
+        found = np.atleast_1d(np.asarray(self._step(step, name)))
+        if found.dtype.kind not in "fiu" or found.ndim != 1 or len(found) < least or not np.isfinite(found).all():
             raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} cannot be read: {error}"
-            ) from None
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected at "
+                f"least {least} finite numbers. {_REMEDY}"
+            )
+        return found
+
+    def _picture(self, step: int, name: str) -> np.ndarray:
+        found = np.asarray(self._step(step, name))
+        if found.dtype != np.uint8 or found.ndim != 3 or found.shape[-1] != 3:
+            raise UserError(
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {found.dtype} {list(found.shape)}; "
+                f"expected uint8 [height, width, 3]. {_REMEDY}"
+            )
+        return found
+
+    def _flag(self, step: int, name: str) -> bool:
+        found = np.asarray(self._step(step, name))
+        if found.size != 1 or found.dtype.kind not in "biu":
+            raise UserError(
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected a "
+                f"flag. {_REMEDY}"
+            )
+        return bool(found.reshape(-1)[0])
+
+    def _text(self, value: Any) -> str:
+        if not isinstance(value, bytes | str):
+            raise UserError(f"{self.ref.file} {self.ref.group} has {brief(value)} for a text. {_REMEDY}")
+        try:
+            return value.decode("utf-8") if isinstance(value, bytes) else value.encode().decode()
+        except UnicodeError:
+            raise UserError(f"{self.ref.file} {self.ref.group} has a text that is not UTF-8. {_REMEDY}") from None
 
     @property
     def goals(self) -> list[str]:
         """All wordings of the goal, lower-case; the first is the one to train with."""
-        return [_text(goal).lower() for goal in np.atleast_1d(self._group["setup/task_goal"][()])]
+        goals = [self._text(goal).lower() for goal in np.atleast_1d(self._value("setup/task_goal"))]
+        if not goals:
+            raise UserError(f"{self.ref.file} {self.ref.group}/setup/task_goal is empty. {_REMEDY}")
+        return goals
 
     @property
     def seed(self) -> int | None:
-        return int(self._group["setup/seed"][()]) if "setup/seed" in self._group else None
+        if "setup/seed" not in self._group:
+            return None
+        found = np.asarray(self._value("setup/seed"))
+        if found.size != 1 or found.dtype.kind not in "iu":
+            raise UserError(f"{self.ref.file} {self.ref.group}/setup/seed is {brief(found.tolist())}. {_REMEDY}")
+        return int(found.reshape(-1)[0])
 
     @property
     def difficulty(self) -> str | None:
-        return _text(self._group["setup/difficulty"][()]) if "setup/difficulty" in self._group else None
+        return self._text(self._value("setup/difficulty")) if "setup/difficulty" in self._group else None
 
     def __len__(self) -> int:
         return self.length
@@ -130,28 +179,28 @@ class RawEpisode:
         """The four texts of every step, as in `RawFrame`, without reading pictures."""
         subgoals: dict[str, str] = {}
         for k in range(self.length):
-            if not subgoals or not bool(self._step(k, "info/is_completed")):
-                subgoals = {name: _text(self._step(k, f"info/{name}")).lower() for name in SUBGOALS}
+            if not subgoals or not self._flag(k, "info/is_completed"):
+                subgoals = {name: self._text(self._step(k, f"info/{name}")).lower() for name in SUBGOALS}
             yield subgoals
 
     def joints(self) -> tuple[np.ndarray, np.ndarray]:
         """Joint angles and joint targets of every step, [t, 7] each, in the file's own precision."""
-        angles = [np.asarray(self._step(k, "obs/joint_state"))[:7] for k in range(self.length)]
-        targets = [np.asarray(self._step(k, "action/joint_action"))[:7] for k in range(self.length)]
+        angles = [self._numbers(k, "obs/joint_state", 7)[:7] for k in range(self.length)]
+        targets = [self._numbers(k, "action/joint_action", 7)[:7] for k in range(self.length)]
         return np.stack(angles), np.stack(targets)
 
     def front(self, step: int) -> np.ndarray:
         """The front picture of one step, [H, W, 3] uint8."""
-        return np.asarray(self._step(step, "obs/front_rgb"))
+        return self._picture(step, "obs/front_rgb")
 
     def __iter__(self) -> Iterator[RawFrame]:
         for k, subgoals in enumerate(self.subgoals()):
-            fingers = np.atleast_1d(self._step(k, "obs/gripper_state"))
+            fingers = self._numbers(k, "obs/gripper_state", 1)
             yield RawFrame(
                 front=self.front(k),
-                wrist=np.asarray(self._step(k, "obs/wrist_rgb")),
-                state=np.concatenate([self._step(k, "obs/joint_state"), fingers[:1]]).astype(np.float32),
-                action=np.asarray(self._step(k, "action/joint_action")),
+                wrist=self._picture(k, "obs/wrist_rgb"),
+                state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers[:1]]).astype(np.float32),
+                action=self._numbers(k, "action/joint_action", 8),
                 is_demo=k < self.exec_start,
                 subgoals=subgoals,
             )
@@ -165,22 +214,18 @@ def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
         UserError: the file or the episode is damaged or has another layout; the message names the place.
     """
     with _open(ref.file) as handle:
-        if ref.group not in handle:
+        with decoding(ref.file, "HDF5", _REMEDY):
+            group = handle.get(ref.group)
+        if group is None:
             raise UserError(f"{ref.file} has no {ref.group}.")
-        yield RawEpisode(ref, handle[ref.group])
+        yield RawEpisode(ref, group)
 
 
 @contextmanager
 def _open(file: Path) -> Iterator[Any]:
     import h5py
 
-    try:
+    with decoding(require_file(file, "HDF5"), "HDF5", _REMEDY):
         handle = h5py.File(file, "r")
-    except OSError as error:
-        raise UserError(f"{file} cannot be opened as HDF5 ({error}); download or copy it again.") from None
     with handle:
         yield handle
-
-
-def _text(value: Any) -> str:
-    return value.decode("utf-8") if isinstance(value, bytes) else str(value)

@@ -1,6 +1,6 @@
 """Is this folder a dataset we can read? Checked before LeRobot is asked, which would otherwise look on the hub."""
 
-import json
+import math
 from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.hdf5 import SUBGOALS
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, listed
+from mme_vla.files import decoding, inside, read_json, require_file
 
 VIEWS = ("image", "wrist_image")
 VECTORS = ("state", "actions")
@@ -30,7 +31,7 @@ def resolve_root(root: str | Path) -> Path:
             "hub: `hf download <owner>/<dataset> --repo-type dataset --local-dir <folder>`; from HDF5 files: "
             "`python -m mme_vla.data.convert input=<files> output=<folder>`."
         )
-    version = str(read_info(path).get("codebase_version", "unknown"))
+    version = brief(read_info(path).get("codebase_version", "unknown"), quote=False)
     if not version.startswith("v3."):
         raise UserError(
             f"{path} is a LeRobot {version} dataset; v3.0 is needed. Convert it with LeRobot's own command: "
@@ -44,15 +45,27 @@ def resolve_root(root: str | Path) -> Path:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return `meta/info.json`.
+    """Return `meta/info.json`: features with a `dtype` and a `shape` of whole numbers, frames per second, and others.
 
     Raises:
-        UserError: it is not JSON.
+        UserError: it is not JSON, or does not describe features.
     """
-    try:
-        return json.loads((root / "meta" / "info.json").read_text())
-    except json.JSONDecodeError as error:
-        raise UserError(f"{root / 'meta' / 'info.json'} is damaged: {error}.") from None
+    path = root / "meta" / "info.json"
+    info = read_json(path, "a dataset's description")
+    features = info.get("features")
+    if not isinstance(features, dict) or not all(_is_feature(feature) for feature in features.values()):
+        raise UserError(f"{path} does not describe its features by dtype and shape. Copy or download it again.")
+    fps = info.get("fps")
+    if isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000 or not math.isfinite(fps):
+        raise UserError(f"{path}: fps is {brief(fps)}; expected frames per second, above 0 and at most 1000.")
+    return {**info, "features": {name: {**f, "shape": tuple(f["shape"])} for name, f in features.items()}}
+
+
+def _is_feature(feature: object) -> bool:
+    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
+        return False
+    shape = feature.get("shape")
+    return isinstance(shape, list) and all(type(side) is int and 0 < side < 2**20 for side in shape)
 
 
 def check_features(root: Path, features: dict[str, dict[str, Any]]) -> list[str]:
@@ -64,7 +77,7 @@ def check_features(root: Path, features: dict[str, dict[str, Any]]) -> list[str]
     missing = [name for name in (*VIEWS, *VECTORS) if name not in features]
     if missing:
         raise UserError(
-            f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {', '.join(features)}. "
+            f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
             "Expected the names of the released RoboMME datasets; rename the features in a copy of the dataset."
         )
     for name in VECTORS:
@@ -86,21 +99,24 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
     Raises:
         UserError: the file is absent, of another form, or does not cover every episode.
     """
-    if not file.is_file():
-        raise UserError(f"exec_starts={file} does not exist.")
-    try:
-        if file.suffix == ".json":
-            table = {int(key): int(value) for key, value in json.loads(file.read_text()).items()}
-        else:
-            import pyarrow.parquet as pq
+    expected = (
+        'Expected JSON {"<episode_index>": <exec_start_idx>, …} or a parquet table with the columns episode_index and '
+        "exec_start_idx, all whole numbers from 0."
+    )
+    require_file(file, "exec_starts, first execution frames")
+    if file.suffix == ".json":
+        found = list(read_json(file, "first execution frames").items())
+        pairs = [(int(key) if key.isdecimal() and len(key) < 10 else key, value) for key, value in found]
+    else:
+        import pyarrow.parquet as pq
 
-            columns = pq.read_table(file, columns=["episode_index", "exec_start_idx"]).to_pydict()
-            table = dict(zip(columns["episode_index"], columns["exec_start_idx"], strict=True))
-    except (ValueError, AttributeError, OSError) as error:
-        raise UserError(
-            f'{file} cannot be read ({error}): expected JSON {{"<episode_index>": <exec_start_idx>, …}} or a parquet '
-            "table with the columns episode_index and exec_start_idx."
-        ) from None
+        with decoding(file, "a parquet table", expected), pq.ParquetFile(file) as opened:
+            columns = opened.read(columns=["episode_index", "exec_start_idx"]).to_pydict()
+            pairs = list(zip(columns["episode_index"], columns["exec_start_idx"], strict=True))
+    for pair in pairs:
+        if not all(type(number) is int and 0 <= number < 2**40 for number in pair):
+            raise UserError(f"{file} says {brief(pair[1])} of episode {brief(pair[0])}. {expected}")
+    table = dict(pairs)
     lost = [episode for episode in range(episodes) if episode not in table]
     if lost:
         raise UserError(
@@ -119,7 +135,7 @@ def content_fingerprint(root: Path, parts: Sequence[str] = ("data", "videos", "m
         for file in sorted((root / part).rglob("*")):
             if file.suffix not in (".parquet", ".mp4"):
                 continue
-            size = file.stat().st_size
+            size = require_file(inside(root, file.relative_to(root).as_posix()), "a part of a dataset").stat().st_size
             digest.update(f"{file.relative_to(root).as_posix()} {size}\n".encode())
             with file.open("rb") as handle:
                 for offset in (0, size // 2, max(size - 65536, 0)):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.files import decoding
 
 _SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nearer one is decoded up to
 
@@ -34,14 +35,17 @@ class VideoReader:
         order = np.argsort(np.asarray(timestamps), kind="stable")
         wanted = np.asarray(timestamps, np.float64)[order]
         pictures: list[np.ndarray] = []
+        if not path.is_file():
+            raise UserError(f"{path} is missing: the dataset is incomplete. Copy or download it again.")
         try:
-            for picture in self._decode(self._container(path), wanted, fps):
-                pictures.append(picture)
+            with decoding(path, "a video", "Copy or convert it again."):
+                for picture in self._decode(self._container(path), wanted, fps):
+                    pictures.append(picture)
+                if len({picture.shape for picture in pictures}) > 1:
+                    raise ValueError("its pictures are not of one size")
         except UserError:
-            raise
-        except (OSError, ValueError) as error:  # PyAV's errors derive from these
             self._drop(path)
-            raise UserError(f"{path} cannot be decoded ({error}); copy or convert it again.") from None
+            raise
         if len(pictures) < len(wanted):
             self._drop(path)
             raise UserError(
@@ -79,8 +83,6 @@ class VideoReader:
         if self._process != os.getpid():  # open files of a parent process share their position with it
             self._open, self._process = OrderedDict(), os.getpid()
         if path not in self._open:
-            if not path.is_file():
-                raise UserError(f"{path} is missing: the dataset is incomplete. Copy or download it again.")
             container = av.open(str(path))
             container.streams.video[0].codec_context.thread_count = 1  # parallelism is across workers
             self._open[path] = container

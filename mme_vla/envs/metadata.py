@@ -7,16 +7,17 @@ or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`)
 """
 
 import csv
-import json
 import os
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.files import read_json
 from mme_vla.registry import TASKS
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
@@ -111,15 +112,26 @@ def _file(folder: Path, task: str, split: str) -> Path:
     return folder / split / f"record_dataset_{task}_metadata.json"
 
 
+def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
+    """Episode, seed and difficulty of one official record."""
+    found: dict[str, Any] = record if isinstance(record, dict) else {}
+    numbers: list[Any] = [found.get("episode"), found.get("seed")]
+    difficulty: Any = found.get("difficulty")
+    if not all(type(n) is int and 0 <= n < 2**31 for n in numbers) or difficulty not in list(_CYCLE):
+        raise UserError(
+            f"{path} is not official metadata: a record has episode {brief(numbers[0])}, seed {brief(numbers[1])} and "
+            f"difficulty {brief(difficulty)}; expected two whole numbers and one of {', '.join(sorted(set(_CYCLE)))}. "
+            "Get the file again."
+        )
+    return numbers[0], numbers[1], difficulty
+
+
 def _official(folder: Path, task: str, split: str) -> list[EpisodeSpec]:
     path = _file(folder, task, split)
-    try:
-        records = json.loads(path.read_text())["records"]
-        specs = [EpisodeSpec(task, split, int(r["episode"]), int(r["seed"]), str(r["difficulty"])) for r in records]
-    except FileNotFoundError:
-        raise UserError(f"{path} does not exist; expected official metadata of {task}, split {split!r}.") from None
-    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path} is not official metadata: {error!r}. Get the file again.") from None
+    records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
+    if not isinstance(records, list) or not records:
+        raise UserError(f"{path} is not official metadata: it has no list of records. Get the file again.")
+    specs = [EpisodeSpec(task, split, *_numbers_of(record, path)) for record in records]
     specs.sort(key=lambda spec: spec.episode)
     if [spec.episode for spec in specs] != list(range(len(specs))):
         raise UserError(f"{path} does not number its episodes 0, 1, 2, …; get the file again.")

@@ -12,9 +12,12 @@ from typing import IO, Self
 
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
+from mme_vla.files import read_bytes
 
 RECORDS = "episodes.jsonl"
 """Name of a run's file; its shards are called `episodes-<shard>.jsonl`."""
+LOG_LIMIT = 2**30
+"""Most bytes of one file."""
 
 
 class RecordLog:
@@ -61,8 +64,8 @@ class RecordLog:
         if not rest:
             return
         try:
-            EpisodeRecord.from_json(rest.decode())
-        except ValueError:
+            EpisodeRecord.from_json(rest)
+        except UserError:
             warnings.warn(f"{self.path}: removed a half-written last line ({len(rest)} bytes).", stacklevel=3)
             self._file.truncate(len(content) - len(rest))
         else:  # only the line's end is missing
@@ -75,18 +78,15 @@ def read_records(path: Path) -> list[EpisodeRecord]:
     Raises:
         UserError: the file is not there, or another line is not a record.
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"Cannot read {path}: {error.strerror}.") from None
+    content = read_bytes(path, "episode records", LOG_LIMIT)
     *lines, rest = content.split(b"\n")
     records = []
     for number, line in enumerate([*lines, rest], 1):
         if not line.strip():
             continue
         try:
-            records.append(EpisodeRecord.from_json(line.decode()))
-        except ValueError as error:
+            records.append(EpisodeRecord.from_json(line))
+        except UserError as error:
             if number > len(lines):
                 warnings.warn(f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2)
                 continue

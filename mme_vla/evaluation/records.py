@@ -2,12 +2,15 @@
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
+from types import NoneType
 from typing import Any, NamedTuple, Self
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.files import parse_json, sealed, unsealed
 
+_LARGEST = 2**63  # numbers from there on are damage
 OUTCOMES = ("success", "fail", "timeout", "error")
 
 
@@ -47,6 +50,11 @@ class Seconds:
     policy: float = 0.0
     total: float = 0.0
     render: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < _LARGEST:
+                raise UserError(f"seconds.{name}={brief(value)} of a record must be a number of seconds.")
 
 
 @dataclass(frozen=True)
@@ -88,14 +96,16 @@ class EpisodeRecord:
 
     def __post_init__(self) -> None:
         if self.outcome not in OUTCOMES:
-            raise UserError(f"outcome {self.outcome!r} is none. {did_you_mean(str(self.outcome), OUTCOMES)}")
+            raise UserError(f"outcome {brief(self.outcome)} is none. {did_you_mean(str(self.outcome)[:80], OUTCOMES)}")
         for name, kind in _KINDS.items():
             value = getattr(self, name)
             if not isinstance(value, kind) or isinstance(value, bool):
                 wanted = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-                raise UserError(f"{name}={value!r} of a record must be {wanted}, not {type(value).__name__}.")
+                raise UserError(f"{name}={brief(value)} of a record must be {wanted}, not {type(value).__name__}.")
+            if isinstance(value, int) and abs(value) >= _LARGEST:
+                raise UserError(f"{name}={brief(value)} of a record is out of range.")
         if self.composition is not None and not isinstance(self.composition, str):
-            raise UserError(f"composition={self.composition!r} of a record must be text, or null.")
+            raise UserError(f"composition={brief(self.composition)} of a record must be text, or null.")
         if isinstance(self.checkpoint, str) and self.checkpoint.isdecimal():  # 60000 and "60000" are one checkpoint
             object.__setattr__(self, "checkpoint", int(self.checkpoint))
 
@@ -113,33 +123,41 @@ class EpisodeRecord:
         return EpisodeKey(self.task, self.episode)
 
     def to_json(self) -> str:
-        """One line, without its end."""
-        return json.dumps(asdict(self), ensure_ascii=False, separators=(",", ":"))
+        """One line, without its end; a checksum in it tells damage."""
+        return json.dumps(sealed(asdict(self)), ensure_ascii=False, separators=(",", ":"))
 
     @classmethod
-    def from_json(cls, line: str) -> Self:
+    def from_json(cls, line: str | bytes) -> Self:
         """Read a line.
 
         Raises:
-            ValueError: it is not JSON. UserError: it is, but not a record: fields are missing, unknown or wrong.
+            UserError: it is not JSON, not a record (fields are missing, unknown or wrong), or not what was written.
         """
-        values = json.loads(line)
-        if not isinstance(values, dict):
-            raise UserError(f"a record is a JSON object, not {type(values).__name__}")
+        # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
+        values = unsealed(parse_json(line, "an episode record", finite=False), "an episode record")
         known = {member.name for member in fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
-            raise UserError(f"unknown field {unknown[0]!r}. {did_you_mean(unknown[0], known)} Others go into `extra`.")
-        try:
-            return cls(**{**values, "seconds": Seconds(**(values.get("seconds") or {}))})
-        except TypeError as error:
-            raise UserError(f"not an episode record: {error}") from None
+            hint = did_you_mean(unknown[0][:80], known)
+            raise UserError(f"unknown field {brief(unknown[0])}. {hint} Others go into `extra`.")
+        seconds = values.get("seconds") or {}
+        unknown = sorted(set(seconds) - set(vars(Seconds()))) if isinstance(seconds, dict) else ["seconds"]
+        lacking = sorted(member.name for member in fields(cls) if _is_required(member) and member.name not in values)
+        if unknown or lacking:
+            raise UserError(
+                f"not an episode record: {listed(lacking) or 'nothing'} is missing, {listed(unknown)} unknown"
+            )
+        return cls(**{**values, "seconds": Seconds(**seconds)})
+
+
+def _is_required(member: Field[Any]) -> bool:
+    return member.default is MISSING and member.default_factory is MISSING
 
 
 _KINDS: dict[str, Any] = {
     "model": str, "checkpoint": (int, str), "model_seed": int, "task": str, "episode": int, "seed": int,
     "difficulty": str, "steps": int, "split": str, "max_steps": int, "action_space": str, "when": str, "extra": dict,
-    "seconds": Seconds,
+    "seconds": Seconds, "error": (str, NoneType), "subgoal": (str, NoneType), "memory_budget": (int, NoneType),
 }  # fmt: skip
 
 

@@ -10,7 +10,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import plain, read_json, sealed, unsealed
 
 RUN_FILE = "run.json"
 INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "timeout", "retries", "backoff",
@@ -36,7 +37,7 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
     Raises:
         UserError: the folder holds a run with other settings; each difference is named.
     """
-    settings = json.loads(json.dumps(settings))  # as they will be read back: tuples are lists, keys are strings
+    settings = plain(settings)  # as they will be read back
     content = {
         "settings": settings,
         "fingerprint": fingerprint(settings),
@@ -45,7 +46,7 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
     }
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        _write_new(folder / RUN_FILE, json.dumps(content, indent=2, sort_keys=True) + "\n")
+        _write_new(folder / RUN_FILE, json.dumps(sealed(content), indent=2, sort_keys=True) + "\n")
         return content
     except FileExistsError:
         _await_content(folder / RUN_FILE)
@@ -65,15 +66,15 @@ def read_run(folder: Path) -> dict[str, Any]:
         UserError: it is missing or damaged.
     """
     path = folder / RUN_FILE
-    try:
-        content = json.loads(path.read_text())
-        if content["fingerprint"] != fingerprint(content["settings"]):
-            raise UserError(f"{path} was changed by hand: its settings do not have its fingerprint.")
-    except OSError as error:
-        raise UserError(f"Cannot read {path}: {error.strerror}.") from None
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
-        raise UserError(f"{path} is damaged ({error}); remove it if the records beside it are of this run.") from None
-    return content
+    content = read_json(path, "a run's settings", finite=False)
+    if not isinstance(content.get("settings"), dict) or not isinstance(content.get("fingerprint"), str):
+        raise UserError(
+            f"{path} is damaged: it lacks settings or their fingerprint; remove it if the records beside "
+            "it are of this run."
+        )
+    if content["fingerprint"] != fingerprint(content["settings"]):
+        raise UserError(f"{path} was changed by hand: its settings do not have its fingerprint.")
+    return unsealed(content, str(path))
 
 
 def _write_new(target: Path, text: str) -> None:
@@ -105,7 +106,8 @@ def _await_content(path: Path, patience: float = 2) -> None:
 def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     before, after = _flat(there), _flat(now)
     changed = [key for key in sorted({*before, *after}) if before.get(key, _NOTHING) != after.get(key, _NOTHING)]
-    return "; ".join(f"{key} was {before.get(key, 'not set')!r}, is {after.get(key, 'not set')!r}" for key in changed)
+    told = (f"{key} was {brief(before.get(key, 'not set'))}, is {brief(after.get(key, 'not set'))}" for key in changed)
+    return "; ".join(told)
 
 
 _NOTHING = object()

@@ -1,12 +1,15 @@
 """Files as they really are: damaged, shared, half written, from strangers. Nothing here knows what is in them."""
 
-from mme_vla.files.checksums import SUMS, check_sums, file_sum, write_sums
+from mme_vla.files.checksums import SUMS, Sums, check_sums, file_sum, sum_line, write_sums
+from mme_vla.files.foreign import decoding, require_file
 from mme_vla.files.locks import FolderLock
 from mme_vla.files.places import inside, safe_name
-from mme_vla.files.reading import parse_json, read_json, read_json_lines, read_text
+from mme_vla.files.reading import is_text, parse_json, read_bytes, read_json, read_json_lines, read_text
+from mme_vla.files.seals import plain, sealed, unsealed
 from mme_vla.files.writing import write_atomically, write_json
 
 __all__ = [
-    "SUMS", "FolderLock", "check_sums", "file_sum", "inside", "parse_json", "read_json", "read_json_lines", "read_text",
-    "safe_name", "write_atomically", "write_json", "write_sums",
+    "SUMS", "FolderLock", "Sums", "check_sums", "decoding", "file_sum", "inside", "is_text", "parse_json", "plain",
+    "read_bytes", "read_json", "read_json_lines", "read_text", "require_file", "safe_name", "sealed", "sum_line",
+    "unsealed", "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip

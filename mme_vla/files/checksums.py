@@ -13,6 +13,7 @@ from mme_vla.files.writing import write_atomically
 
 SUMS = "SHA256SUMS"
 _AT_ONCE = 4  # files
+_REMEDY = "Take an earlier checkpoint or copy the file again"
 _LINE = re.compile(r"([0-9a-f]{64})  ([^\n]+)")
 
 
@@ -20,6 +21,11 @@ def file_sum(path: Path) -> str:
     """The SHA-256 of a file's bytes, in hexadecimal."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def sum_line(path: Path, name: str) -> str:
+    """The line of a list of checksums for a file that is, or will be, called `name`."""
+    return f"{file_sum(path)}  {name}\n"
 
 
 def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = False) -> None:
@@ -37,6 +43,49 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
         draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 
 
+class Sums:
+    """The checksums that lie beside a folder's files, read once; each file is compared at most once.
+
+    there: whether there are any; folders written by others, or before there were sums, have none.
+    """
+
+    def __init__(self, folder: Path, name: str = SUMS, remedy: str = _REMEDY) -> None:
+        """Read the list.
+
+        Args:
+            folder: a folder that may hold the list `name`. remedy: what the user can do about a damaged file.
+
+        Raises:
+            UserError: the list is damaged.
+        """
+        self.folder, self.name, self.remedy = folder, name, remedy
+        path = folder / name
+        self.there = path.exists() or path.is_symlink()
+        self.table = _read_sums(path) if self.there else {}
+        self._compared: set[str] = set()
+
+    def check(self, *names: str) -> None:
+        """Compare these files, each the first time it is asked about; one that is not listed is not checked.
+
+        Raises:
+            UserError: one is missing or its content is not what was written.
+        """
+        paths = {name: inside(self.folder, name) for name in names if name in self.table and name not in self._compared}
+        for path in paths.values():
+            if not path.is_file():
+                raise UserError(
+                    f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again."
+                )
+        with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
+            for (name, path), found in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
+                if found != self.table[name]:
+                    raise UserError(
+                        f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "
+                        f"{self.remedy}; if you changed it on purpose, delete {self.name}."
+                    )
+        self._compared |= set(paths)
+
+
 def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
     """Compare files with the sums that were written beside them.
 
@@ -46,27 +95,14 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
             people add notes and cards.
 
     Returns:
-        Whether there were sums to compare with; folders written by others, or before there were sums, have none.
+        Whether there were sums to compare with.
 
     Raises:
         UserError: a file is missing or its content is not what was written.
     """
-    sums = folder / SUMS
-    if not sums.exists():
-        return False
-    table = _read_sums(sums)
-    paths = {name: inside(folder, name) for name in (sorted(table) if names is None else names) if name in table}
-    for path in paths.values():
-        if not path.is_file():
-            raise UserError(f"{path} is missing, though {sums} lists it. Copy the whole folder again.")
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        for (name, path), found in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
-            if found != table[name]:
-                raise UserError(
-                    f"{path} is damaged: its content is not what was written (SHA-256 differs from {SUMS}). Take an "
-                    f"earlier checkpoint or copy the file again; if you changed it on purpose, delete {SUMS}."
-                )
-    return True
+    sums = Sums(folder)
+    sums.check(*(sorted(sums.table) if names is None else names))
+    return sums.there
 
 
 def _read_sums(sums: Path) -> dict[str, str]:

@@ -15,11 +15,11 @@ _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
 TEXT_LIMIT = 64 * 2**20  # bytes; the largest files of text here, tables of subgoals and statistics, stay far below
 
 
-def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
-    """Read a regular file of UTF-8 text of at most `limit` bytes.
+def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes:
+    """Read a regular file of at most `limit` bytes.
 
     Raises:
-        UserError: it is missing, a folder, a device or a pipe (which could block or never end), too large, not UTF-8.
+        UserError: it is missing, a folder, a device or a pipe (which could block or never end), too large.
     """
     try:
         # A pipe without a writer would block in open(); a device would never end.
@@ -30,16 +30,40 @@ def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
                 raise UserError(f"{path} is not a file; expected {what}.")
             if found.st_size > limit:
                 raise UserError(f"{path} has {found.st_size:,} bytes; {what} has at most {limit:,}.")
-            data = file.read(limit + 1)
+            return file.read(limit + 1)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
         reason = "a folder" if isinstance(error, IsADirectoryError) else getattr(error, "strerror", None) or error
         raise UserError(f"{path} cannot be read as {what}: {reason}.") from None
+
+
+def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
+    """Read a regular file of UTF-8 text of at most `limit` bytes; see `read_bytes`.
+
+    Raises:
+        UserError: as `read_bytes`, or it is not UTF-8.
+    """
+    data = read_bytes(path, what, limit)
     try:
         return data.decode()
     except UnicodeDecodeError as error:
         raise UserError(f"{path} is damaged: byte {error.start:,} is not UTF-8 text; expected {what}.") from None
+
+
+def is_text(value: object) -> bool:
+    """Whether a value is text that can be written and tokenised: JSON's escapes allow half characters, UTF-8 does not.
+
+    >>> is_text("\ud800")
+    False
+    """
+    if not isinstance(value, str):
+        return False
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = dict, finite: bool = True) -> Any:

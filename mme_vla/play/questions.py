@@ -3,12 +3,13 @@
 Points are (row, column) in thousandths of the picture's sides, as with the subgoal predictors.
 """
 
-import json
 import math
 import re
 from collections.abc import Sequence
 from typing import Any
 
+from mme_vla.errors import UserError, brief
+from mme_vla.files import parse_json
 from mme_vla.play.game import SIDE, Decision, Option
 from mme_vla.subgoal.words.parsing import THOUSAND, MalformedAnswer, to_pixels, to_thousandths
 from mme_vla.subgoal.words.prompts import IMAGE, VIDEO
@@ -98,7 +99,9 @@ def parse_choice(answer: str, options: Sequence[Option]) -> dict[str, Any]:
     label = letter.strip().strip("().:[]").lower()
     option = next((option for option in options if option.label == label), None)
     if option is None:
-        raise MalformedAnswer(f"there is no option {letter!r}; the options are {', '.join(o.label for o in options)}")
+        raise MalformedAnswer(
+            f"there is no option {brief(letter)}; the options are {', '.join(o.label for o in options)}"
+        )
     return {"choice": label, "point": _pixel(found.get("point"), option) if option.needs_point else None}
 
 
@@ -118,7 +121,8 @@ def _pixel(point: Any, option: Option) -> list[int]:
 def _last_object(answer: str) -> dict[str, Any]:
     for text in reversed(_OBJECT.findall(answer)):
         try:
-            return dict(json.loads(text))
-        except (ValueError, RecursionError):  # also numbers too long to read, and lists nested too deep
+            found: dict[str, Any] = parse_json(text, "the answer", finite=False)
+            return found
+        except UserError:
             continue
     raise MalformedAnswer("the answer holds no JSON object")

@@ -1,7 +1,6 @@
 """The page in a browser: a few routes around a `Desk`."""
 
 import asyncio
-import json
 import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -10,6 +9,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from mme_vla.errors import UserError, missing_extra
+from mme_vla.files import parse_json
 from mme_vla.play.desk import Desk, StaleError
 from mme_vla.serving.listen import is_local, listen
 
@@ -82,13 +82,7 @@ def make_app(desk: Desk, local: bool = True) -> Any:
             content += piece
             if len(content) > MOST:
                 raise UserError(f"The request is longer than {MOST} bytes.")
-        try:
-            found = json.loads(bytes(content) or b"{}")
-        except ValueError:
-            raise UserError("The request is not JSON.") from None
-        if not isinstance(found, dict):
-            raise UserError("The request is no JSON object.")
-        return found
+        return parse_json(bytes(content) or b"{}", "The request")
 
     async def choose(request: Request) -> Response:
         try:

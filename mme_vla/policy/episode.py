@@ -9,6 +9,8 @@ from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
+from mme_vla.processing.limits import check_reach, finite_array
+from mme_vla.processing.prompt import checked_text
 from mme_vla.types import VIEWS, HistoryTokens
 
 if TYPE_CHECKING:
@@ -40,7 +42,7 @@ class Episode:
         self._images: Tensor | None = None
         self._state: Tensor | None = None
         self._video_over = False
-        self.goal = goal
+        self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
         memory = policy.memory
@@ -72,19 +74,19 @@ class Episode:
         """
         # Everything is checked before anything is remembered: after an error the same frames can be given again.
         front, wrist = (self._checked_view(frames, view) for view in VIEWS)
-        states = np.asarray(states, np.float32)
+        states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         if states.shape != (len(front), 8) or len(wrist) != len(front) or demo.shape not in ((), (len(front),)):
             raise UserError(
                 f"observe() needs as many wrist images, 8-number states and is_demo flags as front images: got "
                 f"{len(front)} front, {len(wrist)} wrist, states of shape {states.shape} and is_demo of {demo.shape}."
             )
-        if not np.isfinite(states).all():
-            raise UserError("observe() got states that are not finite numbers.")
         if len(front) == 0:
             return
+        processor = self._policy.require_processor()
+        check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
         demo, executed = self._checked_course(len(front), demo, actions)
-        images = self._policy.require_processor().images([front[-1], wrist[-1]])
+        images = processor.images([front[-1], wrist[-1]])
         self._take(front, demo, executed)
         self._images, self._state = images, torch.from_numpy(states[-1].copy())
 
@@ -119,10 +121,12 @@ class Episode:
         Raises:
             UserError: pictures or a state of another form.
         """
-        state = np.asarray(state, np.float32)
-        if state.shape != (8,) or not np.isfinite(state).all():
+        state = finite_array(state, "the state")
+        if state.shape != (8,):
             raise UserError(f"look() needs a state of 8 finite numbers, got shape {state.shape}.")
-        images = self._policy.require_processor().images([image, wrist_image])
+        processor = self._policy.require_processor()
+        check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
+        images = processor.images([image, wrist_image])
         self._images, self._state = images, torch.from_numpy(state.copy())
 
     def _checked_course(
@@ -192,7 +196,8 @@ class Episode:
         """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
         if actions is None:
             return np.zeros((0, 8), np.float32) if self._chunk is None else self._chunk[:count]
-        executed = np.asarray(actions, np.float32)[max(len(actions) - count, 0) :]
+        given = finite_array(actions, "actions")
+        executed = given[max(len(given) - count, 0) :] if given.ndim else given
         if executed.shape != (count, 8):
             raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
         return executed

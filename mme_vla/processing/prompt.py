@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import is_text
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.registry import Registry
 
@@ -139,6 +140,19 @@ def discretize(values: np.ndarray) -> list[int]:
     return (np.digitize(np.clip(values, -1, 1), edges) - 1).tolist()
 
 
+def checked_text(text: object, what: str) -> str:
+    """`text`, if a tokenizer can take it.
+
+    Raises:
+        UserError: it is no text, or holds half a character (a lone surrogate), which no UTF-8 has.
+    """
+    if not isinstance(text, str):
+        raise UserError(f"{what} must be a text, got {brief(text)}.")
+    if not is_text(text):
+        raise UserError(f"{what} holds half a character (a lone surrogate), which cannot be written: {brief(text)}.")
+    return text
+
+
 def encode_prompt(
     prompt_format: PromptFormat, tokenizer: Tokenizer, given: PromptInput, max_length: int
 ) -> tuple[Tensor, Tensor]:
@@ -153,11 +167,12 @@ def encode_prompt(
     Returns:
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
+    checked_text(given.goal, "the goal")
     tokens = [token for text, bos in prompt_format.pieces(given) for token in tokenizer.encode(text, bos=bos)]
     if len(tokens) > max_length:
         _warn_once(
             f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise prompt_length. "
-            f"The first one, {len(tokens)} tokens long: {given.goal!r}.",
+            f"The first one, {len(tokens)} tokens long: {brief(given.goal, 200)}.",
             key=("truncated", max_length),
         )
         tokens = tokens[:max_length]
@@ -168,11 +183,12 @@ def encode_prompt(
 
 def shorten(text: str, tokenizer: Tokenizer, length: int | None) -> str:
     """Cut a text to its first `length` tokens, with one warning; None leaves it as it is."""
+    checked_text(text, "the subgoal")
     tokens = tokenizer.encode(text, bos=False)
     if length is None or len(tokens) <= length:
         return text
     _warn_once(
-        f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one: {text!r}.",
+        f"A subgoal has more tokens than subgoal_length={length} and loses its end. The first one: {brief(text, 200)}.",
         key=("shortened", length),
     )
     return tokenizer.decode(tokens[:length])

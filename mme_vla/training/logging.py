@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from mme_vla.errors import missing_extra
+from mme_vla.errors import UserError, missing_extra
+from mme_vla.files import parse_json, read_text
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 
@@ -173,9 +174,9 @@ def read_metrics(folder: Path) -> list[dict[str, Any]]:
     """The lines of a run's `metrics.jsonl`; a last line cut off by a kill is left out."""
     path = folder / METRICS
     lines = []
-    for line in path.read_text().splitlines() if path.is_file() else []:
+    for line in read_text(path, "metrics", limit=2**30).splitlines() if path.exists() else []:
         try:
-            lines.append(json.loads(line))
-        except ValueError:
+            lines.append(parse_json(line, str(path), finite=False))
+        except UserError:
             break
     return lines

@@ -1,12 +1,12 @@
 """Run folders: which one this run writes to, what it may resume from, and which settings it may change then."""
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError, brief
+from mme_vla.files import plain
 from mme_vla.training.checkpoint import checkpoints_in, read_state, resolve_checkpoint, step_of
 
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
@@ -82,7 +82,7 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Dotted keys whose values differ and must not, with both values."""
-    before, after = (_flat(json.loads(json.dumps(values))) for values in (old, new))
+    before, after = (_flat(plain(values)) for values in (old, new))
     return {
         key: (before.get(key), after.get(key))
         for key in sorted(before.keys() | after.keys())

@@ -12,10 +12,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.data.cache.store import DTYPES, FINGERPRINT, MEMORY_VIEW, check_fingerprint, score_file, token_file
+from mme_vla.data.cache.store import (
+    DTYPES,
+    FINGERPRINT,
+    MEMORY_VIEW,
+    check_fingerprint,
+    score_file,
+    sum_file,
+    token_file,
+)
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
+from mme_vla.files import sum_line
 from mme_vla.memory.base import Memory
 
 Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
@@ -45,8 +54,9 @@ def clear_cache(folder: Path) -> None:
         return
     if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
         raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.")
-    for path in [*folder.glob("episode_*.np[yz]"), *folder.glob("*.partial"), folder / FINGERPRINT]:
-        path.unlink(missing_ok=True)
+    for pattern in ("episode_*.np[yz]", "episode_*.sha256", "*.partial", FINGERPRINT):
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
 
 
 def build_cache(
@@ -157,10 +167,17 @@ def _build_episode(
                 raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.kept_pictures)} frames")
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
+    drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
-        _save(score_file(folder, episode), np.savez, frames=np.asarray(frames, np.int64), values=stacked)
-    _save(token_file(folder, episode), np.save, np.concatenate(rows))
+        path = score_file(folder, episode)
+        drafts[path] = _draft(path, np.savez, frames=np.asarray(frames, np.int64), values=stacked)
+    path = token_file(folder, episode)
+    drafts[path] = _draft(path, np.save, np.concatenate(rows))
+    sums = "".join(sum_line(draft, path.name) for path, draft in drafts.items())
+    _replace(sum_file(folder, episode), sums.encode())
+    for path, draft in drafts.items():  # tokens last: where they are, all else is
+        draft.replace(path)
 
 
 def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
@@ -169,13 +186,14 @@ def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
     return tokens.detach().float().cpu().numpy()
 
 
-def _save(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> None:
+def _draft(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> Path:
+    """What will become `path`, on disk already."""
     draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with draft.open("wb") as handle:
         writer(handle, *arrays, **named)
         handle.flush()
         os.fsync(handle.fileno())
-    draft.replace(path)
+    return draft
 
 
 def _replace(path: Path, content: bytes) -> None:

@@ -6,20 +6,19 @@ stands in its `fingerprint.json`, and a folder whose fingerprint is not the expe
 never replaced unless asked to.
 """
 
-import json
 import os
 from collections import OrderedDict
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
 
 from mme_vla.config.devices import find_device
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import Sums, decoding, read_json, require_file
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 
@@ -34,9 +33,6 @@ MEMORY_VIEW = "image"
 FINGERPRINT = "fingerprint.json"
 COMMAND = "python -m mme_vla.data.cache model=<model> data=<data>"
 DTYPES = {"bfloat16": np.uint16, "float32": np.float32}  # bfloat16 is stored as its bits
-
-
-DAMAGED = (OSError, ValueError, EOFError, BadZipFile)  # what reading a damaged file can raise
 
 
 class CacheMissingError(UserError):
@@ -91,8 +87,16 @@ def score_file(folder: Path, episode: int) -> Path:
     return folder / f"episode_{episode:06d}.scores.npz"
 
 
+def sum_file(folder: Path, episode: int) -> Path:
+    """SHA-256 sums of an episode's files; written before the tokens, too. Caches of older versions have none."""
+    return folder / f"episode_{episode:06d}.sha256"
+
+
 class VisionCache:
-    """A finished cache of one dataset: histories of its episodes, of which only the rows asked for are read."""
+    """A finished cache of one dataset: histories of its episodes, of which only the rows asked for are read.
+
+    An episode's files are compared with their checksums when its history is first asked for, once a process.
+    """
 
     max_open = 64  # histories kept at hand
 
@@ -123,10 +127,16 @@ class VisionCache:
             raise UserError(f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true")
         self.width = widths.pop()
         self._histories: OrderedDict[int, CachedHistory] = OrderedDict()
+        self._verified: set[int] = set()
 
     def history(self, episode: int) -> CachedHistory:
-        """The stored tokens of a whole episode."""
+        """The stored tokens of a whole episode.
+
+        Raises:
+            UserError: its files are not what was written.
+        """
         if episode not in self._histories:
+            self.verify(episode)
             length = int(self._lengths[episode])
             self._histories[episode] = CachedHistory(
                 self.spec,
@@ -141,17 +151,32 @@ class VisionCache:
         self._histories.move_to_end(episode)
         return self._histories[episode]
 
+    def verify(self, episode: int) -> None:
+        """Compare an episode's files with the checksums that were written with them, the first time it is asked for.
+
+        Raises:
+            UserError: a file is not what was written.
+        """
+        if episode in self._verified:
+            return
+        sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)
+        for name in sums.table:
+            sums.check(name)
+        self._verified.add(episode)
+
+    @property
+    def _remedy(self) -> str:
+        return f"Rebuild the cache: {self._command} rebuild=true"
+
     def _tokens(self, episode: int) -> np.ndarray:
         path = token_file(self.folder, episode)
         rows = len(self.spec.kept_frames(int(self._lengths[episode])))
-        try:
-            tokens = np.load(path, mmap_mode="r")
-        except DAMAGED as error:
-            raise UserError(f"{path} is damaged ({error}). Rebuild the cache: {self._command} rebuild=true") from None
+        with decoding(require_file(path), "tokens of a vision cache", self._remedy):
+            tokens = np.lib.format.open_memmap(path, mode="r")
         if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:
             raise UserError(
                 f"{path} holds {tokens.dtype} {list(tokens.shape)} where {np.dtype(self._dtype)} [{rows}, "
-                f"{self.spec.grid**2}, d] is expected. Rebuild the cache: {self._command} rebuild=true"
+                f"{self.spec.grid**2}, d] is expected. {self._remedy}"
             )
         return tokens
 
@@ -159,11 +184,23 @@ class VisionCache:
         if not self.spec.scorer:
             return None
         path = score_file(self.folder, episode)
-        try:
-            with np.load(path) as stored:
-                return FrameScores(stored["frames"], stored["values"])
-        except (*DAMAGED, KeyError) as error:
-            raise UserError(f"{path} is damaged ({error}). Rebuild the cache: {self._command} rebuild=true") from None
+        with decoding(require_file(path), "scores of a vision cache", self._remedy), np.load(path) as stored:
+            frames, values = stored["frames"], stored["values"]
+        length, patches = int(self._lengths[episode]), self.spec.grid**2
+        if (
+            (frames.dtype, values.dtype) != (np.int64, np.float32)
+            or frames.ndim != 1
+            or values.shape != (len(frames), patches)
+            or (frames < 0).any()
+            or (frames >= length).any()
+            or not np.isfinite(values).all()
+        ):
+            raise UserError(
+                f"{path} holds {values.dtype} scores {list(values.shape)} of {frames.dtype} frames "
+                f"{list(frames.shape)}, where finite float32 [n, {patches}] of int64 [n] frames below {length} are "
+                f"expected. {self._remedy}"
+            )
+        return FrameScores(frames, values)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_histories": OrderedDict()}  # a worker maps its own
@@ -180,13 +217,10 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
         if folder.is_dir() and any(folder.iterdir()):
             raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another data.cache.root.")
         raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
-    try:
-        found = json.loads(path.read_text())
-    except json.JSONDecodeError:
-        found = {}
+    found = read_json(path, "what a vision cache was made of")
     differing = [key for key, value in expected.items() if found.get(key) != value]
     if differing:
-        details = "; ".join(f"{key} is {found.get(key)!r}, expected {expected[key]!r}" for key in differing)
+        details = "; ".join(f"{key} is {brief(found.get(key), 200)}, expected {expected[key]!r}" for key in differing)
         raise UserError(f"The vision cache {folder} is stale: {details}. Rebuild it with: {command} rebuild=true")
 
 
@@ -261,6 +295,8 @@ def run(cfg: "DictConfig") -> None:
                 f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
             )
             continue
+        if os.environ.get("RANK", "0") == "0":
+            source.verify()  # its pictures are all about to be read, and for the last time
         if cfg.rebuild:
             clear_cache(folder)
         batch_size = cfg.data.cache.batch_size

@@ -21,7 +21,8 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.layout import SAMPLE
 from mme_vla.data.progress import progress
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import SUMS, plain, read_json, write_sums
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.media import write_mp4, write_png
 from mme_vla.subgoal.finetuning.rows import SETS, RowOptions, episode_rows
@@ -82,7 +83,7 @@ def build(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
     origins = {episode.name: episode.origin for episode in episodes}
-    plan = json.loads(json.dumps({"sets": list(sets), "options": asdict(options), "episodes": origins}))
+    plan = plain({"sets": list(sets), "options": asdict(options), "episodes": origins})
     _claim(output, plan)
     missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
     if not all((output / f"{name}.jsonl").is_file() for name in sets):
@@ -95,6 +96,9 @@ def build(
             draft.write_text("".join(_part(output, name, episode).read_text() for episode in episodes))
             draft.replace(output / f"{name}.jsonl")
     shutil.rmtree(output / PARTS, ignore_errors=True)
+    if not (output / SUMS).is_file():  # the last thing written: what they do not list is not compared
+        kinds = {".jsonl", ".png", ".mp4"}
+        write_sums(output, [str(p.relative_to(output)) for p in sorted(output.rglob("*.*")) if p.suffix in kinds])
     return {name: (output / f"{name}.jsonl").read_text().count("\n") for name in sets}
 
 
@@ -135,7 +139,7 @@ def _claim(output: Path, plan: dict[str, Any]) -> None:
     """Make `output` the folder of this plan, or recognise it as such."""
     record = output / PLAN
     if output.exists() and any(output.iterdir()):
-        if not record.is_file() or json.loads(record.read_text()) != plan:
+        if not record.is_file() or read_json(record, "a plan") != plan:
             raise UserError(
                 f"{output} holds something else, or the result of other inputs, sets or options. Choose another "
                 "output, repeat that command to finish it, or remove the folder yourself."
@@ -183,7 +187,9 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
                 'tasks=<file> with {"<episode index>": "<Task>", …}.'
             )
         record = source.records[e] if e < len(source.records) else {}
-        number = int(record.get("source_episode", e))
+        number = record.get("source_episode", e)
+        if type(number) is not int or not 0 <= number < 2**31:
+            raise UserError(f"{source.root} gives {brief(number)} as the number of episode {e}; expected a whole one.")
         reader = partial(_lerobot_labels, source, e, task, number)
         pictures = partial(_lerobot_pictures, source, e)
         found.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, pictures))
@@ -191,11 +197,8 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
 
 
 def _read_tasks(path: Path) -> dict[str, str]:
-    try:
-        given = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise UserError(f"tasks={path} cannot be read as JSON: {error}.") from None
-    if not isinstance(given, dict) or not all(isinstance(task, str) for task in given.values()):
+    given: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}')
+    if not all(isinstance(task, str) for task in given.values()):
         raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
     return given
 

@@ -1,6 +1,5 @@
 """Rows of the fine-tuning data → questions with their pictures, batches, and Hugging Face datasets."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
+from mme_vla.files import Sums, inside, is_text, read_json_lines
 from mme_vla.subgoal.finetuning.media import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.models.qwen3vl import IMAGE_TOKENS, TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.words.parsing import write_boxes
@@ -17,6 +17,7 @@ from mme_vla.subgoal.words.prompts import BBOX
 Row = dict[str, Any]
 IGNORED = -100  # a label that does not count
 _MARKS = 32  # tokens of the conversation's own marks, at most
+_LIMIT = 2**31  # bytes of a file of rows
 _TIME = 12  # tokens of a video frame's time stamp, at most
 
 
@@ -31,23 +32,48 @@ def read_rows(file: str | Path) -> list[Row]:
         raise UserError(
             f"{path} does not exist. Build it: python -m mme_vla.subgoal.build input=… output={path.parent}"
         )
+    Sums(path.parent, remedy="Build the training data again").check(path.name)
     rows: list[Row] = []
-    for number, line in enumerate(path.read_text().splitlines(), 1):
-        try:
-            row = json.loads(line)
-            assert [m["role"] for m in row["messages"]] == ["system", "user", "assistant"]
-        except (ValueError, KeyError, TypeError, AssertionError):
-            raise UserError(f"{path}, line {number}, is no row of messages. Build the training data again.") from None
+    for number, row in read_json_lines(path, "rows of training data", _LIMIT):
+        if reason := _fault(row):
+            raise UserError(f"{path}, line {number}, is no row: {reason}. Build the training data again.")
         rows.append(row)
     if not rows:
         raise UserError(f"{path} holds no row.")
     return rows
 
 
+def _fault(row: Row) -> str:
+    """What is wrong with a row; empty if nothing is."""
+    messages = row.get("messages")
+    if not isinstance(messages, list) or not all(isinstance(message, dict) for message in messages):
+        return "it has no messages"
+    if [message.get("role") for message in messages] != ["system", "user", "assistant"]:
+        return "expected one message each of system, user and assistant"
+    texts = [message.get("content") for message in messages]
+    if not all(isinstance(text, str) and is_text(text) for text in texts):
+        return "the content of a message is no text"
+    for key in ("images", "videos"):
+        names = row.get(key, [])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            return f"{key} is {brief(names)}, not a list of files"
+    objects = row.get("objects", {})
+    points = objects.get("bbox", []) if isinstance(objects, dict) else None
+    if not isinstance(points, list) or not all(_is_point(point) for point in points):
+        return f"objects is {brief(objects)}, where bbox should be a list of [row, column]"
+    if (marks := texts[1].count(BBOX) + texts[2].count(BBOX)) != len(points):
+        return f"it has {marks} marks {BBOX} for {len(points)} points"
+    return ""
+
+
+def _is_point(point: object) -> bool:
+    return isinstance(point, list) and len(point) == 2 and all(type(n) is int and 0 <= n < 2**20 for n in point)
+
+
 def texts_of(row: Row) -> tuple[str, str, str]:
     """System, user and answer of a row, points written as the model sees them."""
     system, user, answer = (message["content"] for message in row["messages"])
-    points = [(int(y), int(x)) for y, x in row.get("objects", {}).get("bbox", [])]
+    points = [(y, x) for y, x in row.get("objects", {}).get("bbox", [])]
     asked = user.count(BBOX)
     return system, write_boxes(user, points[:asked]), write_boxes(answer, points[asked:])
 
@@ -55,8 +81,8 @@ def texts_of(row: Row) -> tuple[str, str, str]:
 def question_of(row: Row, folder: Path) -> Question:
     """A row with its pictures; paths are relative to `folder`."""
     system, user, answer = texts_of(row)
-    images = [read_image(folder / name) for name in row.get("images", [])]
-    videos = [Clip.read(folder / name) for name in row.get("videos", [])]
+    images = [read_image(inside(folder, name, "picture")) for name in row.get("images", [])]
+    videos = [Clip.read(inside(folder, name, "video")) for name in row.get("videos", [])]
     return Question(system, user, images, videos, answer)
 
 
@@ -68,8 +94,12 @@ class RowDataset(torch.utils.data.Dataset[Question]):
 
     def __init__(self, file: str | Path, tokenizer: Any, max_length: int = 3200) -> None:
         self.folder = Path(file).parent
+        self._sums = Sums(self.folder, remedy="Build the training data again")
         rows = read_rows(file)
-        image = _image_tokens(read_image(self.folder / rows[0]["images"][0]).shape)
+        shown = next((name for row in rows for name in row.get("images", [])), None)
+        if shown is None:
+            raise UserError(f"{file} has no row with a picture. Build the training data again.")
+        image = _image_tokens(read_image(inside(self.folder, shown, "picture")).shape)
         self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
         self.left_out = len(rows) - len(self.rows)
         if not self.rows:
@@ -79,7 +109,10 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         return len(self.rows)
 
     def __getitem__(self, index: int) -> Question:
-        return question_of(self.rows[index], self.folder)
+        row = self.rows[index]
+        for name in (*row.get("images", []), *row.get("videos", [])):
+            self._sums.check(name)
+        return question_of(row, self.folder)
 
 
 class Collator:
@@ -123,8 +156,8 @@ def hf_dataset(file: str | Path) -> Any:
         for message in messages:
             message["content"] = [{"type": p["type"], "text": p.get("text")} for p in message["content"]]
         columns["messages"].append(messages)
-        columns["images"].append([str(folder / name) for name in row.get("images", [])])
-        columns["videos"].append([str(folder / name) for name in row.get("videos", [])])
+        columns["images"].append([str(inside(folder, name, "picture")) for name in row.get("images", [])])
+        columns["videos"].append([str(inside(folder, name, "video")) for name in row.get("videos", [])])
     part = {"type": Value("string"), "text": Value("string")}
     features = Features(
         messages=List({"role": Value("string"), "content": List(part)}),

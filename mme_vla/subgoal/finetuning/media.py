@@ -9,8 +9,10 @@ from typing import Self
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.files import decoding, require_file
 
 VIDEO_FRAMES = 10  # that a model looks at, at most
+_REMEDY = "Build the training data again."
 FPS = 30  # of the videos predictors are shown; the simulator's steps simply play faster
 
 
@@ -54,11 +56,8 @@ def read_image(path: Path) -> np.ndarray:
     """
     from PIL import Image
 
-    try:
-        with Image.open(path) as image:
-            return np.array(image.convert("RGB"))
-    except OSError as error:
-        raise UserError(f"{path} cannot be read ({error}). Build the training data again.") from None
+    with decoding(require_file(path, "a picture"), "a picture", _REMEDY), Image.open(path) as image:
+        return np.array(image.convert("RGB"))
 
 
 @dataclass(frozen=True)
@@ -87,17 +86,14 @@ class Clip:
         """
         import av
 
-        try:
-            with av.open(str(path)) as container:
-                length = container.streams.video[0].frames
-                indices = sample_video(length)
-                wanted = set(indices.tolist())
-                decoded = enumerate(container.decode(video=0))
-                frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in wanted]
-        except (OSError, ValueError) as error:  # PyAV's errors derive from these
-            raise UserError(f"{path} cannot be read ({error}). Build the training data again.") from None
-        if len(frames) != len(indices):
-            raise UserError(f"{path} is damaged: it announces {length} frames. Build the training data again.")
+        with decoding(require_file(path, "a video"), "a video", _REMEDY), av.open(str(path)) as container:
+            length = container.streams.video[0].frames
+            indices = sample_video(length)
+            wanted = set(indices.tolist())
+            decoded = enumerate(container.decode(video=0))
+            frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in wanted]
+        if len(frames) != len(indices) or len({frame.shape for frame in frames}) != 1:
+            raise UserError(f"{path} is damaged: it announces {length} frames. {_REMEDY}")
         return cls(np.stack(frames), indices, length)
 
 

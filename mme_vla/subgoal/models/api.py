@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError, missing_extra
+from mme_vla.files import read_json, sealed, unsealed
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.media import mp4_bytes, png_bytes
 from mme_vla.subgoal.models.threads import within
@@ -141,8 +142,12 @@ class Api:
         if known is not None:
             known.parent.mkdir(parents=True, exist_ok=True)
             draft = known.with_suffix(f".{uuid.uuid4().hex}.partial")  # other processes may share the folder
-            draft.write_text(json.dumps(vars(reply)))
-            draft.replace(known)
+            draft.write_text(json.dumps(sealed(vars(reply))))
+            try:
+                draft.replace(known)
+            except OSError as error:  # a folder in its place: the answer counts, it is only not kept
+                draft.unlink(missing_ok=True)
+                log.warning("%s cannot be written: %s", known, error.strerror)
         return reply
 
     def _tried(self, system: str, turns: Sequence[Turn]) -> Reply:
@@ -248,13 +253,16 @@ def _part(part: Any) -> Mapping[str, Any]:
 
 def _read_reply(path: Path) -> Reply | None:
     """An answer that was kept; None where there is none, or its file is damaged."""
-    try:
-        kept = json.loads(path.read_text())
-        return Reply(str(kept["text"]), int(kept["input_tokens"]), int(kept["output_tokens"]))
-    except FileNotFoundError:
+    if not path.exists() and not path.is_symlink():
         return None
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
-        log.warning("%s is damaged (%s): the question is asked again", path, error)
+    try:
+        kept = unsealed(read_json(path, "an answer that was kept"), str(path))
+        counts: list[Any] = [kept.get("input_tokens"), kept.get("output_tokens")]
+        if not isinstance(kept.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
+            raise UserError(f"{path} lacks a text and two numbers of tokens")
+        return Reply(kept["text"], *counts)
+    except UserError as error:
+        log.warning("%s The question is asked again.", error)
         return None
 
 

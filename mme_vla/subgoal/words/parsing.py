@@ -5,11 +5,12 @@ the 256×256 front picture, `<row, column>`. What cannot be read raises `Malform
 and survive.
 """
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mme_vla.errors import UserError, brief
+from mme_vla.files import is_text, parse_json
 from mme_vla.subgoal.words.prompts import BBOX
 
 SIDE = 256  # of the front picture, in pixels
@@ -62,7 +63,7 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
     """
     pieces = text.split(BBOX)
     if len(pieces) != len(points) + 1:
-        raise ValueError(f"{len(pieces) - 1} {BBOX} marks for {len(points)} points in {text!r}.")
+        raise ValueError(f"{len(pieces) - 1} {BBOX} marks for {len(points)} points in {brief(text)}.")
     boxes = [f"<|box_start|>({to_thousandths(y, side)},{to_thousandths(x, side)})<|box_end|>" for y, x in points]
     return "".join(piece + box for piece, box in zip(pieces, [*boxes, ""], strict=True))
 
@@ -168,18 +169,14 @@ def _json_object(answer: str) -> dict[str, object]:
     if start < 0 or stop < start:
         raise MalformedAnswer("the answer holds no JSON object")
     try:
-        found = json.loads(answer[start : stop + 1])
-    except (ValueError, RecursionError) as error:  # also a number of thousands of digits, and very deep nesting
-        raise MalformedAnswer(f"the answer is not JSON ({getattr(error, 'msg', error)})") from None
-    if not isinstance(found, dict):
-        raise MalformedAnswer("the answer is no JSON object")
+        found: dict[str, object] = parse_json(answer[start : stop + 1], "the answer", finite=False)
+    except UserError as error:
+        raise MalformedAnswer(f"the answer is not JSON: {error}") from None
     return found
 
 
 def _writable(text: str) -> str:
     """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise MalformedAnswer("the answer holds half a character") from None
+    if not is_text(text):
+        raise MalformedAnswer("the answer holds half a character")
     return text

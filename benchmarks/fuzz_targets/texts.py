@@ -1,0 +1,158 @@
+"""Result logs, answers of predictors and players, fine-tuning rows, official metadata."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.fuzz_targets.base import Target, digest, every_file
+from mme_vla.envs import metadata
+from mme_vla.errors import UserError
+from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
+from mme_vla.evaluation.records import EpisodeRecord, Seconds
+from mme_vla.evaluation.run_file import claim_run, read_run
+from mme_vla.files import read_text, write_sums
+from mme_vla.play.game import Option
+from mme_vla.play.questions import parse_choice
+from mme_vla.subgoal.base import Usage
+from mme_vla.subgoal.finetuning.examples import RowDataset
+from mme_vla.subgoal.finetuning.media import write_mp4, write_png
+from mme_vla.subgoal.models.api import Api, Reply, Settings
+from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
+
+
+def write_logs(folder: Path) -> None:
+    """Records of five episodes and the settings of their run."""
+    claim_run(folder, {"checkpoint": "a", "seed": 7, "tasks": ["PickXtimes"]}, {"device": "cpu"})
+    with RecordLog(folder / RECORDS) as log:
+        for episode in range(5):
+            outcome = "success" if episode % 2 else "timeout"
+            log.append(
+                EpisodeRecord(
+                    "pi05", 60000, 7, "PickXtimes", episode, 500 + episode, "easy", outcome, 300 + episode,
+                    seconds=Seconds(1.5, 0.25, 2.0), when="2026-01-01T00:00:00+00:00", extra={"score": 0.5},
+                )
+            )  # fmt: skip
+
+
+def read_logs(folder: Path) -> object:
+    """The settings and notes, and every record."""
+    run = read_run(folder)
+    return digest(sorted(map(repr, run.items()))), tuple(map(repr, read_records(folder / RECORDS)))
+
+
+def _is_shorter(valid: Any, found: Any) -> bool:
+    """A log cut after a whole line is that of a run that was stopped there: it goes on with the missing episodes."""
+    return found[0] == valid[0] and found[1] == valid[1][: len(found[1])]
+
+
+QUESTION = ("You plan.", [("user", ["What next?"])])
+
+
+def _api(folder: Path, answer: str) -> Api:
+    api = Api(Settings(cache=str(folder / "answers"), requests_per_minute=None), Usage(), client=object())
+    api._once = lambda contents, config: Reply(answer, 12, 7)  # type: ignore[method-assign]
+    return api
+
+
+def write_answers(folder: Path) -> None:
+    """One answer that was kept."""
+    _api(folder, "pick up the cube at <1, 2>").ask(*QUESTION)
+
+
+def read_answers(folder: Path) -> object:
+    """The kept answer; where it is damaged the question is asked again, and answered in the same words."""
+    reply = _api(folder, "pick up the cube at <1, 2>").ask(*QUESTION)
+    return reply.text, reply.input_tokens, reply.output_tokens
+
+
+ANSWERS = {
+    "subgoal.txt": "pick up the cube at <|box_start|>(250,500)<|box_end|> now",
+    "memer.json": '{"current_subtask": "open the drawer", "keyframe_positions": [1, 3]}',
+    "gemini.json": '{"reasoning": "so far", "subgoal": "press the button at <100, 250.5>"}',
+    "choice.json": '{"choice": "a", "point": [100, 900]}',
+}
+
+
+def write_said(folder: Path) -> None:
+    """What models said."""
+    for name, text in ANSWERS.items():
+        (folder / name).write_text(text)
+
+
+def read_said(folder: Path) -> object:
+    """What the predictors and players understand of it; they count what they cannot, and go on."""
+    said = {name: read_text(folder / name, "an answer") for name in ANSWERS}
+    try:
+        return (
+            parse_subgoal(said["subgoal.txt"]), parse_memer(said["memer.json"], recent=8),
+            pixels_of_pairs(parse_gemini(said["gemini.json"])),
+            parse_choice(said["choice.json"], [Option("a", "pick", True)]),
+        )  # fmt: skip
+    except MalformedAnswer as error:
+        raise UserError(str(error)) from None
+
+
+class _Words:
+    def encode(self, text: str, add_special_tokens: bool) -> list[str]:
+        return text.split()
+
+
+def write_rows(folder: Path) -> None:
+    """Two rows, one with a picture and a point, one with a video."""
+    pictures = np.random.default_rng(0).integers(0, 255, (12, 32, 32, 3), np.uint8)
+    write_png(pictures[0], folder / "a.png")
+    write_mp4(pictures, folder / "a.mp4")
+    rows: list[dict[str, Any]] = [
+        {
+            "messages": _messages("<image> What next?", "pick up at <bbox>"),
+            "images": ["a.png"],
+            "objects": {"bbox": [[1, 2]]},
+        },
+        {"messages": _messages("<video> What next?", "stop"), "videos": ["a.mp4"]},
+    ]
+    (folder / "simple.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    write_sums(folder, ["simple.jsonl", "a.png", "a.mp4"])
+
+
+def _messages(user: str, answer: str) -> list[dict[str, str]]:
+    texts = {"system": "You plan.", "user": user, "assistant": answer}
+    return [{"role": role, "content": text} for role, text in texts.items()]
+
+
+def read_rows(folder: Path) -> object:
+    """Every question with its pictures."""
+    dataset = RowDataset(folder / "simple.jsonl", _Words())
+    read: list[object] = [len(dataset), dataset.left_out]
+    for i in range(len(dataset)):
+        question = dataset[i]
+        read += [question.system, question.user, question.answer, *question.images]
+        read += [array for clip in question.videos for array in (clip.frames, clip.indices, clip.length)]
+    return digest(*read)
+
+
+def write_metadata(folder: Path) -> None:
+    """Official metadata of one task."""
+    records = [{"task": "PickXtimes", "episode": e, "seed": 500 + e, "difficulty": "easy"} for e in range(4)]
+    place = folder / "test" / "record_dataset_PickXtimes_metadata.json"
+    place.parent.mkdir()
+    place.write_text(json.dumps({"env_id": "PickXtimes", "record_count": 4, "records": records}))
+
+
+def read_metadata(folder: Path) -> object:
+    """Every episode."""
+    return tuple(map(repr, metadata.episodes("PickXtimes", "test", folder)))
+
+
+def _always(valid: object, found: object) -> bool:
+    return True
+
+
+TARGETS = [
+    Target("logs", write_logs, every_file, read_logs, _is_shorter),
+    Target("kept-answers", write_answers, every_file, read_answers),
+    Target("answers", write_said, every_file, read_said, _always),
+    Target("rows", write_rows, every_file, read_rows),
+    Target("metadata", write_metadata, every_file, read_metadata, _always),
+]
