@@ -10,6 +10,6 @@ from mme_vla.files.writing import draft_of, is_draft, remove_drafts, write_atomi
 
 __all__ = [
     "PLAN", "SUMS", "FolderLock", "check_sums", "claim_plan", "disk_trouble", "draft_of", "drop_plan", "file_sum",
-    "inside", "is_draft", "name_place", "parse_json", "read_json", "read_json_lines", "read_text", "remove_drafts", "safe_name",
-    "write_atomically", "write_json", "write_sums",
+    "inside", "is_draft", "name_place", "parse_json", "read_json", "read_json_lines", "read_text", "remove_drafts",
+    "safe_name", "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip

@@ -13,6 +13,16 @@ from mme_vla.errors import UserError
 from mme_vla.files.trouble import name_place
 
 LOCK = ".lock"
+_held: set[int] = set()  # descriptors
+
+
+def _let_go() -> None:
+    """A forked process holds nothing: it would go on holding the folder when this process is gone."""
+    while _held:
+        os.close(_held.pop())
+
+
+os.register_at_fork(after_in_child=_let_go)
 
 
 class FolderLock:
@@ -55,6 +65,7 @@ class FolderLock:
                     "Wait until it has ended, stop it, or write to another folder."
                 ) from None
             self._descriptor = descriptor
+            _held.add(descriptor)
             if self._in_place():
                 break
             self._forget()  # what we hold was removed by its last holder between our opening and our locking it
@@ -67,7 +78,7 @@ class FolderLock:
 
     def release(self) -> None:
         """Let go of the folder; harmless if it is not held."""
-        if self._descriptor is None:
+        if self._descriptor not in _held:
             return
         with suppress(OSError):  # the folder may have been moved or removed by its holder
             if self._in_place():
@@ -84,8 +95,9 @@ class FolderLock:
             return False
 
     def _forget(self) -> None:
-        assert self._descriptor is not None
-        os.close(self._descriptor)
+        if self._descriptor in _held:  # not so in a forked process
+            _held.remove(self._descriptor)
+            os.close(self._descriptor)
         self._descriptor = None
 
     def __enter__(self) -> Self:

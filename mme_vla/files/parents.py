@@ -18,10 +18,12 @@ def end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is None:
         return
-    watched: list[int] = [parent.sentinel]
+    watched, number = [parent.sentinel], parent.pid
 
     def watch() -> None:
-        wait(watched)
+        # Forked sisters hold each other's ends of the pipe, so the parent's number is looked at as well.
+        while not wait(watched, timeout=1.0) and os.getppid() == number:
+            pass
         os._exit(1)  # nothing to tidy up for anybody, and a simulator may take long to
 
     threading.Thread(target=watch, name="parent watch", daemon=True).start()
