@@ -16,7 +16,6 @@ from mme_vla.data.cache import DTYPES, FINGERPRINT, MEMORY_VIEW, check_fingerpri
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
-from mme_vla.files import draft_of, remove_drafts
 from mme_vla.memory.base import MemoryModule
 
 Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
@@ -46,7 +45,7 @@ def clear_cache(folder: Path) -> None:
         return
     if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
         raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.")
-    for path in [*folder.glob("episode_*.np[yz]"), *folder.glob("*.partial"), *folder.glob(".*.partial"), folder / FINGERPRINT]:
+    for path in [*folder.glob("episode_*.np[yz]"), *folder.glob("*.partial"), folder / FINGERPRINT]:
         path.unlink(missing_ok=True)
 
 
@@ -70,7 +69,6 @@ def build_cache(
     """
     rank, world = process_rank() if shard is None else shard
     folder.mkdir(parents=True, exist_ok=True)
-    remove_drafts(folder)
     if not (folder / FINGERPRINT).is_file():
         if any(not path.name.endswith(".partial") for path in folder.iterdir()):
             check_fingerprint(folder, expected)
@@ -172,7 +170,7 @@ def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
 
 
 def _save(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> None:
-    draft = draft_of(path)
+    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
     with draft.open("wb") as handle:
         writer(handle, *arrays, **named)
         handle.flush()
@@ -181,6 +179,6 @@ def _save(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named:
 
 
 def _replace(path: Path, content: bytes) -> None:
-    draft = draft_of(path)
+    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
     draft.write_bytes(content)
     draft.replace(path)

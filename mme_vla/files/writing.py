@@ -4,6 +4,7 @@ import json
 import os
 import re
 import socket
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from mme_vla.files.trouble import name_place
 
-_DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)\.partial")
+_DRAFT = re.compile(r"\..+\.(?P<host>[^.]*)-(?P<process>\d+)-[0-9a-f]{8}\.partial")
 
 
 @contextmanager
@@ -41,9 +42,10 @@ def write_json(path: Path, value: Any, indent: int | None = 2) -> None:
 def draft_of(path: Path) -> Path:
     """Where this process writes what is to become `path`.
 
-    Machine and process are in the name: two writers never share a draft, and the last one to finish wins whole.
+    Machine and process are in the name, so that a killed one's can be told, and a random number, as both may repeat
+    among containers: two writers never share a draft, and the last one to finish wins whole.
     """
-    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}.partial")
+    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{uuid.uuid4().hex[:8]}.partial")
 
 
 def is_draft(path: Path) -> bool:
