@@ -10,6 +10,7 @@ simulator of one process. Nothing leaves the machine.
 import argparse
 import json
 import os
+import random
 import shutil
 import sys
 import tempfile
@@ -22,7 +23,7 @@ from pathlib import Path
 os.environ |= {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1"}
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent / "tests")]
 
-from kill_commands import COMMANDS, import_everything, results
+from kill_commands import COMMANDS, import_for, results
 from kill_tracer import trace
 
 
@@ -59,7 +60,9 @@ def attack(name: str, every: int, base: Path, until: float = float("inf"), first
     whole = base / f"{name}-whole"
     expected, changes = _run(command.run, inputs, whole, log)
     found.changes = len(changes)
-    for number in range(first, len(changes) + 1, every):
+    numbers = list(range(first, len(changes) + 1, every))
+    random.Random(0).shuffle(numbers)  # so that what there is time for is spread over the run
+    for number in numbers:
         if time.monotonic() > until:
             break
         folder = base / f"{name}-killed"
@@ -118,7 +121,7 @@ def main() -> None:
     given = parser.parse_args()
     if unknown := set(given.commands) - set(COMMANDS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
-    import_everything()
+    import_for(given.commands)
     until, outcomes = time.monotonic() + 60 * given.minutes, []
     print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |\n|---|" + "---:|" * 7)
     with tempfile.TemporaryDirectory() as base:

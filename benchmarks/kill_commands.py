@@ -1,15 +1,14 @@
 """The commands that `kill.py` kills, each so small that a run takes seconds, and what of their results must be equal."""
 
 import hashlib
-import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import h5py
 import numpy as np
 
 SMALL = [
@@ -30,10 +29,12 @@ class Command:
     """One command.
 
     prepare: makes what it reads, once, in a folder. run: carries it out, with that folder and the one it writes to.
+    imports: modules that it needs; loaded before it is forked.
     """
 
     prepare: Callable[[Path], None]
     run: Callable[[Path, Path], object]
+    imports: tuple[str, ...]
 
 
 def results(folder: Path) -> dict[str, str]:
@@ -148,29 +149,20 @@ def _warm_cache(inputs: Path) -> None:
     _cache(inputs, inputs)
 
 
+_LEARNING = ("accelerate", "mme_vla.train", "mme_vla.training.loop", "mme_vla.training.finish", "mme_vla.build")
+_LEARNING += ("mme_vla.data.cache_build", "mme_vla.weights", "lerobot.datasets.dataset_metadata")
+_WRITING = ("lerobot.datasets.lerobot_dataset", "lerobot.datasets.aggregate", "mme_vla.data.convert", "av")
 COMMANDS = {
-    "train": Command(_warm_cache, _train),
-    "cache": Command(_nothing, _cache),
-    "convert": Command(_write_demonstrations, _convert),
-    "record": Command(_nothing, _record),
-    "evaluate": Command(_nothing, _evaluate),
+    "train": Command(_warm_cache, _train, _LEARNING),
+    "cache": Command(_nothing, _cache, _LEARNING),
+    "convert": Command(_write_demonstrations, _convert, _WRITING),
+    "record": Command(_nothing, _record, (*_WRITING, "mme_vla.envs.recorder", "mme_vla.envs.hdf5_writer")),
+    "evaluate": Command(_nothing, _evaluate, ("rollout_stand_ins", "av")),
 }
 
 
-def import_everything() -> None:
-    """What the commands import, so that a forked process has it."""
-    import accelerate  # noqa: F401
-    import av  # noqa: F401
-    import lerobot.datasets.aggregate
-    import lerobot.datasets.lerobot_dataset  # noqa: F401
-    import matplotlib.pyplot  # noqa: F401
-    import rollout_stand_ins  # noqa: F401
-
-    import mme_vla.envs.hdf5_writer
-    import mme_vla.envs.recorder
-    import mme_vla.train
-    import mme_vla.training.finish
-    import mme_vla.training.loop
-    import mme_vla.weights  # noqa: F401
-
-    assert h5py and json
+def import_for(names: Iterable[str]) -> None:
+    """What these commands import, so that a forked process has it."""
+    for name in names:
+        for module in COMMANDS[name].imports:
+            import_module(module)
