@@ -23,8 +23,8 @@ from pathlib import Path
 os.environ |= {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1"}
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent / "tests")]
 
-from kill_commands import COMMANDS, import_for, results
-from kill_tracer import trace
+from kill_commands import COMMANDS, import_for, results  # noqa: E402
+from kill_tracer import trace  # noqa: E402
 
 
 @dataclass
@@ -32,8 +32,8 @@ class Outcome:
     """What came of killing one command.
 
     changes: file operations of an undisturbed run. kills: how many of them it was killed before.
-    refused: kills after which the same words failed. wrong: after which the results differ. left: after which something
-    lies beside them. outlived: after which a process of the command lived on. places: the operations of the first three.
+    refused: kills after which the same words failed. wrong: after which the results differ. left: after which
+    something lies beside them. outlived: after which a process of the command lived on. places: the operations of the first three.
     """
 
     command: str
@@ -123,7 +123,8 @@ def main() -> None:
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
     import_for(given.commands)
     until, outcomes = time.monotonic() + 60 * given.minutes, []
-    print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |\n|---|" + "---:|" * 7)
+    print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |")
+    print("|---|" + "---:|" * 7)
     with tempfile.TemporaryDirectory() as base:
         for name in given.commands:
             o = attack(name, given.every, Path(base).resolve(), until, given.first)

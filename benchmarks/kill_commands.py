@@ -1,4 +1,4 @@
-"""The commands that `kill.py` kills, each so small that a run takes seconds, and what of their results must be equal."""
+"""The commands that `kill.py` kills, each so small that a run takes seconds, and what of their results is compared."""
 
 import hashlib
 import re
@@ -103,7 +103,8 @@ def _evaluate(inputs: Path, folder: Path) -> None:
     module.VecEnv = Envs  # type: ignore[assignment, misc]
     torch.manual_seed(0)
     settings = RolloutSettings(max_steps=24, flow_steps=2, max_batch=1, video="all", workers=1)
-    module.evaluate(quick_policy("pi05"), JOBS[1:4], folder / "run", FACTS, settings, base=make_scripted_env, shown=False)
+    policy = quick_policy("pi05")
+    module.evaluate(policy, JOBS[1:4], folder / "run", FACTS, settings, base=make_scripted_env, shown=False)
 
 
 class _Recorder:

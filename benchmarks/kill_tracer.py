@@ -1,8 +1,8 @@
 """Stops a forked process before its n-th change of a file below a folder, whoever asks for it: Python, HDF5, FFmpeg.
 
 Linux on x86-64: a seccomp filter hands the system calls that change files to this process, which is the tracer
-(ptrace). Threads and child processes are followed. Not seen: half of a single write, memory-mapped writing, what a power
-cut takes from the disk's own cache.
+(ptrace). Threads and child processes are followed; only changes that the process itself makes are counted. Not seen:
+half of a single write, memory-mapped writing, what a power cut takes from the disk's own cache.
 """
 
 import ctypes
