@@ -32,8 +32,9 @@ class Outcome:
     """What came of killing one command.
 
     changes: file operations of an undisturbed run. kills: how many of them it was killed before.
-    refused: kills after which the same words failed. wrong: after which the results differ. left: after which
-    something lies beside them. outlived: after which a process of the command lived on. places: the operations of the first three.
+    refused: kills after which the same words failed. wrong: after which the results differ.
+    left: after which something lies beside them. outlived: after which a process of the command lived on.
+    places: what was about to be done in all of these.
     """
 
     command: str
