@@ -21,7 +21,7 @@ RECIPE = [
     "logger=none",
 ]  # fmt: skip
 # What only tells when and how fast.
-_TIMES = re.compile(r'"(?:seconds|when|begun|speed/\w+|memory/gib)": ?(?:"[^"]*"|[-+.\w]+)')
+_TIMES = re.compile(r'"(?:seconds|when|begun|speed/\w+|memory/gib)": ?(?:"[^"]*"|\{[^}]*\}|[-+.\w]+)')
 
 
 @dataclass(frozen=True)
