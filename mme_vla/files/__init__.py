@@ -3,10 +3,13 @@
 from mme_vla.files.checksums import SUMS, check_sums, file_sum, write_sums
 from mme_vla.files.locks import FolderLock
 from mme_vla.files.places import inside, safe_name
+from mme_vla.files.plans import PLAN, claim_plan, drop_plan
 from mme_vla.files.reading import parse_json, read_json, read_json_lines, read_text
-from mme_vla.files.writing import write_atomically, write_json
+from mme_vla.files.trouble import disk_trouble, name_place
+from mme_vla.files.writing import draft_of, is_draft, remove_drafts, write_atomically, write_json
 
 __all__ = [
-    "SUMS", "FolderLock", "check_sums", "file_sum", "inside", "parse_json", "read_json", "read_json_lines", "read_text",
+    "PLAN", "SUMS", "FolderLock", "check_sums", "claim_plan", "disk_trouble", "draft_of", "drop_plan", "file_sum",
+    "inside", "is_draft", "name_place", "parse_json", "read_json", "read_json_lines", "read_text", "remove_drafts",
     "safe_name", "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.files.parents import end_with_parent
+
 LARGE = 4096
 """Arrays of at least this many bytes go through shared memory; everything else is pickled."""
 FRAMES_PER_BLOCK = 8
@@ -68,6 +70,7 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
 
 def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
     """Run commands until told to close, or until the other side is gone."""
+    end_with_parent()
     with contextlib.suppress(ImportError):
         import torch
 

@@ -18,6 +18,7 @@ from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
 from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
+from mme_vla.files import remove_drafts
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.serving.session import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
@@ -69,6 +70,7 @@ def evaluate(
     shard = shard or Shard()
     mine = take_share(jobs, shard)
     with RecordLog(output / shard.file) as log:
+        remove_drafts(output / VIDEOS)  # films of workers that were killed
         done = _done(output, mine, facts)
         missing = [job for job in mine if (job.task, job.episode) not in finished(done)]
         kept = [record for record in done if record.outcome != "error"]
