@@ -75,6 +75,9 @@ def test_the_command_writes_both_layouts_and_only_what_is_missing(
     with open_episode(ref) as episode:
         assert len(source) == 1
         assert len(source.states(0)) == episode.length
+    record.run(cfg)
+    assert "all there already" in capsys.readouterr().out
+    jobs.append(record.Job("PatternLock", 1, seed=1, difficulty="easy", recovery=None, retries=3))
     with pytest.raises(UserError, match="exists already"):
         record.run(cfg)
 

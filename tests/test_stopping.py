@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,15 @@ def test_all_processes_stop_after_the_same_update_when_one_is_asked(tmp_path: Pa
     assert [process.communicate(timeout=100)[0].strip() for process in started] == ["stopped after 3"] * 2
 
 
+@pytest.fixture
+def usual_interrupt() -> Iterator[None]:
+    """Ctrl-C as Python has it: a process that a script starts in its background ignores it from the start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("usual_interrupt")
 def test_a_second_signal_ends_the_process_as_usual() -> None:
     with pytest.raises(KeyboardInterrupt), stop_asked() as asked:
         signal.raise_signal(signal.SIGINT)

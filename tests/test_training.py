@@ -217,8 +217,8 @@ def test_resuming_with_other_settings_lists_them(tmp_path: Path) -> None:
     assert "log_every" not in str(error.value)
     run = open_run(tmp_path / "new", str(tmp_path), {"train": {**RECIPE, "steps": 9}, "seed": 1})
     assert (run.folder, run.step) == (tmp_path, 2)
-    with pytest.raises(UserError, match=r"already reached train\.steps=2"):
-        open_run(tmp_path / "new", str(tmp_path), {"train": {**RECIPE, "steps": 2}, "seed": 1})
+    with pytest.raises(UserError, match=r"has done 2 steps already, more than train\.steps=1"):
+        open_run(tmp_path / "new", str(tmp_path), {"train": {**RECIPE, "steps": 1}, "seed": 1})
 
 
 def test_a_setting_that_came_or_went_counts_as_changed() -> None:

@@ -3,9 +3,7 @@
 import logging
 import multiprocessing
 import os
-import signal
 import sys
-import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,15 +73,11 @@ def main(cfg: DictConfig) -> None:
                 if shard.count > 1 else "")  # fmt: skip
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
-    _end_on_sigterm()
     _spawn_as_usual()
     try:
         done = evaluate(
             policy, jobs, output, facts, settings, subgoals=subgoals, shard=shard, source=source, notes=notes
         )
-    except KeyboardInterrupt:
-        logger.warning("stopped; what is finished is recorded, and the same command goes on from there")
-        raise SystemExit(130) from None
     finally:
         if subgoals is not None:
             report_usage(subgoals.usage)
@@ -181,16 +175,6 @@ def report_usage(usage: "Usage") -> None:
     words += [f"${usage.cost:.2f}" if usage.cost >= 0.01 else f"${usage.cost:.4f}"] if usage.cost else []
     if words:
         logger.info("subgoals: %s", ", ".join(words))
-
-
-def _end_on_sigterm() -> None:
-    """A cluster's SIGTERM ends the run as Ctrl-C does: at once, since every finished episode is on disk."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, interrupt)
 
 
 def _spawn_as_usual() -> None:

@@ -1,40 +1,24 @@
 """`python -m mme_vla.envs.record`: demonstrate episodes of the benchmark and keep them as a dataset."""
 
-import json
 import multiprocessing
-import shutil
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.envs.recording.recorded import Job, Wanted
 from mme_vla.errors import UserError
+from mme_vla.files import FolderLock, claim_plan, drop_plan, read_json, write_json
+from mme_vla.files.parents import end_with_parent, signals_held
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
     from mme_vla.envs.recording.recorder import Recording
-
-
-@dataclass(frozen=True)
-class Job:
-    """One episode to demonstrate."""
-
-    task: str
-    episode: int
-    seed: int
-    difficulty: str
-    recovery: str | None
-    retries: int
-
-    @property
-    def name(self) -> str:
-        """Of the episode's files."""
-        return f"{self.task}-{self.episode:04d}"
 
 
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
@@ -72,7 +56,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
                 write_previews(folder / f"{job.name}.h5", job.episode, job.task, previews)
             counts = {"steps": result.steps, "stored": result.stored, "video": result.video}
             done = {"task": job.task, "episode": job.episode, "seed": seed, **counts, "failed_seeds": failures}
-            (folder / f"{job.name}.json").write_text(json.dumps(done))
+            write_json(folder / f"{job.name}.json", done, indent=None)  # last: what it tells of is there
             return done
         failures[seed] = result.error or "the demonstration did not end in success"
     draft.unlink(missing_ok=True)
@@ -92,7 +76,13 @@ def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | Non
     with progress("record", len(jobs), len(jobs) - len(missing), "episodes") as advance:
         for _ in _carry_out(missing, folder, workers, previews):
             advance(1)
-    return [json.loads((folder / f"{job.name}.json").read_text()) for job in jobs]
+    return [read_json(folder / f"{job.name}.json", "what is known of a recorded episode") for job in jobs]
+
+
+def _begin_worker(plugins: Sequence[str]) -> None:
+    """A worker process ends with the one that started it, and knows the same tasks."""
+    end_with_parent()
+    import_plugins(plugins)
 
 
 def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None) -> Iterator[dict[str, Any]]:
@@ -100,13 +90,17 @@ def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path |
         yield from (record_episode(job, folder, previews) for job in jobs)
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, import_plugins, (imported_plugins(),)) as pool:
-        futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
+    with ProcessPoolExecutor(workers, context, _begin_worker, (imported_plugins(),)) as pool:
+        with signals_held():  # the workers are started here, and inherit that
+            futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
         try:
             for future in as_completed(futures):
                 yield future.result()
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
+        except BaseException as error:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: nobody waits for it
+                for worker in multiprocessing.active_children():
+                    worker.terminate()
             raise
 
 
@@ -126,61 +120,45 @@ def plan(cfg: "DictConfig") -> list[Job]:
 
 
 def run(cfg: "DictConfig") -> None:
-    """Record as configs/record.yaml and the command line say.
+    """Record as configs/record.yaml and the command line say; what the same words have recorded stays as it is.
 
     Raises:
         UserError: something that the configuration asks for is not possible; nothing that exists is overwritten.
     """
-    from mme_vla.data.conversion import ConvertOptions, convert
-    from mme_vla.data.hdf5 import EpisodeRef
+    from mme_vla.data.conversion import ConvertOptions
 
     if not cfg.lerobot and cfg.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
     options = ConvertOptions(images=cfg.images, fps=cfg.fps, **cfg.video)
-    jobs, output = plan(cfg), Path(cfg.output)
-    if output.exists():
-        raise UserError(f"{output} exists already; choose another output, or remove that folder yourself.")
-    official = _official_files(jobs, cfg.hdf5)
+    jobs = plan(cfg)
+    wanted = Wanted(jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5))
+    places = ", ".join(map(str, wanted.places))
+    work = Path(cfg.output).with_name(Path(cfg.output).name + ".recording")
+    if not wanted.missing(options) and not work.exists():
+        print(f"{places}: {len(jobs)} episodes, all there already.")
+        return
     require_simulator()
-    work = output.with_name(output.name + ".recording")
-    _claim(work, jobs)
-    previews = None if cfg.previews is None else Path(cfg.previews)
-    done = record(jobs, work / "episodes", cfg.workers, previews)
-    parts = {job: work / "episodes" / f"{job.name}.h5" for job in jobs}
-    for task, path in official.items():
-        from mme_vla.envs.recording.hdf5_writer import join
-
-        path.parent.mkdir(parents=True, exist_ok=True)
-        join([part for job, part in parts.items() if job.task == task], path)
-    if cfg.lerobot:
-        convert([EpisodeRef(part, job.episode, job.task) for job, part in parts.items()], output, options)
-    shutil.rmtree(work)
-    steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
-    places = ", ".join(map(str, [*([output] if cfg.lerobot else []), *official.values()]))
-    print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
-
-
-def _official_files(jobs: Sequence[Job], folder: str | None) -> dict[str, Path]:
-    if folder is None:
-        return {}
-    files = {job.task: Path(folder) / f"record_dataset_{job.task}.h5" for job in jobs}
-    if there := [str(path) for path in files.values() if path.exists()]:
-        raise UserError(f"{', '.join(there)} exist already; choose another folder with hdf5=, or remove them yourself.")
-    return files
+    with FolderLock(work, "recording"):
+        _claim(work, jobs)
+        missing = wanted.missing(options)  # asked again: another process may have finished it meanwhile
+        if missing:
+            previews = None if cfg.previews is None else Path(cfg.previews)
+            done = record(jobs, work / "episodes", cfg.workers, previews)
+            wanted.write(missing, work / "episodes", options)
+            steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
+            print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
+        else:
+            print(f"{places}: {len(jobs)} episodes, all there already.")
+        drop_plan(work)
 
 
 def _claim(work: Path, jobs: Sequence[Job]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
-    plan_file, wanted = work / "plan.json", [asdict(job) for job in jobs]
-    if plan_file.is_file():
-        if json.loads(plan_file.read_text()) != wanted:
-            raise UserError(
-                f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
-                "another output, or remove that folder yourself."
-            )
-        return
-    work.mkdir(parents=True, exist_ok=True)
-    plan_file.write_text(json.dumps(wanted, indent=1))
+    if not claim_plan(work, [asdict(job) for job in jobs]):
+        raise UserError(
+            f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
+            "another output, or remove that folder yourself."
+        )
 
 
 def main() -> None:

@@ -4,14 +4,20 @@ import os
 import shlex
 import sys
 import time
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
 from mme_vla.config.devices import find_device
+from mme_vla.files import remove_drafts, write_atomically
+
+if TYPE_CHECKING:
+    from mme_vla.training.loop import Trainer
+    from mme_vla.training.runs import Run
+    from mme_vla.training.settings import TrainSettings
 
 # Threads that wait for each other asleep: busy waiting slows a step tenfold when anything else runs on the same cores
 # (data workers do). It counts only when set before PyTorch is imported.
@@ -27,22 +33,59 @@ def main(cfg: DictConfig) -> None:
     """
     from hydra.core.hydra_config import HydraConfig
 
-    begun = time.perf_counter()
+    begun, named = time.perf_counter(), True
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
-    fresh = Path(HydraConfig.get().runtime.output_dir if HydraConfig.initialized() else config["output"])
-    train(cfg, {str(key): value for key, value in config.items()}, fresh, begun)
+    fresh = Path(config["output"])
+    if HydraConfig.initialized():
+        fresh = Path(HydraConfig.get().runtime.output_dir)
+        named = any(word.startswith("output=") for word in HydraConfig.get().overrides.task)
+    train(cfg, {str(key): value for key, value in config.items()}, fresh, begun, named)
 
 
-def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -> Path:
+def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, named: bool = True) -> Path:
     """Train as `cfg` says (`config` is its plain form), in `folder` unless it resumes a run elsewhere.
+
+    Args:
+        named: whether the user chose the folder's name; another run may have begun in the same second.
 
     Returns:
         The last checkpoint.
+
+    Raises:
+        SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the signal's number.
     """
     from accelerate import Accelerator
     from accelerate.utils import broadcast_object_list
 
+    from mme_vla.training.logging import check_logger
+    from mme_vla.training.runs import claim_run
+    from mme_vla.training.settings import TrainSettings
+
+    settings = TrainSettings.from_dict(config["train"], config["seed"])
+    check_logger(config)
+    if settings.device == "cuda":
+        find_device("cuda")  # says so where there is none
+    accelerator = Accelerator(cpu=settings.device == "cpu")
+    chosen: list[Any] = [None]
+    with ExitStack() as held:
+        if accelerator.is_main_process:  # the clock is in the folder's name: the first process decides
+            chosen[0], lock = claim_run(folder, named, config["resume"], config)
+            held.push(lock)
+        run = broadcast_object_list(chosen)[0]
+        if run.folder != folder:
+            with suppress(OSError):
+                folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
+        trainer = _train(cfg, config, run, settings, accelerator, begun)
+    if trainer.stopped_by is not None:
+        raise SystemExit(128 + trainer.stopped_by)
+    assert trainer.last_checkpoint is not None
+    return trainer.last_checkpoint
+
+
+def _train(
+    cfg: DictConfig, config: dict[str, Any], run: "Run", settings: "TrainSettings", accelerator: Any, begun: float
+) -> "Trainer":
     from mme_vla.data.dataset import collate
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.finetune import apply_finetuning
@@ -51,23 +94,12 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     from mme_vla.training.console import ProgressLine
     from mme_vla.training.data import check_frozen, prepare_data
     from mme_vla.training.finish import finish
-    from mme_vla.training.logging import Loggers, check_logger, open_loggers
+    from mme_vla.training.logging import Loggers, open_loggers
     from mme_vla.training.loop import Trainer
-    from mme_vla.training.runs import CONFIG, open_run
-    from mme_vla.training.settings import TrainSettings
+    from mme_vla.training.runs import CONFIG, check_content
     from mme_vla.training.start import start_from, weights_to_start_from
     from mme_vla.training.validation import Validation
 
-    settings = TrainSettings.from_dict(config["train"], config["seed"])
-    check_logger(config)
-    if settings.device == "cuda":
-        find_device("cuda")  # says so where there is none
-    accelerator = Accelerator(cpu=settings.device == "cpu")
-    chosen: list[Any] = [open_run(folder, config["resume"], config)]
-    run = broadcast_object_list(chosen)[0]  # the clock is in the folder's name: the first process decides
-    if run.folder != folder:
-        with suppress(OSError):
-            folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
     first = accelerator.is_main_process
     line = ProgressLine(settings.steps, run.step, shown=first)
     # A backbone whose weights are about to be replaced is not drawn first.
@@ -85,6 +117,9 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     policy.to(accelerator.device)
     with accelerator.main_process_first():
         data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
+    if run.checkpoint is not None:
+        check_content(run.checkpoint, data.content)
+    config["data"]["content"] = data.content
     check_disk(run.folder, policy, settings.keep)
     validation = None
     if data.val is not None and settings.val_samples:
@@ -94,7 +129,9 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     line.say(trainer.describe())
     loggers = open_loggers(run.folder, config, run.step) if first else Loggers([])
     if first:
-        OmegaConf.save(cfg, run.folder / CONFIG, resolve=True)
+        remove_drafts(run.folder)
+        with write_atomically(run.folder / CONFIG) as draft:
+            OmegaConf.save(cfg, draft, resolve=True)
     try:
         with line:
             finished = trainer.run(line, loggers)
@@ -103,8 +140,7 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float) -
     finally:
         loggers.close()
     accelerator.end_training()
-    assert trainer.last_checkpoint is not None
-    return trainer.last_checkpoint
+    return trainer
 
 
 def cache_command() -> str:

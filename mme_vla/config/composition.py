@@ -27,10 +27,11 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.core.utils import JobRuntime
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config import plugins
+from mme_vla.config.endings import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
 from mme_vla.errors import UserError
@@ -198,15 +199,15 @@ def cli[T](
 ) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
     """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
 
-    Before the command starts the overrides are checked. A `UserError`, then or from `main`, is printed without
-    traceback and ends the process with code 2; any other exception keeps its traceback. Called with a config, the
-    decorated function runs `main` directly.
+    Before the command starts the overrides are checked. How it ends when the user, the system or the disk ends it is
+    `print_user_errors`' matter; any other exception keeps its traceback. Called with a config, the decorated function
+    runs `main` directly.
     """
 
     def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
         @functools.wraps(main)
         def job(cfg: DictConfig) -> T:
-            with print_user_errors():
+            with print_user_errors():  # here too: Hydra would print a traceback before it gets further
                 _require_values(cfg)
                 if {"name", "memory"} <= set(cfg):
                     cfg.name = _name_under_hydra(_root_=cfg)
@@ -222,8 +223,13 @@ def cli[T](
             sys.argv[1:] = plugins.trust_as_override(sys.argv[1:])
             with print_user_errors():
                 _check_command_line(config_name, tree)
-            start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
-            start(job)()
+                start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
+                # Hydra makes the run folder: what the disk says to that is to come here, not to be printed there.
+                os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+                try:
+                    start(job)()
+                except HydraException as error:
+                    raise UserError(str(error)) from error
             return None
 
         return command
@@ -287,19 +293,6 @@ def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
     logger.handlers = [handler]
     logger.propagate = False
     warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
-
-
-@contextmanager
-def print_user_errors() -> Iterator[None]:
-    """Show a `UserError` as a sentence instead of a traceback, and end the process with code 2."""
-    try:
-        yield
-    except UserError as error:
-        from rich.console import Console
-        from rich.text import Text
-
-        Console(stderr=True, soft_wrap=True).print(Text("Error: ", "bold red"), Text(str(error)), sep="")
-        raise SystemExit(2) from None
 
 
 @contextmanager

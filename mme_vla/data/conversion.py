@@ -20,12 +20,13 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, find_files, list_episodes, open_episode
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
+from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
-_PLAN, _PARTS, _MERGED = "plan.json", "episodes", "merged"
+_PARTS, _MERGED = "episodes", "merged"
 
 
 @dataclass(frozen=True)
@@ -72,21 +73,45 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
 def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOptions | None = None) -> int:
     """Convert these episodes, in this order, into a dataset at `output`; return how many were newly written.
 
-    A run that was interrupted is continued by calling again with the same arguments.
+    A run that was interrupted is continued by calling again with the same arguments. The files are told by their
+    content, so one that has changed since is noticed.
 
     Raises:
-        UserError: `output` holds something else, a partial run had other episodes or options, or an episode is
-            damaged. Nothing that exists is overwritten.
+        UserError: `output` holds something else, a partial run had other episodes or options, another process converts
+            into it, or an episode is damaged. Nothing that exists is overwritten.
     """
     options = options or ConvertOptions()
     if not episodes:
         raise UserError("There is no episode to convert.")
-    origins = [{"file": ref.file.name, "bytes": ref.file.stat().st_size, "episode": ref.index} for ref in episodes]
-    plan = {"options": asdict(options), "episodes": origins}
+    plan = _plan(episodes, options)
     partial = output.with_name(output.name + ".partial")
-    if _finished(output, plan):
-        shutil.rmtree(partial, ignore_errors=True)
+    if _finished(output, plan) and not partial.exists():
         return 0
+    with FolderLock(partial, "conversion"):
+        if _finished(output, plan):  # asked again: another process may have finished it meanwhile
+            drop_plan(partial)
+            return 0
+        return _convert(episodes, output, partial, plan, options)
+
+
+def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
+    """What decides the result. Reading whole files takes a small part of what converting them takes."""
+    files = list(dict.fromkeys(ref.file for ref in episodes))
+    with progress("read", sum(file.stat().st_size for file in files), unit="bytes") as advance:
+        sums = {}
+        for file in files:
+            sums[file] = file_sum(file)
+            advance(file.stat().st_size)
+    origins = [
+        {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
+        for ref in episodes
+    ]
+    return {"options": asdict(options), "episodes": origins}
+
+
+def _convert(
+    episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
+) -> int:
     _claim(partial, plan)
     names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
     parts = [partial / _PARTS / name for name in names]
@@ -97,7 +122,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
             advance(1)
     _merge(parts, partial / _MERGED, plan)
     (partial / _MERGED).rename(output)
-    shutil.rmtree(partial)
+    drop_plan(partial)
     return len(missing)
 
 
@@ -105,30 +130,31 @@ def _finished(output: Path, plan: dict[str, Any]) -> bool:
     if not output.exists() or (output.is_dir() and not any(output.iterdir())):
         return False
     side = output / SIDE_FILE
-    if side.is_file() and json.loads(side.read_text()).get("plan") == plan:
+    if side.is_file() and _same(read_json(side, "the facts of a converted dataset").get("plan"), plan):
         return True
     raise UserError(
-        f"{output} exists and is not the result of this conversion (other files, episodes or options). "
-        "Choose another output, or remove that folder yourself."
+        f"{output} exists and is not the result of this conversion (other files, other content of a file, other "
+        "episodes or options). Choose another output, or remove that folder yourself."
     )
+
+
+def _same(stored: Any, plan: dict[str, Any]) -> bool:
+    """Whether a stored plan is this one; plans from before contents were compared name files and sizes only."""
+    if isinstance(stored, dict) and not any("sha256" in origin for origin in stored.get("episodes", ())):
+        plan = {**plan, "episodes": [{k: v for k, v in o.items() if k != "sha256"} for o in plan["episodes"]]}
+    return stored == plan
 
 
 def _claim(partial: Path, plan: dict[str, Any]) -> None:
     """Make `partial` the work folder of this plan, or recognise it as such."""
-    record = partial / _PLAN
-    if partial.exists() and any(partial.iterdir()):
-        if not record.is_file() or json.loads(record.read_text()) != plan:
-            raise UserError(
-                f"{partial} belongs to another conversion (other inputs or options). Repeat that one to finish it, "
-                "choose another output, or remove that folder yourself."
-            )
-        for leftover in (partial / "writing", partial / _MERGED):
-            shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
-        return
-    (partial / _PARTS).mkdir(parents=True, exist_ok=True)
-    draft = partial / (_PLAN + ".new")
-    draft.write_text(json.dumps(plan, indent=1))
-    draft.rename(record)
+    if not claim_plan(partial, plan):
+        raise UserError(
+            f"{partial} belongs to another conversion (other inputs, other content of an input, or options). Repeat "
+            "that one to finish it, choose another output, or remove that folder yourself."
+        )
+    for leftover in (partial / "writing", partial / _MERGED):
+        shutil.rmtree(leftover, ignore_errors=True)  # our own half-written work
+    (partial / _PARTS).mkdir(exist_ok=True)
 
 
 def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:

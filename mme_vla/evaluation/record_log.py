@@ -8,11 +8,12 @@ import os
 import warnings
 from collections.abc import Iterable
 from pathlib import Path
+from types import TracebackType
 from typing import IO, Self
 
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
-from mme_vla.files import read_bytes
+from mme_vla.files import name_place, read_bytes
 
 RECORDS = "episodes.jsonl"
 """Name of a run's file; its shards are called `episodes-<shard>.jsonl`."""
@@ -54,8 +55,15 @@ class RecordLog:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        name_place(error, self.path)
+        try:
+            self.close()
+        except OSError:  # what a full disk did not take is tried once more on closing
+            if error is None:
+                raise
 
     def _repair(self) -> None:
         self._file.seek(0)

@@ -4,14 +4,13 @@ import hashlib
 import json
 import os
 import time
-import uuid
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError, brief
-from mme_vla.files import plain, read_json, sealed, unsealed
+from mme_vla.files import draft_of, plain, read_json, remove_drafts, sealed, unsealed
 
 RUN_FILE = "run.json"
 INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "timeout", "retries", "backoff",
@@ -83,7 +82,8 @@ def _write_new(target: Path, text: str) -> None:
     Raises:
         FileExistsError: it is.
     """
-    mine = target.with_name(f".{target.name}.{uuid.uuid4().hex}")  # process ids repeat on hosts that share a folder
+    remove_drafts(target.parent)
+    mine = draft_of(target)
     mine.write_text(text)
     try:
         os.link(mine, target)  # whole or not at all, and never over another's
@@ -93,7 +93,7 @@ def _write_new(target: Path, text: str) -> None:
         with target.open("x") as file:
             file.write(text)
     finally:
-        mine.unlink()
+        mine.unlink(missing_ok=True)
 
 
 def _await_content(path: Path, patience: float = 2) -> None:

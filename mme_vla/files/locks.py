@@ -4,53 +4,101 @@ import errno
 import fcntl
 import os
 import socket
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from mme_vla.errors import UserError
+from mme_vla.files.trouble import name_place
 
 LOCK = ".lock"
+_held: set[int] = set()  # descriptors
+
+
+def _let_go() -> None:
+    """A forked process holds nothing: it would go on holding the folder when this process is gone."""
+    while _held:
+        os.close(_held.pop())
+
+
+os.register_at_fork(after_in_child=_let_go)
 
 
 class FolderLock:
     """Hold a folder for this process, as a context manager or from `acquire()` to `release()`.
 
-    The lock is the file `.lock` in the folder; it stays behind, without meaning, when nobody holds it.
+    The lock is the file `.lock` in the folder. Whoever lets go removes it, and the folder too if nothing else is in it;
+    after a kill it stays behind, without meaning.
+
+    Args:
+        folder: made if need be. what: it is for, in the message.
+        name: of the lock's file, where several kinds of holders share a folder.
 
     Raises:
         UserError: another process holds the folder.
     """
 
-    def __init__(self, folder: Path, what: str = "run") -> None:
-        self.folder, self.what = Path(folder), what
+    def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
+        self.folder, self.what, self.path = Path(folder), what, Path(folder) / name
         self._descriptor: int | None = None
 
     def acquire(self) -> Self:
         """Take the lock, making the folder if need be."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        for last in (False,) * 99 + (True,):
+            try:
+                self.folder.mkdir(parents=True, exist_ok=True)
+                descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+            except FileNotFoundError:  # its last holder has just removed the folder
+                if last:
+                    raise
+                continue
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
+                os.close(descriptor)
+                if error.errno not in (errno.EAGAIN, errno.EACCES):  # a file system without locks
+                    return self
+                raise UserError(
+                    f"{self.folder} is in use by another {self.what} ({holder or 'a process that has just started'}). "
+                    "Wait until it has ended, stop it, or write to another folder."
+                ) from None
+            self._descriptor = descriptor
+            _held.add(descriptor)
+            if self._in_place():
+                break
+            self._forget()  # what we hold was removed by its last holder between our opening and our locking it
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-            os.close(descriptor)
-            if error.errno not in (errno.EAGAIN, errno.EACCES):  # a file system without locks
-                return self
-            raise UserError(
-                f"{self.folder} is in use by another {self.what} ({holder or 'a process that has just started'}). Wait "
-                "until it has ended, stop it, or write to another folder."
-            ) from None
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
-        self._descriptor = descriptor
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+        except OSError:  # a full disk: the lock holds without words
+            pass
         return self
 
     def release(self) -> None:
         """Let go of the folder; harmless if it is not held."""
-        if self._descriptor is not None:
+        if self._descriptor not in _held:
+            return
+        with suppress(OSError):  # the folder may have been moved or removed by its holder
+            if self._in_place():
+                self.path.unlink()
+                self.folder.rmdir()
+        self._forget()
+
+    def _in_place(self) -> bool:
+        """Whether the file that is locked is still the one under the lock's name."""
+        assert self._descriptor is not None
+        try:
+            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
+        except FileNotFoundError:
+            return False
+
+    def _forget(self) -> None:
+        if self._descriptor in _held:  # not so in a forked process
+            _held.remove(self._descriptor)
             os.close(self._descriptor)
-            self._descriptor = None
+        self._descriptor = None
 
     def __enter__(self) -> Self:
         return self.acquire()
@@ -58,4 +106,5 @@ class FolderLock:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        name_place(error, self.folder)
         self.release()

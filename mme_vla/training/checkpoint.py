@@ -72,7 +72,7 @@ def save_checkpoint(
     write_sums(draft, (RAW, OPTIMIZER, STATE), keep=True)
     _flush(draft)
     replace_folder(draft, target)
-    _prune(folder, keep)
+    tidy(folder, keep)
     return target
 
 
@@ -203,10 +203,13 @@ def check_disk(folder: Path, policy: Policy, keep: KeepRule) -> None:
         )
 
 
-def _prune(folder: Path, keep: KeepRule) -> None:
+def tidy(folder: Path, keep: KeepRule) -> None:
+    """Remove the checkpoints that `keep` does not hold on to, and what a killed run left half-written or -removed."""
     for path in checkpoints_in(folder)[: -keep.last]:
         if not keep.every or step_of(path) % keep.every:
-            shutil.rmtree(path)
+            path.rename(folder / f".{path.name}.partial")  # whole or gone, for whoever looks
+    for path in folder.glob(".step_*.partial"):
+        shutil.rmtree(path)
 
 
 def _on_cpu(tensor: Tensor) -> Tensor:

@@ -24,6 +24,8 @@ class SplitData:
 
     train: TrainingDataset
     val: TrainingDataset | None
+    content: list[str]
+    """A fingerprint of each dataset's content."""
 
 
 def prepare_data(
@@ -79,7 +81,8 @@ def prepare_data(
         )  # fmt: skip
 
     held_out = sum(map(len, split.val))
-    prepared = SplitData(side(split.train, data["jitter"]), side(split.val, False) if held_out else None)
+    prepared = SplitData(side(split.train, data["jitter"]), side(split.val, False) if held_out else None,
+                         [source.fingerprint for source in sources])  # fmt: skip
     say(
         f"data {data['name']}: {len(prepared.train)} training steps in {sum(map(len, split.train))} episodes, "
         f"{0 if prepared.val is None else len(prepared.val)} held-out steps in {held_out}"

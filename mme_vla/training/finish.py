@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mme_vla.files import write_atomically
 from mme_vla.training.console import ProgressLine
 from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, read_metrics
@@ -33,7 +34,8 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
             line.say(verdict)
         line.say(f"plot: {folder / PLOT}")
     summary |= {"checkpoint": str(trainer.last_checkpoint), "seconds": round(seconds, 1)}
-    (folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n")
+    with write_atomically(folder / SUMMARY) as draft:  # a run that has one is finished
+        draft.write_text(json.dumps(summary, indent=2) + "\n")
     line.say(f"loss {summary['first_loss']:.4f} → {summary['last_loss']:.4f} (first and last twentieth of the run)")
     line.say(f"checkpoint: {trainer.last_checkpoint}")
     return summary

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.files import parse_json, read_text
+from mme_vla.files import parse_json, read_text, write_atomically
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 
@@ -36,7 +36,8 @@ class JsonLines:
     def __init__(self, folder: Path, first_step: int) -> None:
         path = folder / METRICS
         kept = [line for line in read_metrics(folder) if line["step"] <= first_step]
-        path.write_text("".join(json.dumps(line) + "\n" for line in kept))
+        with write_atomically(path) as draft:
+            draft.write_text("".join(json.dumps(line) + "\n" for line in kept))
         self._file = path.open("a", buffering=1)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
@@ -96,7 +97,8 @@ class WeightsAndBiases:
 
         record = folder / "wandb_id"
         if not record.is_file():
-            record.write_text(wandb.util.generate_id())
+            with write_atomically(record) as draft:
+                draft.write_text(wandb.util.generate_id())
         self._wandb = wandb
         self._run = wandb.init(
             project=project, entity=entity, group=group, tags=tags, mode=mode, dir=str(folder),

@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, trainable
+from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, tidy, trainable
 from mme_vla.training.console import ProgressLine, memory_gib
 from mme_vla.training.ema import EMA
 from mme_vla.training.logging import Loggers
@@ -90,6 +90,8 @@ class Trainer:
         self.model = accelerator.prepare_model(policy)
         self._parameters = list(parameters.values())
         self.last_checkpoint = run.checkpoint
+        self.stopped_by: int | None = None
+        """The signal that ended `run` early."""
 
     def describe(self) -> str:
         """One line on what trains where."""
@@ -107,6 +109,10 @@ class Trainer:
             Whether it got there; False when the user or the cluster asked it to stop, which saves a checkpoint first.
         """
         window, settings = Window(self.settings.batch_size), self.settings
+        if self.run_info.step >= settings.steps:  # killed between its last step and its end
+            if self.accelerator.is_main_process:
+                tidy(self.run_info.checkpoints, settings.keep)
+            return True
         batches = iter(self.loader)
         with stop_asked() as asked:
             for step in range(self.run_info.step, settings.steps):
@@ -125,6 +131,7 @@ class Trainer:
                     if saving:
                         self.save(done)
                 if stopping:
+                    self.stopped_by = asked.signal
                     line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
                     return False
         return True

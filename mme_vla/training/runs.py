@@ -1,12 +1,14 @@
 """Run folders: which one this run writes to, what it may resume from, and which settings it may change then."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError, brief
-from mme_vla.files import plain
+from mme_vla.files import FolderLock, plain
+from mme_vla.files.locks import LOCK
 from mme_vla.training.checkpoint import checkpoints_in, read_state, resolve_checkpoint, step_of
 
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
@@ -15,11 +17,12 @@ CHECKPOINTS = "checkpoints"
 MAY_DIFFER = (
     "name", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
     "train.save_every", "train.keep", "train.workers", "train.open_loop_chunks", "train.device",
-    "data.cache", "trust_plugins",
+    "data.cache", "data.content", "trust_plugins",
 )  # fmt: skip
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss.
 
-The name too: it follows from the sections that are compared, and runs of earlier versions may be called otherwise."""
+The name too: it follows from the sections that are compared, and runs of earlier versions may be called otherwise.
+`data.content`, the fingerprints of the datasets, is compared when they are open (`check_content`)."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,36 @@ class Run:
         return self.folder / CHECKPOINTS
 
 
+def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str, Any]) -> tuple[Run, FolderLock]:
+    """Decide as `open_run`, and hold the run's folder against other processes.
+
+    Args:
+        named: whether the user chose `folder`. One that is named after the clock may belong to another run that began
+            in the same second: then this run takes the next name, `<folder>-2`.
+
+    Raises:
+        UserError: as `open_run`, or another process trains in the folder.
+    """
+    for number in range(1, 1000):
+        place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
+        try:
+            run = open_run(place, resume, config)
+            lock = FolderLock(run.folder, "training run").acquire()
+        except UserError:
+            if named or resume is not None or not _in_use(place):
+                raise
+            continue
+        try:
+            again = open_run(place, resume, config)  # what decided may have changed before the folder was held
+            if again.folder == run.folder:
+                return again, lock
+            raise UserError(f"{run.folder} has just been finished by another process; repeat the command.")
+        except BaseException:
+            lock.release()
+            raise
+    raise UserError(f"{folder} and the names after it are taken: choose another output.")
+
+
 def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run:
     """Decide where this run writes and where it starts; nothing is written yet.
 
@@ -47,7 +80,7 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             not.
     """
     if resume is None:
-        if any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY)):
+        if _holds_run(folder):
             raise UserError(
                 f"{folder} already holds a training run, which is never overwritten: "
                 f"continue it with resume={folder}, or choose another output."
@@ -69,8 +102,10 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."
         )
     steps = config["train"]["steps"]
-    if state["step"] >= steps:
-        raise UserError(f"{checkpoint} has already reached train.steps={steps}: give a larger train.steps to go on.")
+    if state["step"] > steps:
+        raise UserError(
+            f"{checkpoint} has done {state['step']} steps already, more than train.steps={steps}: give as many or more."
+        )
     newer = [path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]]
     if newer:
         raise UserError(
@@ -78,6 +113,25 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
             "would overwrite: resume from the newest, or move those away."
         )
     return Run(checkpoint.parent.parent, checkpoint, state["step"])
+
+
+def check_content(checkpoint: Path, now: Sequence[str]) -> None:
+    """Make sure that a resumed run has the data it began with.
+
+    Args:
+        checkpoint: it goes on from. now: `SplitData.content`.
+
+    Raises:
+        UserError: a dataset has changed. Checkpoints from before this was noted cannot tell.
+    """
+    then = read_state(checkpoint)["config"].get("data", {}).get("content")
+    if then is not None and list(then) != list(now):
+        which = [i for i, (old, new) in enumerate(zip_longest(then, now)) if old != new]
+        raise UserError(
+            f"The data have changed since {checkpoint} was written: number {', '.join(map(str, which))} of "
+            "data.sources holds other episodes, so going on would be another run. Bring the data back, or start anew "
+            f"with init_from={checkpoint}."
+        )
 
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
@@ -88,6 +142,15 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
         for key in sorted(before.keys() | after.keys())
         if before.get(key) != after.get(key) and not any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
     }
+
+
+def _holds_run(folder: Path) -> bool:
+    return any((folder / name).exists() for name in (CHECKPOINTS, METRICS, SUMMARY))
+
+
+def _in_use(folder: Path) -> bool:
+    """Whether a folder holds a run, or one that has not written anything yet."""
+    return _holds_run(folder) or (folder / LOCK).exists()
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

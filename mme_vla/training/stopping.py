@@ -4,26 +4,42 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import distributed
 
+from mme_vla.files.parents import end_with_parent
+
 ANSWERED = (signal.SIGINT, signal.SIGTERM)
 
 
-@contextmanager
-def stop_asked() -> Iterator[Callable[[], bool]]:
-    """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual.
+@dataclass
+class Asked:
+    """Call it to know whether any process was asked to stop.
 
-    Yields:
-        A function that says whether any process was asked. It is a collective: all processes call it after the same
-        update, so all get the same answer, though the signals reach them at different moments or only one of them.
+    It is a collective: all processes call it after the same update, so all get the same answer, though the signals
+    reach them at different moments or only one of them.
     """
-    event = threading.Event()
-    with _signals_set(event):
+
+    anyone: Callable[[], bool]
+    event: threading.Event = field(default_factory=threading.Event)
+    signal: int = signal.SIGTERM
+    """Which signal this process was asked by; of processes asked by another one, SIGTERM."""
+
+    def __call__(self) -> bool:
+        return self.anyone()
+
+
+@contextmanager
+def stop_asked() -> Iterator[Asked]:
+    """While this is open, Ctrl-C and SIGTERM only ask; a second one ends the process as usual."""
+    asked = Asked(lambda: asked.event.is_set())
+    event = asked.event
+    with _signals_set(asked):
         if not _several_processes():
-            yield event.is_set
+            yield asked
             return
         # On the CPU, and apart from the gradients' group: nothing waits for a GPU to answer.
         group = distributed.new_group(backend="gloo")
@@ -33,16 +49,21 @@ def stop_asked() -> Iterator[Callable[[], bool]]:
             distributed.all_reduce(flag, distributed.ReduceOp.MAX, group)
             return bool(flag)
 
+        asked.anyone = anyone
         try:
-            yield anyone
+            yield asked
         finally:
             distributed.destroy_process_group(group)
 
 
 def leave_signals_alone(worker: int) -> None:
-    """Signals go to every process of a group, data workers included: the training process alone answers them."""
+    """Signals go to every process of a group, data workers included: the training process alone answers them.
+
+    A data worker ends with it, also when it is killed.
+    """
     for number in ANSWERED:
         signal.signal(number, signal.SIG_IGN)
+    end_with_parent()
 
 
 def _several_processes() -> bool:
@@ -50,15 +71,16 @@ def _several_processes() -> bool:
 
 
 @contextmanager
-def _signals_set(event: threading.Event) -> Iterator[None]:
-    """Each signal sets the event, once; only a main thread may answer signals, in any other nothing changes."""
+def _signals_set(asked: Asked) -> Iterator[None]:
+    """Each signal asks, once; only a main thread may answer signals, in any other nothing changes."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     before = {number: signal.getsignal(number) for number in ANSWERED}
 
     def ask(number: int, frame: Any) -> None:
-        event.set()
+        asked.signal = number
+        asked.event.set()
         signal.signal(number, before[signal.Signals(number)])
 
     for number in before:

@@ -18,7 +18,7 @@ import torch
 from mme_vla.config.devices import find_device
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, brief
-from mme_vla.files import Sums, decoding, read_json, require_file
+from mme_vla.files import FolderLock, Sums, decoding, read_json, require_file
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 
@@ -268,7 +268,7 @@ def ensure_cache(
 
 def run(cfg: "DictConfig") -> None:
     """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line describe."""
-    from mme_vla.data.cache.building import build_cache, clear_cache, estimate
+    from mme_vla.data.cache.building import build_cache, clear_cache, estimate, process_rank
     from mme_vla.data.sources import open_sources
     from mme_vla.policy.build import build_from_config
     from mme_vla.training.start import start_from, weights_to_start_from
@@ -295,12 +295,15 @@ def run(cfg: "DictConfig") -> None:
                 f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
             )
             continue
-        if os.environ.get("RANK", "0") == "0":
+        rank, world = process_rank()
+        if rank == 0:
             source.verify()  # its pictures are all about to be read, and for the last time
-        if cfg.rebuild:
-            clear_cache(folder)
-        batch_size = cfg.data.cache.batch_size
-        written = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
+        # Beside the folder, and one for each share: processes that take other shares, or train, are welcome.
+        with FolderLock(folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"):
+            if cfg.rebuild:
+                clear_cache(folder)
+            batch_size = cfg.data.cache.batch_size
+            written = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
         print(f"{source.name}: {written} episodes encoded, {len(source)} in all, at {folder}")
 
 

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 
 from mme_vla.envs.observations import INTRINSIC
+from mme_vla.files import remove_drafts, write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import RecordedStep
@@ -67,14 +68,12 @@ def join(parts: Sequence[Path], path: Path) -> None:
 
     The file appears under its name only when it is whole.
     """
-    draft = path.with_name(path.name + ".partial")
-    draft.unlink(missing_ok=True)
-    with h5py.File(draft, "w") as target:
+    remove_drafts(path.parent)
+    with write_atomically(path) as draft, h5py.File(draft, "w") as target:
         for part in parts:
             with h5py.File(part) as source:
                 for episode in source.values():
                     _copy(episode, target.create_group(Path(episode.name).name))
-    draft.rename(path)
 
 
 def _copy(source: Any, target: Any) -> None:

@@ -27,6 +27,7 @@ from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.jobs import Job, Reply
 from mme_vla.errors import UserError
+from mme_vla.files.parents import signals_held
 
 _CLOSING_SECONDS = 5.0
 _STARTING_SECONDS = 120.0
@@ -192,7 +193,8 @@ class VecEnv:
         process = self._context.Process(
             target=_work, args=(imported_plugins(), there, block, self._factory, self._options), daemon=True
         )
-        process.start()
+        with signals_held():
+            process.start()
         there.close()
         return _Worker(process, here, block)
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.envs.rendering import renderer_works
+from mme_vla.files.parents import end_with_parent
 
 LARGE = 4096
 """Arrays of at least this many bytes go through shared memory; everything else is pickled."""
@@ -71,6 +72,7 @@ def restore(value: Any, arrays: list[np.ndarray]) -> Any:
 
 def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dict[str, Any]) -> None:
     """Run commands until told to close, until the other side is gone, or until the renderer has failed."""
+    end_with_parent()
     os.environ["OMP_NUM_THREADS"] = "1"  # the workers themselves are the parallelism
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)

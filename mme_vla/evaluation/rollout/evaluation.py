@@ -19,7 +19,7 @@ from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
 from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
-from mme_vla.files import safe_name
+from mme_vla.files import remove_drafts, safe_name
 from mme_vla.policy.base import Policy
 from mme_vla.processing.subgoal_text import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
@@ -77,6 +77,7 @@ def evaluate(
     shard = shard or Shard()
     mine = take_share(jobs, shard)
     with RecordLog(output / shard.file) as log:
+        remove_drafts(output / VIDEOS)  # films of workers that were killed
         done = _done(output, mine, facts)
         missing = [job for job in mine if (job.task, job.episode) not in finished(done)]
         kept = [record for record in done if record.outcome != "error"]

@@ -1,12 +1,13 @@
 """An episode as a video: front and wrist side by side, the conditioning part in a red border, the subgoal below."""
 
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mme_vla.files import draft_of
 
 FPS = 30
 BORDER = 10  # pixels
@@ -64,8 +65,8 @@ class EpisodeVideo:
 
         folder = self._path("", "").parent
         folder.mkdir(parents=True, exist_ok=True)
-        self._draft = folder / f".unfinished-{os.getpid()}-{id(self):x}.mp4"
-        self._container = av.open(str(self._draft), "w")
+        self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
+        self._container = av.open(str(self._draft), "w", format="mp4")
         self._stream = self._container.add_stream("libx264", rate=FPS)
         self._stream.height, self._stream.width = picture.shape[:2]
         self._stream.pix_fmt = "yuv420p"

@@ -22,7 +22,7 @@ from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episod
 from mme_vla.data.layout import SAMPLE
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError, brief
-from mme_vla.files import SUMS, plain, read_json, write_sums
+from mme_vla.files import SUMS, FolderLock, claim_plan, file_sum, plain, read_json, write_atomically, write_sums
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.media import write_mp4, write_png
 from mme_vla.subgoal.finetuning.rows import SETS, RowOptions, episode_rows
@@ -31,7 +31,7 @@ from mme_vla.subgoal.finetuning.swift import write_arguments
 if TYPE_CHECKING:
     from omegaconf import DictConfig
 
-PLAN, PARTS = "plan.json", "parts"
+PARTS = "parts"
 
 
 @dataclass(frozen=True)
@@ -62,10 +62,9 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
     root = SAMPLE if str(entry) == "sample" else Path(entry)
     if (root / "meta" / "info.json").is_file():
         return _from_lerobot(EpisodeSource(root), tasks)
-    return [
-        Demonstration(ref.task, ref.index, f"{ref.file.name}:{ref.file.stat().st_size}", *_h5_readers(ref))
-        for ref in list_episodes(find_files([root]))
-    ]
+    refs = list_episodes(find_files([root]))
+    sums = {file: file_sum(file) for file in dict.fromkeys(ref.file for ref in refs)}
+    return [Demonstration(ref.task, ref.index, f"{ref.file.name}:{sums[ref.file]}", *_h5_readers(ref)) for ref in refs]
 
 
 def build(
@@ -84,7 +83,18 @@ def build(
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
     origins = {episode.name: episode.origin for episode in episodes}
     plan = plain({"sets": list(sets), "options": asdict(options), "episodes": origins})
-    _claim(output, plan)
+    with FolderLock(output, "build of subgoal data"):
+        return _build(episodes, output, sets, options, plan)
+
+
+def _build(
+    episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions, plan: dict[str, Any]
+) -> dict[str, int]:
+    if not claim_plan(output, plan):
+        raise UserError(
+            f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
+            "repeat that command to finish it, or remove the folder yourself."
+        )
     missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
     if not all((output / f"{name}.jsonl").is_file() for name in sets):
         with progress("subgoal data", len(episodes), len(episodes) - len(missing), "episodes") as advance:
@@ -92,9 +102,8 @@ def build(
                 _build_episode(episode, output, sets, options)
                 advance(1)
         for name in sets:
-            draft = output / f"{name}.jsonl.partial"
-            draft.write_text("".join(_part(output, name, episode).read_text() for episode in episodes))
-            draft.replace(output / f"{name}.jsonl")
+            with write_atomically(output / f"{name}.jsonl") as draft:
+                draft.write_text("".join(_part(output, name, episode).read_text() for episode in episodes))
     shutil.rmtree(output / PARTS, ignore_errors=True)
     if not (output / SUMS).is_file():  # the last thing written: what they do not list is not compared
         kinds = {".jsonl", ".png", ".mp4"}
@@ -118,11 +127,8 @@ def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], op
             _write_once(path, partial(write_png, picture))
     for name in sets:  # the rows last: where they are, their pictures are
         rows = episode_rows(name, labels, options).rows
-        part = _part(output, name, episode)
-        part.parent.mkdir(parents=True, exist_ok=True)
-        draft = part.with_suffix(".partial")
-        draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
-        draft.replace(part)
+        with write_atomically(_part(output, name, episode)) as draft:
+            draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))
 
 
 def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
@@ -133,22 +139,6 @@ def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:
     return output / PARTS / name / f"{episode.name}.jsonl"
-
-
-def _claim(output: Path, plan: dict[str, Any]) -> None:
-    """Make `output` the folder of this plan, or recognise it as such."""
-    record = output / PLAN
-    if output.exists() and any(output.iterdir()):
-        if not record.is_file() or read_json(record, "a plan") != plan:
-            raise UserError(
-                f"{output} holds something else, or the result of other inputs, sets or options. Choose another "
-                "output, repeat that command to finish it, or remove the folder yourself."
-            )
-        return
-    output.mkdir(parents=True, exist_ok=True)
-    draft = output / f"{PLAN}.partial"
-    draft.write_text(json.dumps(plan, indent=1))
-    draft.replace(record)
 
 
 def _h5_readers(ref: EpisodeRef) -> tuple[Callable[[], Labels], Callable[[Sequence[int]], Iterator[np.ndarray]]]:

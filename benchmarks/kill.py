@@ -1,0 +1,144 @@
+"""Commands killed (SIGKILL) before every change they make to a file, then repeated with the same words.
+
+    python benchmarks/kill.py [train cache convert record evaluate] [--every 1] [--json killed.json] [--minutes 60]
+
+What comes out must equal an undisturbed run's result bit by bit, but for times. `kill_tracer.py` says what is seen of a
+process; `kill_commands.py` what is run: small models, made-up demonstrations, a scripted environment, the made-up
+simulator of one process. Nothing leaves the machine.
+"""
+
+import argparse
+import json
+import os
+import random
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+
+os.environ |= {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1"}
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent / "tests")]
+
+from kill_commands import COMMANDS, import_for, results  # noqa: E402
+from kill_tracer import trace  # noqa: E402
+
+
+@dataclass
+class Outcome:
+    """What came of killing one command.
+
+    changes: file operations of an undisturbed run. kills: how many of them it was killed before.
+    refused: kills after which the same words failed. wrong: after which the results differ.
+    left: after which something lies beside them. outlived: after which a process of the command lived on.
+    places: what was about to be done in all of these.
+    """
+
+    command: str
+    changes: int = 0
+    kills: int = 0
+    refused: int = 0
+    wrong: int = 0
+    left: int = 0
+    outlived: int = 0
+    seconds: float = 0.0
+    places: list[str] = field(default_factory=list)
+
+    @property
+    def failures(self) -> int:
+        return self.refused + self.wrong + self.outlived
+
+
+def attack(name: str, every: int, base: Path, until: float = float("inf"), first: int = 1) -> Outcome:
+    """Kill a command before its changes number `first`, `first` + `every`, …, each time in a new folder."""
+    command, begun, found = COMMANDS[name], time.monotonic(), Outcome(name)
+    inputs, log = base / f"{name}-inputs", base / f"{name}.log"
+    inputs.mkdir()
+    _finish(partial(_quiet, partial(command.prepare, inputs), log), inputs, log)
+    whole = base / f"{name}-whole"
+    expected, changes = _run(command.run, inputs, whole, log)
+    found.changes = len(changes)
+    numbers = list(range(first, len(changes) + 1, every))
+    random.Random(0).shuffle(numbers)  # so that what there is time for is spread over the run
+    for number in numbers:
+        if time.monotonic() > until:
+            break
+        folder = base / f"{name}-killed"
+        folder.mkdir()
+        work = partial(_quiet, partial(command.run, inputs, folder), log)
+        killed = trace(work, folder, kill_at=number)
+        again = trace(work, folder)
+        there = results(folder)
+        found.kills += killed.code == -9
+        found.outlived += killed.outlived > 0
+        found.refused += again.code != 0
+        found.wrong += again.code == 0 and any(there.get(path) != value for path, value in expected.items())
+        found.left += bool(there.keys() - expected.keys())
+        if again.code or any(there.get(path) != value for path, value in expected.items()) or killed.outlived:
+            wrong = sorted(path for path, value in expected.items() if there.get(path) != value)
+            found.places.append(f"{number} {killed.changes[-1]}: exit {again.code}, {wrong[:4]}")
+        elif extra := sorted(there.keys() - expected.keys()):
+            found.places.append(f"{number} {killed.changes[-1]}: left {extra[:4]}")
+        shutil.rmtree(folder)
+    found.seconds = round(time.monotonic() - begun, 1)
+    return found
+
+
+def _run(
+    run: Callable[[Path, Path], object], inputs: Path, folder: Path, log: Path
+) -> tuple[dict[str, str], Sequence[str]]:
+    folder.mkdir()
+    changes = _finish(partial(_quiet, partial(run, inputs, folder), log), folder, log)
+    found = results(folder)
+    shutil.rmtree(folder)
+    return found, changes
+
+
+def _finish(work: Callable[[], object], folder: Path, log: Path) -> Sequence[str]:
+    done = trace(work, folder, limit_s=300)
+    if done.code:
+        raise RuntimeError(f"an undisturbed run ended with {done.code}:\n{log.read_text()[-3000:]}")
+    return done.changes
+
+
+def _quiet(work: Callable[[], object], log: Path) -> None:
+    with log.open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    work()
+
+
+def main() -> None:
+    """Run the attacks and print their table."""
+    parser = argparse.ArgumentParser("python benchmarks/kill.py", description=__doc__.splitlines()[0])
+    parser.add_argument("commands", nargs="*", default=list(COMMANDS), help=f"of {', '.join(COMMANDS)}; default: all")
+    parser.add_argument("--every", type=int, default=1, help="kill before every so manieth operation (default: each)")
+    parser.add_argument("--first", type=int, default=1, help="number of the first operation to kill before")
+    parser.add_argument("--minutes", type=float, default=60, help="stop killing after so long (default: 60)")
+    parser.add_argument("--json", type=Path, help="write the outcomes here")
+    given = parser.parse_args()
+    if unknown := set(given.commands) - set(COMMANDS):
+        parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
+    import_for(given.commands)
+    until, outcomes = time.monotonic() + 60 * given.minutes, []
+    print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |")
+    print("|---|" + "---:|" * 7)
+    with tempfile.TemporaryDirectory() as base:
+        for name in given.commands:
+            o = attack(name, given.every, Path(base).resolve(), until, given.first)
+            outcomes.append(o)
+            numbers = (o.changes, o.kills, o.refused, o.wrong, o.left, o.outlived, o.seconds)
+            print(f"| {name} | " + " | ".join(map(str, numbers)) + " |", flush=True)
+    for o in outcomes:
+        for place in o.places:
+            print(f"{o.command}: {place}")
+    if given.json:
+        given.json.write_text(json.dumps([asdict(o) for o in outcomes], indent=2) + "\n")
+    raise SystemExit(any(o.failures for o in outcomes))
+
+
+if __name__ == "__main__":
+    main()

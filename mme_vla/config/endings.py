@@ -1,0 +1,72 @@
+"""How every command ends: a sentence and an exit code where the user, the system or the disk ended it."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from mme_vla.errors import UserError
+from mme_vla.files.trouble import disk_trouble
+
+DISK_TROUBLE, MISTAKE = 1, 2  # exit codes; a signal's is 128 and its number, as a shell has it
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: what a scheduler sends before it kills. Whatever tidies up after Ctrl-C does so after this."""
+
+
+@contextmanager
+def print_user_errors() -> Iterator[None]:
+    """Surround a command: what is not a bug ends the process with a sentence instead of a traceback.
+
+    A `UserError` ends with code 2, a disk that refuses (full, read-only, too many files) with 1, Ctrl-C with 130 and
+    SIGTERM with 143. Other exceptions pass.
+    """
+    with _terminable():
+        try:
+            yield
+        except UserError as error:
+            _say(f"Error: {error}", "Error: ")
+            raise SystemExit(MISTAKE) from None
+        except KeyboardInterrupt as stop:
+            number = signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT
+            name = "SIGTERM" if number == signal.SIGTERM else "Ctrl-C"
+            _say(f"Stopped by {name}. What was finished is kept: the same command goes on from there.", "Stopped")
+            raise SystemExit(128 + number) from None
+        except Exception as error:
+            sentence = disk_trouble(error)
+            if sentence is None:
+                raise
+            _say(f"Error: {sentence}", "Error: ")
+            raise SystemExit(DISK_TROUBLE) from None
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Turn SIGTERM into an exception while this is open, where the process would just have died of it."""
+    main = threading.current_thread() is threading.main_thread()
+    if not main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def terminate(number: int, frame: FrameType | None) -> None:
+        raise Terminated
+
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _say(text: str, bold: str) -> None:
+    from rich.console import Console
+    from rich.text import Text
+
+    rest = text.removeprefix(bold)
+    try:
+        Console(stderr=True, soft_wrap=True).print(Text(bold, "bold red"), Text(rest), sep="")
+    except OSError:  # the terminal, or the disk that standard error goes to, is what gave way
+        sys.stderr = None

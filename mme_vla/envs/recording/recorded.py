@@ -1,0 +1,117 @@
+"""What a recording is to leave behind: a LeRobot dataset, official files, or both; and what of it is there already."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mme_vla.errors import UserError
+from mme_vla.files import read_json
+
+if TYPE_CHECKING:
+    from mme_vla.data.conversion import ConvertOptions
+
+
+@dataclass(frozen=True)
+class Job:
+    """One episode to demonstrate."""
+
+    task: str
+    episode: int
+    seed: int
+    difficulty: str
+    recovery: str | None
+    retries: int
+
+    @property
+    def name(self) -> str:
+        """Of the episode's files."""
+        return f"{self.task}-{self.episode:04d}"
+
+    def made(self, seed: int | None, difficulty: str | None) -> bool:
+        """Whether an episode of this seed and difficulty can be what this job records."""
+        return seed is not None and self.seed <= seed < self.seed + self.retries and difficulty == self.difficulty
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """The results of a recording.
+
+    jobs: its episodes. dataset: folder of the LeRobot dataset, if one is wanted. hdf5: folder of the official files,
+    one a task, if they are.
+    """
+
+    jobs: Sequence[Job]
+    dataset: Path | None
+    hdf5: Path | None
+
+    @property
+    def places(self) -> list[Path]:
+        """The dataset and the official files."""
+        official = dict.fromkeys(job.task for job in self.jobs) if self.hdf5 is not None else ()
+        return [*([] if self.dataset is None else [self.dataset]), *map(self._official, official)]
+
+    def missing(self, options: "ConvertOptions") -> list[Path]:
+        """The places that are still to be written; what is there holds exactly these episodes.
+
+        Raises:
+            UserError: one of them holds something else, which is never written over.
+        """
+        missing = []
+        for place in self.places:
+            if not place.exists():
+                missing.append(place)
+            elif not (self._is_dataset(options) if place == self.dataset else self._is_official(place)):
+                raise UserError(
+                    f"{place} exists already, and is not what this command records; choose another place, or remove it "
+                    "yourself."
+                )
+        return missing
+
+    def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:
+        """Write these places from the recorded files in `episodes`; each appears whole or not at all."""
+        from mme_vla.data.conversion import convert
+        from mme_vla.data.hdf5 import EpisodeRef
+        from mme_vla.envs.recording.hdf5_writer import join
+
+        for place in missing:
+            if place != self.dataset:
+                place.parent.mkdir(parents=True, exist_ok=True)
+                join([episodes / f"{job.name}.h5" for job in self._of(place)], place)
+        if self.dataset is not None and self.dataset in missing:
+            refs = [EpisodeRef(episodes / f"{job.name}.h5", job.episode, job.task) for job in self.jobs]
+            convert(refs, self.dataset, options)
+
+    def _official(self, task: str) -> Path:
+        assert self.hdf5 is not None
+        return self.hdf5 / f"record_dataset_{task}.h5"
+
+    def _of(self, place: Path) -> list[Job]:
+        return [job for job in self.jobs if self._official(job.task) == place]
+
+    def _is_official(self, place: Path) -> bool:
+        from mme_vla.data.hdf5 import list_episodes, open_episode
+
+        jobs = {job.episode: job for job in self._of(place)}
+        refs = list_episodes([place])
+        if {ref.index for ref in refs} != set(jobs):
+            return False
+        for ref in refs:
+            with open_episode(ref) as episode:
+                if not jobs[ref.index].made(episode.seed, episode.difficulty):
+                    return False
+        return True
+
+    def _is_dataset(self, options: "ConvertOptions") -> bool:
+        from mme_vla.data.conversion import SIDE_FILE
+
+        assert self.dataset is not None
+        if not (self.dataset / SIDE_FILE).is_file():
+            return False
+        side = read_json(self.dataset / SIDE_FILE, "the facts of a recorded dataset")
+        found = side.get("episodes", [])
+        return (
+            side.get("plan", {}).get("options") == asdict(options)
+            and [(e.get("task"), e.get("source_episode")) for e in found] == [(j.task, j.episode) for j in self.jobs]
+            and all(job.made(e.get("seed"), e.get("difficulty")) for job, e in zip(self.jobs, found, strict=True))
+        )
