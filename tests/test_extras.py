@@ -54,7 +54,7 @@ SUFFICE = [
     Case((), "mme_vla.subgoal.build input=sample output=rows sets=[simple]", "simple"),
     Case((), "mme_vla.results --demo --brief", "Made-up records"),
     Case((), "mme_vla.analyse --help", "selection"),
-    Case((), "mme_vla.processing.train_tokenizer words.model", ""),
+    Case((), "mme_vla.processing.train_tokenizer run", "tokenizer.model"),
     Case((), "mme_vla.data.sample --help", "full"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
     Case(("orbax",), f"mme_vla.weights.convert {STEP} jax --to released", ""),
