@@ -6,6 +6,8 @@ Every variant gets the same weights as a `pi05` whose adaptive gates are open (a
 hide everything); only the memory's own parameters are as initialised. Mean over eight random batches.
 """
 
+import argparse
+
 import torch
 
 from mme_vla.testing.small import NEURAL, random_batch, random_history, small_policy
@@ -29,6 +31,7 @@ def distance(name: str, **overrides: object) -> float:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print("| model | relative distance at initialisation |\n|---|---:|")
     for name in NEURAL:
         print(f"| `{name}` | {distance(name):.1e} |")

@@ -7,6 +7,7 @@ are known beforehand, each served alone: every chunk of theirs is compared, and 
 Reads memory from /proc (Linux).
 """
 
+import argparse
 import http.client
 import json
 import random
@@ -271,4 +272,6 @@ def soak_server(checkpoint: str, seconds: float) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(float(sys.argv[1]) if len(sys.argv) > 1 else 120))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("seconds", nargs="?", type=float, default=120, help="how long the clients are at it")
+    raise SystemExit(main(parser.parse_args().seconds))

@@ -19,8 +19,8 @@ from typing import Any, cast
 
 import numpy as np
 import torch
-from cost import TERA, check_attention_is_counted, flops, full_size, sampling
 
+from mme_vla.evaluation.analyses.cost import count_model, flops
 from mme_vla.subgoal import Gemini, Memer, QwenVL
 from mme_vla.subgoal.finetuning.collecting import Demonstration, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes
@@ -28,6 +28,7 @@ from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
 from mme_vla.subgoal.words.parsing import mark_points, write_boxes
 from mme_vla.subgoal.words.prompts import memer_answer
 
+TERA = 1e12
 RUN = 16  # actions executed of a chunk
 PICTURE, SECOND = 258, 258  # Gemini's tokens of a picture, and of a second of video
 QWEN3_VL_4B = {
@@ -189,7 +190,7 @@ def measure(
         told = partial(answer, name, kind, labels)
         chunks += play(predictor, labels, lambda step, told=told: setattr(model, "next_answer", told(step)))
     n, usage = len(episodes), predictor.usage
-    acting, reference = chunks * flops(sampling(*full_size(policy))), chunks * plain
+    acting, reference = chunks * count_model(policy).chunk, chunks * plain
     counted = isinstance(model, CountingVLM)
     return [
         f"`{name}`, {kind}", f"`{policy}`", f"{chunks / n:.1f}", f"{usage.calls / n:.1f}",
@@ -205,7 +206,7 @@ def count(demonstrations: Sequence[Demonstration]) -> None:
     """Print the table."""
     tiny = VLM.load("tiny", device="cpu")
     episodes = [demonstration.labels() for demonstration in demonstrations]
-    plain = flops(sampling(*full_size("pi05")))
+    plain = count_model("pi05").chunk  # refuses a PyTorch whose counter leaves out attention
     heads = [
         "predictor", "policy", "chunks", "calls", "tokens read a call", "written a call", "a call",
         "predictor, an episode", "policy, an episode", "together, over `pi05`",
@@ -227,7 +228,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--episodes", nargs="+", type=int, default=[0, 1, 2, 3], help="of the embedded sample")
     args = parser.parse_args()
-    check_attention_is_counted()
     sample = open_input("sample")
     count([sample[index] for index in args.episodes])
 

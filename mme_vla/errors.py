@@ -20,6 +20,15 @@ def did_you_mean(name: str, options: Iterable[str]) -> str:
     return f"{hint}Known: {', '.join(known) or 'none'}."
 
 
+def missing_extra(what: str, extra: str) -> UserError:
+    """The error to raise where the packages of an extra are not installed: what needs them, and what installs them.
+
+    `--inexact` keeps the extras that are there already; a plain `uv sync` would take them away.
+    """
+    with_uv, with_pip = f"uv sync --inexact --extra {extra}", f"pip install -c constraints.txt -e '.[{extra}]'"
+    return UserError(f"{what} needs the extra `{extra}`. In the clone: {with_uv} (without uv: {with_pip}).")
+
+
 def brief(value: object, most: int = 80, quote: bool = True) -> str:
     """A value as it stands in a message: its repr, cut in the middle where it is longer than `most` characters.
 

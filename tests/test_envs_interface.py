@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 h5py = pytest.importorskip("h5py")
 
 from mme_vla.envs import make, make_env, rendering_check  # noqa: E402
@@ -265,7 +265,7 @@ def test_unknown_names_are_refused_with_what_exists(arguments: dict[str, Any], w
 
 def test_a_missing_simulator_says_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(make, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"pip install 'mme-vla\[sim\]'"):
+    with pytest.raises(UserError, match="uv sync --inexact --extra sim"):
         make_env("PickXtimes", render=False)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla.commands import gallery as show
 from mme_vla.commands import record

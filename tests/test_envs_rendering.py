@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 h5py = pytest.importorskip("h5py")
 
 from mme_vla.envs import make_env  # noqa: E402

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-sapien = pytest.importorskip("sapien", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+sapien = pytest.importorskip("sapien", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
 from mme_vla.envs.choices import Choice  # noqa: E402
 from mme_vla.envs.grounding import project  # noqa: E402

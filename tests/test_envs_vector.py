@@ -166,7 +166,7 @@ def test_unknown_names_are_refused_before_any_process_starts(
 
 
 def test_real_environments_run_in_workers() -> None:
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
     with make_vec_env("VideoUnmask", [4], workers=1, split="train", render=False) as envs:
         envs.start_next(0)
         reply = only(envs.recv())

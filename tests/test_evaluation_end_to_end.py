@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import REPOSITORY
 
-pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError

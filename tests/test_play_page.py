@@ -23,8 +23,8 @@ from mme_vla.play.desk import Desk
 from mme_vla.play.run import Identity, PlayRun
 from mme_vla.play.web import is_local, listen, make_server
 
-pytest.importorskip("starlette", reason="the page needs the extra play: pip install 'mme-vla[play]'")
-pytest.importorskip("uvicorn", reason="the page needs the extra play: pip install 'mme-vla[play]'")
+pytest.importorskip("starlette", reason="the page needs the extra play: uv sync --inexact --extra play")
+pytest.importorskip("uvicorn", reason="the page needs the extra play: uv sync --inexact --extra play")
 
 
 class Served:

@@ -168,7 +168,7 @@ def test_every_question_tells_the_whole_episode():
 
 
 def test_a_tiny_qwen_plays_and_its_nonsense_is_survived():
-    pytest.importorskip("transformers", reason="needs the extra vlm: pip install 'mme-vla[vlm]'")
+    pytest.importorskip("transformers", reason="needs the extra vlm: uv sync --inexact --extra vlm")
     player = build_player(
         {"name": "qwenvl", "model": "tiny", "tries": 2, "max_new_tokens": 8, "clip_frames": 4, "device": "cpu",
          "dtype": "float32"}
@@ -208,7 +208,7 @@ def test_the_oracle_needs_this_librarys_tasks():
 
 
 def test_the_oracle_solves_episodes_without_rendering(tmp_path):
-    pytest.importorskip("mani_skill", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
     words = ["task=[VideoUnmask,VideoUnmaskSwap]", "episodes=0", "player=oracle", f"output={tmp_path / 'run'}"]
     done = subprocess.run(
         [sys.executable, "-m", "mme_vla.play", *words], capture_output=True, text=True, cwd=Path(__file__).parent.parent

@@ -276,7 +276,7 @@ def test_a_launcher_that_is_not_installed_is_named_with_its_extra() -> None:
         pytest.skip("the extra `sweep` is installed")
     command = [sys.executable, "-m", "mme_vla.evaluate", "--multirun", "launcher=joblib", "model=pi05"]
     done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-    assert done.returncode == 2 and "pip install 'mme-vla[sweep]'" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "uv sync --inexact --extra sweep" in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.skipif(

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes
 from mme_vla.envs import make_env

@@ -258,7 +258,7 @@ TINY_VLM = ["subgoal=qwenvl", "subgoal.model=tiny", "subgoal.device=cpu", "subgo
 
 @pytest.mark.parametrize("words", [["subgoal=oracle"], TINY_VLM], ids=["oracle", "qwenvl"])
 def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str], tmp_path: Path) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
     pytest.importorskip("transformers", reason="needs the extra vlm")
     from mme_vla.envs.rendering_check import render_backend
 

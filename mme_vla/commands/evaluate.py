@@ -114,7 +114,7 @@ def choose_subgoals(
         UserError: an unknown predictor, option or mode, or a policy that reads no subgoal, or another kind.
     """
     from mme_vla.evaluation.rollout.evaluation import check_subgoals
-    from mme_vla.serving.session import subgoal_kind
+    from mme_vla.processing.subgoal_text import subgoal_kind
     from mme_vla.subgoal import BackgroundPredictor, build_predictor
 
     if mode not in SUBGOAL_MODES:

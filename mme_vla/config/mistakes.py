@@ -12,7 +12,7 @@ from hydra.errors import HydraException, MissingConfigException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, missing_extra
 
 COMPOSITION_ERRORS = (HydraException, OmegaConfBaseException, yaml.YAMLError, ValueError)
 _BAD_KEY = re.compile(r"Could not override '(.+)'\.\n|Could not delete from config\. '(.+)' does not exist")
@@ -36,7 +36,7 @@ class ConfigTree:
         if isinstance(error, MissingConfigException) and error.missing_cfg_file:
             group, _, name = error.missing_cfg_file.rpartition("/")
             if group == "hydra/launcher":
-                return f"The launcher {name!r} is not installed; run: pip install 'mme-vla[sweep]'"
+                return str(missing_extra(f"launcher={name}", "sweep"))
             options = error.options or [n for n in self.loader.get_group_options(group) if not n.startswith("_")]
             return f"Unknown {group or 'config'} {name!r}. {did_you_mean(name, options)}"
         for choice in self.choices:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mme_vla.envs import metadata
 from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.registry import TASKS
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def require_simulator() -> None:
         UserError: mani-skill is not installed.
     """
     if find_spec("mani_skill") is None:
-        raise UserError("The simulator is not installed; run: pip install 'mme-vla[sim]'")
+        raise missing_extra("The simulator", "sim")
 
 
 def load_tasks(*tasks: str) -> None:

@@ -11,7 +11,7 @@ from importlib.resources import files
 from importlib.util import find_spec
 from typing import Any
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.play.desk import Desk, StaleError
 
 log = logging.getLogger("mme_vla.play")
@@ -34,7 +34,7 @@ def require_page() -> None:
         UserError: the extra `play` is not installed.
     """
     if find_spec("starlette") is None or find_spec("uvicorn") is None:
-        raise UserError("The page needs the extra `play`: pip install 'mme-vla[play]'.")
+        raise missing_extra("The page", "play")
 
 
 def make_app(desk: Desk, local: bool = True) -> Any:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from torch import Tensor, nn
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, missing_extra
 
 if TYPE_CHECKING:
     from mme_vla.policy.saving import Saved
@@ -111,7 +111,7 @@ def add_adapters(
     try:
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
-        raise UserError("LoRA needs peft, which is not installed: pip install 'mme-vla[vlm]'.") from None
+        raise missing_extra("LoRA", "vlm") from None
     config = LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=chosen)  # type: ignore[arg-type]
     inject_adapter_in_model(config, policy, ADAPTER)
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "targets": list(targets)}

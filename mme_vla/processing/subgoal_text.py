@@ -65,3 +65,15 @@ def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
         return f"at <{y}, {x}>"
 
     return POINT.sub(moved, text)
+
+
+def subgoal_kind(policy: Any) -> str | None:
+    """`simple_subgoal` or `grounded_subgoal`, as the policy was trained; None where it reads none.
+
+    Args:
+        policy: anything with a policy's processor and configuration.
+    """
+    if not policy.require_processor().prompt_format.reads_subgoal:
+        return None
+    kind = (policy.config.get("subgoal_text") or {}).get("kind")
+    return None if kind is None else str(kind)

@@ -7,14 +7,14 @@ from typing import Any, Self
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.serving.codec import pack, unpack
 
 try:
     from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
     from websockets.sync.client import connect
 except ImportError as error:
-    raise UserError("The client needs msgpack and websockets: pip install 'mme-vla[serve]'.") from error
+    raise missing_extra("The client", "serve") from error
 
 
 class Client:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 
 REFUSED_KINDS = "VOc"  # records and raw bytes, Python objects, complex numbers
 MOST_ITEMS = 2**17  # entries of one list or map: msgpack reserves room for as many as a message claims
@@ -19,7 +19,7 @@ MOST_TEXT = 2**20  # characters of one text
 try:
     import msgpack
 except ImportError as error:  # the extra is missing: say which
-    raise UserError("Serving needs msgpack and websockets: pip install 'mme-vla[serve]'.") from error
+    raise missing_extra("Serving", "serve") from error
 
 
 def pack(message: Any) -> bytes:

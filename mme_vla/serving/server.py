@@ -8,13 +8,14 @@ from contextlib import suppress
 from importlib.metadata import version
 from typing import Any, cast
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.subgoal_text import subgoal_kind
 from mme_vla.serving.codec import pack
 from mme_vla.serving.counters import ServerStats
 from mme_vla.serving.engine import Engine
 from mme_vla.serving.http_side import HttpSide
-from mme_vla.serving.session import Session, subgoal_kind
+from mme_vla.serving.session import Session
 from mme_vla.serving.settings import ServeSettings
 from mme_vla.serving.warmup import warm_up
 from mme_vla.serving.web import Door
@@ -25,7 +26,7 @@ try:
     from websockets.http11 import Request as Handshake
     from websockets.http11 import Response
 except ImportError as error:
-    raise UserError("Serving needs msgpack and websockets: pip install 'mme-vla[serve]'.") from error
+    raise missing_extra("Serving", "serve") from error
 
 logger = logging.getLogger("mme_vla.serving")
 STOPPING = "The server is stopping."

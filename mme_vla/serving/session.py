@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.processing.subgoal_text import subgoal_kind
 from mme_vla.serving.codec import unpack
 from mme_vla.serving.engine import Engine
 from mme_vla.serving.requests import AddBuffer, Infer, Request, Reset, parse
@@ -135,11 +136,3 @@ class Session:
             return request.subgoals.get(kind)
         given = list(request.subgoals.values())
         return given[0] if len(given) == 1 else None
-
-
-def subgoal_kind(policy: Any) -> str | None:
-    """`simple_subgoal` or `grounded_subgoal`, as the policy was trained; None where it reads none."""
-    if not policy.require_processor().prompt_format.reads_subgoal:
-        return None
-    kind = (policy.config.get("subgoal_text") or {}).get("kind")
-    return None if kind is None else str(kind)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
 
@@ -112,10 +112,8 @@ class WeightsAndBiases:
         try:
             import wandb  # noqa: F401
         except ImportError:
-            raise UserError(
-                "logger=wandb needs the package wandb: `uv sync --extra wandb` or `pip install wandb`. "
-                "TensorBoard (logger=tensorboard) needs nothing more."
-            ) from None
+            # TensorBoard, the default, needs nothing more.
+            raise missing_extra("logger=wandb", "wandb") from None
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         self._run.log(dict(values), step=step)

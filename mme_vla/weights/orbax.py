@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 _ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
@@ -145,7 +145,5 @@ def _tensorstore() -> Any:
     try:
         import tensorstore
     except ImportError:
-        raise UserError(
-            "Orbax checkpoints are read with tensorstore, which is not installed: pip install 'mme-vla[orbax]'."
-        ) from None
+        raise missing_extra("Reading and writing Orbax checkpoints", "orbax") from None
     return tensorstore

@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.types import VIEWS
 
 _JPEG_QUALITY = 90
@@ -29,7 +29,7 @@ class RerunLog:
         try:
             import rerun
         except ImportError:
-            raise UserError("Rerun output needs the extra `viz`: pip install 'mme-vla[viz]'.") from None
+            raise missing_extra("Rerun output", "viz") from None
         if path.suffix != ".rrd":
             raise UserError(f"--rerun {path}: the viewer reads files that end in .rrd.")
         path.parent.mkdir(parents=True, exist_ok=True)

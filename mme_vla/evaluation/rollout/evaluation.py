@@ -19,7 +19,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
 from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.serving.session import subgoal_kind
+from mme_vla.processing.subgoal_text import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
 

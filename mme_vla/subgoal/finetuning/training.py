@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.subgoal.finetuning.examples import Collator, RowDataset
 from mme_vla.subgoal.models.qwen3vl import VLM, load_model
 
@@ -65,8 +65,11 @@ def find_checkpoint(output: Path, resume: str | None) -> str | None:
 
 def run(cfg: "DictConfig") -> Path:
     """Train as configs/subgoal_train.yaml and the command line say; return the adapter's folder."""
-    from peft import LoraConfig, get_peft_model
-    from transformers import Trainer, set_seed
+    try:
+        from peft import LoraConfig, get_peft_model
+        from transformers import Trainer, set_seed
+    except ImportError:
+        raise missing_extra("Fine-tuning Qwen3-VL", "vlm") from None
 
     output = Path(cfg.output)
     checkpoint = find_checkpoint(output, cfg.resume)

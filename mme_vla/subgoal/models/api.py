@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, missing_extra
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.media import mp4_bytes, png_bytes
 from mme_vla.subgoal.models.threads import within
@@ -236,7 +236,7 @@ def _make_client(settings: Settings) -> Any:
     try:
         from google import genai
     except ImportError:
-        raise UserError("Gemini needs the extra `gemini`: pip install 'mme-vla[gemini]'.") from None
+        raise missing_extra("Gemini", "gemini") from None
     return genai.Client(api_key=key, http_options={"timeout": int(settings.timeout * 1000)})
 
 

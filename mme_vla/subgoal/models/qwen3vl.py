@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.subgoal.finetuning.media import FPS, VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.tiny import make_tiny
 from mme_vla.subgoal.words.prompts import IMAGE, VIDEO, split_media
@@ -156,7 +156,7 @@ def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
     try:
         from transformers import AutoProcessor, Qwen3VLForConditionalGeneration
     except ImportError:
-        raise UserError("Qwen3-VL needs the extra `vlm`: pip install 'mme-vla[vlm]'.") from None
+        raise missing_extra("Qwen3-VL", "vlm") from None
     if name == TINY:
         return make_tiny()
     try:

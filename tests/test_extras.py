@@ -1,0 +1,240 @@
+"""Each extra suffices alone: every command runs where the packages of all other extras cannot be imported.
+
+Which packages those are follows from pyproject.toml and from what is installed. A command that needs an extra names it,
+and the words that install it.
+"""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from functools import cache
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+FOLDER = REPOSITORY / "tests" / "extras"
+NEW = "uv sync --inexact --extra {}"
+
+
+# The first test to run waits for all commands.
+pytestmark = pytest.mark.timeout(600)
+
+
+class Case(NamedTuple):
+    """A command, the extras that are there, and how it ends: `says` is a text it prints."""
+
+    extras: tuple[str, ...]
+    words: str
+    says: str
+    code: int = 0
+    wait: str = ""  # stop the command once it has printed this
+
+
+TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.patch_size=1"
+TRAIN = f"mme_vla.commands.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
+PLAY = "mme_vla.play task=StopCube episodes=0 max_choices=1 output=played"
+STEP = "run/checkpoints/step_000001"
+
+# In this order: some read what an earlier one wrote.
+SUFFICE = [
+    Case((), f"{TRAIN} output=run", "checkpoint"),
+    Case((), "mme_vla.commands.inspect dataset=sample episode=0 step=20", ".png"),
+    Case((), "mme_vla.data.cache.store --help", "rebuild"),
+    Case((), "mme_vla.data.conversion --help", "input"),
+    Case((), f"mme_vla.commands.weights {STEP} lerobot --to lerobot", ""),
+    Case((), "mme_vla.subgoal.finetuning.collecting input=sample output=rows sets=[simple]", "simple"),
+    Case((), "mme_vla.commands.results --demo --brief", "Made-up records"),
+    Case((), "mme_vla.commands.analyse --help", "selection"),
+    Case((), "mme_vla.commands.train_tokenizer run", "tokenizer.model"),
+    Case((), "mme_vla.data.sample --help", "full"),
+    Case(("serve",), "mme_vla.commands.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
+    Case(("orbax",), f"mme_vla.commands.weights {STEP} jax --to released", ""),
+    Case(("viz",), "mme_vla.commands.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
+    Case(("vlm",), "mme_vla.subgoal.finetuning.training rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
+                   "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
+    Case(("sweep",), "mme_vla.commands.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
+    Case(("sim",), f"mme_vla.commands.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
+                   "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
+    Case(("sim",), "mme_vla.commands.record --help", "episodes"),
+    Case(("sim",), "mme_vla.commands.gallery --help", "task"),
+    Case(("sim", "play"), f"{PLAY} --help", "player"),
+]  # fmt: skip
+
+NEED = [
+    Case((), "mme_vla.commands.evaluate model=pi05 backbone=tiny", "sim", 2),
+    Case((), "mme_vla.commands.record task=PickXtimes episodes=1 output=recorded", "sim", 2),
+    Case((), "mme_vla.commands.gallery task=PickXtimes", "sim", 2),
+    Case((), f"{PLAY} player=random", "sim", 2),
+    Case(("play",), PLAY, "sim", 2),
+    Case(("sim",), PLAY, "play", 2),
+    Case((), f"{PLAY} player=qwenvl", "vlm", 2),
+    Case((), f"{PLAY} player=gemini", "gemini", 2),
+    Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
+    Case((), "mme_vla.commands.serve model=pi05 backbone=tiny", "serve", 2),
+    Case((), f"mme_vla.commands.weights {STEP} jax2 --to released", "orbax", 2),
+    Case((), "mme_vla.subgoal.finetuning.training rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
+    Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
+    Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
+    Case((), "mme_vla.commands.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
+    Case((), "mme_vla.commands.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
+]
+
+
+@pytest.fixture(scope="module")
+def ended(tmp_path_factory: pytest.TempPathFactory) -> dict[Case, tuple[int, str]]:
+    """How every command ended, and what it said."""
+    there = [case for case in [*SUFFICE, *NEED] if all(is_installed(extra) for extra in case.extras)]
+    asked = [[case.words.split(), hidden(case.extras), case.wait] for case in there]
+    folder = tmp_path_factory.mktemp("extras")
+    path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
+    variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(())), "HF_HUB_OFFLINE": "1",
+                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
+                 # What one command has compiled, the next need not.
+                 "PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "compiled")}  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(FOLDER / "commands.py")], input=json.dumps(asked), env=variables,
+        cwd=folder, capture_output=True, text=True, timeout=550,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    answers = [tuple(answer) for answer in json.loads(done.stdout.splitlines()[-1])]
+    return dict(zip(there, answers, strict=True))
+
+
+def name_of(case: Case) -> str:
+    return f"{'+'.join(case.extras) or 'none'}:{case.words.split()[0].removeprefix('mme_vla.')}:{case.says}"
+
+
+@pytest.mark.parametrize("case", SUFFICE, ids=name_of)
+def test_the_command_runs_with_this_extra_alone(ended: dict[Case, tuple[int, str]], case: Case) -> None:
+    if case not in ended:
+        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
+    code, said = ended[case]
+    assert code == case.code and case.says in said, said[-3000:]
+
+
+@pytest.mark.parametrize("case", NEED, ids=name_of)
+def test_a_command_names_the_extra_that_it_needs(ended: dict[Case, tuple[int, str]], case: Case) -> None:
+    if case not in ended:
+        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
+    code, said = ended[case]
+    assert code == case.code and "Traceback" not in said, said[-3000:]
+    assert f"extra `{case.says}`" in said and NEW.format(case.says) in said
+
+
+def test_every_command_is_among_the_cases() -> None:
+    commands = {command_of(file) for file in (REPOSITORY / "mme_vla").rglob("*.py") if is_command(file)}
+    assert "mme_vla.commands.evaluate" in commands
+    assert commands == {case.words.split()[0] for case in SUFFICE}
+
+
+def test_each_extra_is_among_the_cases() -> None:
+    # Gemini and Weights & Biases answer only to who has a key.
+    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"dev", "gemini", "wandb"}
+
+
+def test_what_is_hidden_is_what_only_other_extras_bring() -> None:
+    assert {"websockets", "msgpack"} <= set(hidden(("sim",))) or not is_installed("serve")
+    for extra in filter(is_installed, needs()):
+        assert {module_of(name) for name in needs()[extra]} & set(hidden((extra,))) == set()
+    assert {"torch", "lerobot", "hydra", "google.protobuf"} & set(hidden(())) == set()
+
+
+def command_of(file: Path) -> str:
+    return ".".join(file.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__main__")
+
+
+def is_command(file: Path) -> bool:
+    """Whether the file is run as a command; a doctest that mentions `__main__` makes none."""
+    tests = [ast.unparse(node.test) for node in ast.parse(file.read_text()).body if isinstance(node, ast.If)]
+    return any("__main__" in test for test in tests)
+
+
+@cache
+def installed() -> dict[str, Distribution]:
+    return {canonicalize_name(found.metadata["Name"]): found for found in distributions()}
+
+
+@cache
+def needs() -> dict[str, list[str]]:
+    """The packages that each extra names."""
+    found: dict[str, list[str]] = {}
+    for line in installed()["mme-vla"].requires or []:
+        requirement = Requirement(line)
+        named = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
+        if named:
+            found.setdefault(named[1], []).append(canonicalize_name(requirement.name))
+    return found
+
+
+def is_installed(extra: str) -> bool:
+    return all(name in installed() for name in needs()[extra])
+
+
+def closure(names: Iterable[tuple[str, str]]) -> set[str]:
+    """Distributions, and all that they need; each with the extra that is asked of it."""
+    seen: set[tuple[str, str]] = set()
+    rest = list(names)
+    while rest:
+        name, extra = rest.pop()
+        if (name, extra) in seen or name not in installed():
+            continue
+        seen.add((name, extra))
+        for line in installed()[name].requires or []:
+            wanted = Requirement(line)
+            if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):
+                rest += [(canonicalize_name(wanted.name), each) for each in ("", *wanted.extras)]
+    return {name for name, _ in seen}
+
+
+@cache
+def modules() -> dict[str, set[str]]:
+    """Each module and package, down to the first folder with an `__init__`, and the distributions that bring it."""
+    owners: dict[str, set[str]] = {}
+    listed = {name: (found.read_text("RECORD") or "").splitlines() for name, found in installed().items()}
+    files = {name: {line.partition(",")[0] for line in lines} for name, lines in listed.items()}
+    packages = {file.removesuffix("/__init__.py") for each in files.values() for file in each}
+    for name, each in files.items():
+        for file in each:
+            if not file.endswith((".py", ".so")) or file.startswith("..") or ".dist-info/" in file:
+                continue
+            inside = ""
+            for part in file.split("/"):
+                inside = f"{inside}/{part}".lstrip("/")
+                owners.setdefault(dotted(inside), set()).add(name)
+                if inside in packages:
+                    break
+    return owners
+
+
+def dotted(file: str) -> str:
+    """The module that a file is: `a/b.cpython-312.so` is `a.b`."""
+    folder, _, name = file.rpartition("/")
+    return f"{folder.replace('/', '.')}.{name.partition('.')[0]}".lstrip(".")
+
+
+@cache
+def hidden(extras: Sequence[str]) -> list[str]:
+    """Modules that would not be there if only these extras were installed."""
+    there = closure([("mme-vla", ""), *(("mme-vla", extra) for extra in extras)])
+    return sorted(module for module, owners in modules().items() if not owners & there)
+
+
+def module_of(distribution: str) -> str:
+    return next((m for m, owners in modules().items() if distribution in owners and "." not in m), distribution)
+
+
+def test_install_lines_name_what_a_clone_has_and_no_index() -> None:
+    pages = [REPOSITORY / "README.md", *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("mme_vla/**/*.py")]
+    text = {page.name: page.read_text() for page in pages}
+    assert [name for name, found in text.items() if re.search(r"pip install \S*mme-vla", found)] == []
+    named = {extra for found in text.values() for extra in re.findall(r"--extra ([a-z]\w*)", found)}
+    assert {"sim", "serve"} <= named <= set(needs())
