@@ -40,52 +40,52 @@ class Case(NamedTuple):
 
 
 TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.patch_size=1"
-TRAIN = f"mme_vla.commands.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
+TRAIN = f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
 PLAY = "mme_vla.play task=StopCube episodes=0 max_choices=1 output=played"
 STEP = "run/checkpoints/step_000001"
 
 # In this order: some read what an earlier one wrote.
 SUFFICE = [
     Case((), f"{TRAIN} output=run", "checkpoint"),
-    Case((), "mme_vla.commands.inspect dataset=sample episode=0 step=20", ".png"),
-    Case((), "mme_vla.data.cache.store --help", "rebuild"),
-    Case((), "mme_vla.data.conversion --help", "input"),
-    Case((), f"mme_vla.commands.weights {STEP} lerobot --to lerobot", ""),
-    Case((), "mme_vla.subgoal.finetuning.collecting input=sample output=rows sets=[simple]", "simple"),
-    Case((), "mme_vla.commands.results --demo --brief", "Made-up records"),
-    Case((), "mme_vla.commands.analyse --help", "selection"),
-    Case((), "mme_vla.commands.train_tokenizer run", "tokenizer.model"),
+    Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
+    Case((), "mme_vla.data.cache --help", "rebuild"),
+    Case((), "mme_vla.data.convert --help", "input"),
+    Case((), f"mme_vla.weights.convert {STEP} lerobot --to lerobot", ""),
+    Case((), "mme_vla.subgoal.build input=sample output=rows sets=[simple]", "simple"),
+    Case((), "mme_vla.results --demo --brief", "Made-up records"),
+    Case((), "mme_vla.analyse --help", "selection"),
+    Case((), "mme_vla.processing.train_tokenizer run", "tokenizer.model"),
     Case((), "mme_vla.data.sample --help", "full"),
-    Case(("serve",), "mme_vla.commands.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
-    Case(("orbax",), f"mme_vla.commands.weights {STEP} jax --to released", ""),
-    Case(("viz",), "mme_vla.commands.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
-    Case(("vlm",), "mme_vla.subgoal.finetuning.training rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
+    Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
+    Case(("orbax",), f"mme_vla.weights.convert {STEP} jax --to released", ""),
+    Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
+    Case(("vlm",), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
                    "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
-    Case(("sweep",), "mme_vla.commands.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
-    Case(("sim",), f"mme_vla.commands.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
+    Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
+    Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
-    Case(("sim",), "mme_vla.commands.record --help", "episodes"),
-    Case(("sim",), "mme_vla.commands.gallery --help", "task"),
+    Case(("sim",), "mme_vla.envs.record --help", "episodes"),
+    Case(("sim",), "mme_vla.envs.show --help", "task"),
     Case(("sim", "play"), f"{PLAY} --help", "player"),
 ]  # fmt: skip
 
 NEED = [
-    Case((), "mme_vla.commands.evaluate model=pi05 backbone=tiny", "sim", 2),
-    Case((), "mme_vla.commands.record task=PickXtimes episodes=1 output=recorded", "sim", 2),
-    Case((), "mme_vla.commands.gallery task=PickXtimes", "sim", 2),
+    Case((), "mme_vla.evaluate model=pi05 backbone=tiny", "sim", 2),
+    Case((), "mme_vla.envs.record task=PickXtimes episodes=1 output=recorded", "sim", 2),
+    Case((), "mme_vla.envs.show task=PickXtimes", "sim", 2),
     Case((), f"{PLAY} player=random", "sim", 2),
     Case(("play",), PLAY, "sim", 2),
     Case(("sim",), PLAY, "play", 2),
     Case((), f"{PLAY} player=qwenvl", "vlm", 2),
     Case((), f"{PLAY} player=gemini", "gemini", 2),
     Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
-    Case((), "mme_vla.commands.serve model=pi05 backbone=tiny", "serve", 2),
-    Case((), f"mme_vla.commands.weights {STEP} jax2 --to released", "orbax", 2),
-    Case((), "mme_vla.subgoal.finetuning.training rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
+    Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
+    Case((), f"mme_vla.weights.convert {STEP} jax2 --to released", "orbax", 2),
+    Case((), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
     Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
     Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
-    Case((), "mme_vla.commands.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
-    Case((), "mme_vla.commands.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
+    Case((), "mme_vla.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
+    Case((), "mme_vla.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
 ]
 
 
@@ -132,7 +132,7 @@ def test_a_command_names_the_extra_that_it_needs(ended: dict[Case, tuple[int, st
 
 def test_every_command_is_among_the_cases() -> None:
     commands = {command_of(file) for file in (REPOSITORY / "mme_vla").rglob("*.py") if is_command(file)}
-    assert "mme_vla.commands.evaluate" in commands
+    assert "mme_vla.evaluate" in commands
     assert commands == {case.words.split()[0] for case in SUFFICE}
 
 
