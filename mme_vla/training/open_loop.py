@@ -19,7 +19,8 @@ class OpenLoop:
     """Chunks of n steps along one episode.
 
     steps: [n] frames they start at. predicted, recorded: [n, h, w] absolute actions of the robot's `space`.
-    valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99) range of each dimension.
+    valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99) range of each
+        dimension; 1 where it never changes.
     still: [n, w] the state held, which a policy that does not move would answer; None where actions and state are of
         different kinds.
     """
@@ -78,6 +79,7 @@ def open_loop(policy: MMEPolicy, samples: TrainingDataset, chunks: int, seed: in
     recorded = [samples.step(i) for i in starts]
     stats = processor.stats
     assert stats is not None
+    half_range = (stats.actions.q99 - stats.actions.q01) / 2
     kind = "held-out" if held_out else "training"
     name = samples.sources[source]
     return OpenLoop(
@@ -86,7 +88,7 @@ def open_loop(policy: MMEPolicy, samples: TrainingDataset, chunks: int, seed: in
         predicted=torch.cat(predicted).numpy(),
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
-        scale=(stats.actions.q99 - stats.actions.q01) / 2,
+        scale=np.where(half_range > 0, half_range, 1),
         still=np.stack([step.state for step in recorded]) if processor.embodiment.action.relative else None,
         space=processor.embodiment.action,
     )
