@@ -76,7 +76,7 @@ def show_checkpoint(folder: Path, console: "Console") -> None:
     console.print(settings)
     stats = policy.require_processor().stats
     if stats is not None:
-        numbers = _table("normalisation", "", *(str(i + 1) for i in range(len(stats.actions))))
+        numbers = _table("normalisation", "", *(str(i + 1) for i in range(max(len(stats.state), len(stats.actions)))))
         for name, of in (("state", stats.state), ("action delta", stats.actions)):
             for quantile in ("q01", "q99"):
                 numbers.add_row(f"{name} {quantile}", *(f"{x:.3f}" for x in getattr(of, quantile)))
