@@ -10,19 +10,23 @@ import torch
 from h5_files import pose_at, write_file
 from omegaconf import OmegaConf
 from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
+from serving_fakes import Served, challenge
 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.config import compose
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.motions import find_motions
 from mme_vla.data.stats import compute_norm_stats
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.vector_jobs import Job
+from mme_vla.evaluation.rollout_env import make_rollout_env
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
+from mme_vla.serving.server import PolicyServer
+from mme_vla.serving.settings import ServeSettings
 from mme_vla.train import train
 
 
@@ -135,3 +139,38 @@ def test_a_pose_out_of_reach_is_the_policys_failure() -> None:
     policy = quick_policy("pi05", embodiment="robomme_ee_pose")
     (record,) = roll(policy, [Job("PickXtimes", "test", 0)], OutOfReach(robot=policy.embodiment), retries=1)
     assert (record.outcome, record.steps, record.extra["refused"]) == ("fail", 0, "IK failed")
+
+
+def test_a_policy_of_motions_is_served_a_motion_at_a_time() -> None:
+    policy = quick_policy("pi05", embodiment="robomme_waypoint")
+    frames, states = [np.zeros((32, 32, 3), np.uint8)] * 2, np.zeros((2, 8), np.float32)
+    with Served(policy) as served, served.client() as client:
+        about = client.metadata
+        assert (about["action_space"], about["action_dim"], about["horizon"], about["execute"]) == ("waypoint", 7, 4, 1)
+        asked = challenge(frames, frames, states, True)
+        answer = client.infer({**asked, "action_space": "waypoint"})["actions"]
+        assert answer.shape == (1, 7) and abs(answer[0, 6]) == 1
+        with pytest.raises(UserError, match="answers with waypoint only"):
+            client.infer({**asked, "action_space": "joint_angle"})
+    with pytest.raises(UserError, match="answers with waypoint, 7 numbers"):
+        PolicyServer(policy, ServeSettings(action_space="joint_angle"))
+    reading = quick_policy("pi05_past_actions", embodiment="robomme_waypoint")
+    with pytest.raises(UserError, match="which motions were executed"):
+        PolicyServer(reading, ServeSettings())
+
+
+@pytest.mark.parametrize("name", ["robomme_ee_pose", "robomme_waypoint"])
+def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(h5_folder: Path, name: str) -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+    panda, job = robot(name), Job("PickXtimes", "train", 8)
+    with open_episode(EpisodeRef(h5_folder / f"record_dataset_{job.task}.h5", job.episode, job.task)) as episode:
+        rows = episode.pose_actions(panda.action.key[0])[episode.exec_start :]
+    actions = rows if panda.action.frames == 1 else find_motions(rows, 0).targets
+    options = {"robot": panda, "action_space": panda.action.space, "render": False}
+    env = make_rollout_env(job.task, job.split, job.episode, **options)
+    env.reset()
+    frames, _, terminated, _, report = env.step({"actions": actions})
+    env.close()
+    assert terminated and report["status"] == "success"
+    assert len(frames["state"]) == report["steps"] >= report["executed"]
+    assert (report["steps"] == report["executed"]) == (panda.action.frames == 1)

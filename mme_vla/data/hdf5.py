@@ -160,8 +160,8 @@ class RawEpisode:
         """
         rows = np.stack([np.asarray(self._step(k, POSE_ACTIONS[column]), np.float32) for k in range(self.length)])
         for part in (slice(0, self.exec_start), slice(self.exec_start, self.length)):
-            unknown = ~np.isfinite(rows[part]).all(1)
-            if unknown.all() and len(unknown):
+            unknown: np.ndarray = ~np.isfinite(rows[part]).all(axis=1)
+            if part.stop > part.start and unknown.all():
                 rows[part] = np.asarray(self._step(part.stop - 1, POSE_ACTIONS["ee_pose_actions"]), np.float32)
             elif unknown.any():
                 rows[part][unknown] = rows[part][~unknown][0]

@@ -75,12 +75,17 @@ class ServeSettings:
         """Actions of a chunk that a challenge client gets, and executes."""
         return min(self.execute or robot.action.execute, robot.action.horizon)
 
-    def check_robot(self, robot: Embodiment) -> None:
-        """Make sure that the policy answers in the action space that was asked for.
+    def check_robot(self, robot: Embodiment, past_actions: int = 0) -> None:
+        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this.
 
         Raises:
-            UserError: it answers in another.
+            UserError: it answers in another action space, or would have to know what no request tells.
         """
+        if past_actions and robot.action.frames is None:
+            raise UserError(
+                f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
+                f"many motions of {robot.name!r} they took: it cannot be served."
+            )
         if self.action_space not in (None, robot.action.space):
             raise UserError(
                 f"action_space={self.action_space}: this policy answers with {robot.action.space}, "

@@ -46,6 +46,8 @@ def replay(
         views = {view: source.frames(episode, indices, view) for view in policy.embodiment.camera_names}
         executed = indices[indices >= start]
         actions = source.actions(episode)[np.maximum(executed - 1, 0)]
+        if source.robot.action.frames is None:
+            actions = source.past_actions(episode, step, len(actions))
         running.observe(views, source.states(episode, seen, step + 1), indices < start, actions)
         seen = step + 1
         if text is not None:
