@@ -8,6 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mme_vla.embodiment import Embodiment
     from mme_vla.errors import UserError
     from mme_vla.memory.base import Memory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 # Names are loaded on first use, so that importing the package costs nothing and needs no optional dependency.
 _HOME = {
     "build_policy": "mme_vla.policy.build",
+    "Embodiment": "mme_vla.embodiment",
     "MMEPolicy": "mme_vla.policy.mme",
     "Episode": "mme_vla.policy.mme",
     "Memory": "mme_vla.memory.base",
@@ -47,6 +49,7 @@ __all__ = [
     "TASKS",
     "Batch",
     "CachedHistory",
+    "Embodiment",
     "Episode",
     "History",
     "HistoryTokens",

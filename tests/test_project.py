@@ -17,7 +17,8 @@ PACKAGE = REPOSITORY / "mme_vla"
 ROOMS = [
     "play", "loading", "testing", "evaluation", "serving", "training", "data", "envs", "weights", "build", "policy",
     "saving", "episode", "subgoal", "finetune", "card", "processing", "integration", "memory", "backbone",
-    "config", "config_errors", "hub", "pretrained", "naming", "types", "registry", "devices", "files", "errors",
+    "config", "config_errors", "hub", "pretrained", "naming", "embodiment", "types",
+    "registry", "devices", "files", "errors",
 ]  # fmt: skip
 
 

@@ -12,6 +12,8 @@ import numpy as np
 from mme_vla.errors import UserError
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
+POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
+"""Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
 _REQUIRED = (
     "obs/front_rgb", "obs/wrist_rgb", "obs/joint_state", "obs/gripper_state", "action/joint_action",
     "info/is_video_demo", "info/is_completed", *(f"info/{name}" for name in SUBGOALS),
@@ -81,6 +83,16 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     return refs
 
 
+def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
+    """The columns of `POSE_ACTIONS` that every one of these episodes has."""
+    files = {file: [ref.group for ref in refs if ref.file == file] for file in dict.fromkeys(ref.file for ref in refs)}
+    found = set(POSE_ACTIONS)
+    for file, groups in files.items():
+        with _open(file) as handle:
+            found = {n for n in found if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
+    return tuple(name for name in POSE_ACTIONS if name in found)
+
+
 class RawEpisode:
     """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
 
@@ -139,6 +151,21 @@ class RawEpisode:
         angles = [np.asarray(self._step(k, "obs/joint_state"))[:7] for k in range(self.length)]
         targets = [np.asarray(self._step(k, "action/joint_action"))[:7] for k in range(self.length)]
         return np.stack(angles), np.stack(targets)
+
+    def pose_actions(self, column: str) -> np.ndarray:
+        """A column of `POSE_ACTIONS`, [t, 7] float32.
+
+        Of waypoints, which are noted when a motion begins: the one under way, and before the first one of the video
+        or the execution that first one; a part without any is one motion to where it ends.
+        """
+        rows = np.stack([np.asarray(self._step(k, POSE_ACTIONS[column]), np.float32) for k in range(self.length)])
+        for part in (slice(0, self.exec_start), slice(self.exec_start, self.length)):
+            unknown: np.ndarray = ~np.isfinite(rows[part]).all(axis=1)
+            if part.stop > part.start and unknown.all():
+                rows[part] = np.asarray(self._step(part.stop - 1, POSE_ACTIONS["ee_pose_actions"]), np.float32)
+            elif unknown.any():
+                rows[part][unknown] = rows[part][~unknown][0]
+        return rows
 
     def front(self, step: int) -> np.ndarray:
         """The front picture of one step, [H, W, 3] uint8."""

@@ -15,6 +15,8 @@ from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.backbone import Pi05Backbone, initialise
 from mme_vla.backbone.pi05.gemma import Conditioning, Hook, KVCache, Layout
 from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import Memory
@@ -77,6 +79,7 @@ class MMEPolicy(Saved):
         sizes = dict(config["backbone"])
         backbone_cls = BACKBONES[sizes.pop("name")]
         backbone_config = BackboneConfig.from_dict(sizes)
+        embodiment_of(config)  # a robot that does not fit is told before anything is built
         integration = _construct(INTEGRATIONS, config.get("integration"), backbone_config) or Integration(
             backbone_config
         )
@@ -95,6 +98,11 @@ class MMEPolicy(Saved):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
         return cls(backbone, memory, integration, processor, config, **config.get("policy", {}))
+
+    @property
+    def embodiment(self) -> Embodiment:
+        """The robot this policy is for."""
+        return embodiment_of(self.config) if self.processor is None else self.processor.embodiment
 
     @property
     def device(self) -> torch.device:
@@ -165,10 +173,9 @@ class MMEPolicy(Saved):
     def _views(self, batch: Batch) -> Tensor:
         from mme_vla.processing.augment import augment_views
         from mme_vla.processing.pictures import to_unit_range
-        from mme_vla.types import VIEWS
 
         images = to_unit_range(batch.images)
-        return augment_views(images, VIEWS) if self.training and self.augment else images
+        return augment_views(images, self.embodiment.augmentations) if self.training and self.augment else images
 
     # Sampling
 
@@ -224,16 +231,16 @@ class MMEPolicy(Saved):
         """Choose the next chunk for many episodes in one batch, adding nothing to their memories.
 
         Returns:
-            float32 [n, h, 8]: absolute joint targets and gripper commands.
+            float32 [n, h, w]: the embodiment's actions, absolute.
         """
         if not episodes:
-            return np.zeros((0, self.backbone.config.horizon, 8), np.float32)
+            return np.zeros((0, self.backbone.config.horizon, self.embodiment.action.width), np.float32)
         processor = self.require_processor()
         processor.require_stats()  # before any episode's noise or memory moves on
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),
-            image_mask=torch.ones(len(episodes), len(processor.views), dtype=torch.bool),
+            image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
         )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.training.checkpoint import checkpoints_in, read_state, resolve_checkpoint, step_of
 
@@ -55,7 +56,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     if checkpoint is None:
         return Run(folder)
     state = read_state(checkpoint)
-    changed = differing_keys(state["config"], config)
+    then, now = ({**c, "embodiment": embodiment_of(c).to_dict()} for c in (state["config"], config))
+    changed = differing_keys(then, now)
     if changed:
         lines = "\n".join(f"  {key}: {old!r} then, {new!r} now" for key, (old, new) in changed.items())
         raise UserError(
