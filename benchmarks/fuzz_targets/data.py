@@ -90,7 +90,7 @@ def read_dataset(folder: Path) -> object:
         steps = range(int(source.lengths[e]))
         read += [source.goal(e), source.task(e), source.states(e), source.actions(e)]
         read += [sorted(source.subgoals(e, t).items()) for t in steps]
-        read += [source.frames(e, list(steps), view) for view in ("image", "wrist_image")]
+        read += [source.frames(e, list(steps), view) for view in source.columns]
     return digest(*read)
 
 

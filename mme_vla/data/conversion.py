@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, find_files, list_episodes, open_episode
+from mme_vla.data.hdf5 import (
+    SUBGOALS,
+    EpisodeRef,
+    RawEpisode,
+    find_files,
+    list_episodes,
+    open_episode,
+    pose_columns,
+)
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json
@@ -53,8 +61,11 @@ class ConvertOptions:
             raise UserError(f"fps={self.fps} and video.gop={self.gop} must be positive.")
 
 
-def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
-    """The dataset's columns, under the names of the released LeRobot datasets."""
+def features(
+    shape: tuple[int, int, int], options: ConvertOptions, poses: Sequence[str] = ()
+) -> dict[str, dict[str, Any]]:
+    """The dataset's columns, under the names of the released LeRobot datasets; `poses` are the tool's, beside them."""
+    tool = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
     joints = [*(f"joint{i}" for i in range(1, 8)), "gripper"]
     kind = "video" if options.images == "video" else "image"
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
@@ -63,6 +74,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "wrist_image": dict(view),
         "state": {"dtype": "float32", "shape": (8,), "names": joints},
         "actions": {"dtype": "float32", "shape": (8,), "names": joints},
+        **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in poses},
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
@@ -83,7 +95,8 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     options = options or ConvertOptions()
     if not episodes:
         raise UserError("There is no episode to convert.")
-    plan = _plan(episodes, options)
+    poses = pose_columns(episodes)
+    plan = _plan(episodes, options, poses)
     partial = output.with_name(output.name + ".partial")
     if _finished(output, plan) and not partial.exists():
         return 0
@@ -91,10 +104,10 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
         if _finished(output, plan):  # asked again: another process may have finished it meanwhile
             drop_plan(partial)
             return 0
-        return _convert(episodes, output, partial, plan, options)
+        return _convert(episodes, output, partial, plan, options, poses)
 
 
-def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
+def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions, poses: Sequence[str]) -> dict[str, Any]:
     """What decides the result. Reading whole files takes a small part of what converting them takes."""
     files = list(dict.fromkeys(ref.file for ref in episodes))
     with progress("read", sum(file.stat().st_size for file in files), unit="bytes") as advance:
@@ -106,11 +119,16 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
         {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
         for ref in episodes
     ]
-    return {"options": asdict(options), "episodes": origins}
+    return {"options": asdict(options), "episodes": origins} | ({"poses": list(poses)} if poses else {})
 
 
 def _convert(
-    episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
+    episodes: Sequence[EpisodeRef],
+    output: Path,
+    partial: Path,
+    plan: dict[str, Any],
+    options: ConvertOptions,
+    poses: Sequence[str],
 ) -> int:
     _claim(partial, plan)
     names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
@@ -118,7 +136,7 @@ def _convert(
     missing = [i for i, part in enumerate(parts) if not part.is_dir()]
     with progress("convert", len(parts), len(parts) - len(missing), "episodes") as advance:
         for i in missing:
-            _write_part(episodes[i], parts[i], options)
+            _write_part(episodes[i], parts[i], options, poses)
             advance(1)
     _merge(parts, partial / _MERGED, plan)
     (partial / _MERGED).rename(output)
@@ -157,12 +175,12 @@ def _claim(partial: Path, plan: dict[str, Any]) -> None:
     (partial / _PARTS).mkdir(exist_ok=True)
 
 
-def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
+def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions, poses: Sequence[str]) -> None:
     """Write one episode as a dataset of its own; `part` appears only when it is whole."""
     draft = part.parent.parent / "writing"
     shutil.rmtree(draft, ignore_errors=True)
     with open_episode(ref) as episode:
-        _write_dataset(episode, draft, options)
+        _write_dataset(episode, draft, options, poses)
         side = {
             "task": ref.task,
             "source_file": ref.file.name,
@@ -177,12 +195,13 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
     draft.rename(part)
 
 
-def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> None:
+def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions, poses: Sequence[str]) -> None:
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = None
     goal = episode.goals[0]
+    tool = {name: episode.pose_actions(name) for name in poses}
     for step, frame in enumerate(episode):
         if dataset is None:
             video = options.images == "video"
@@ -190,7 +209,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
             dataset = LeRobotDataset.create(
                 repo_id=f"local/{episode.ref.task}",
                 fps=options.fps,
-                features=features(frame.front.shape, options),
+                features=features(frame.front.shape, options, poses),
                 root=root,
                 robot_type="panda",
                 use_videos=video,
@@ -208,6 +227,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 "wrist_image": frame.wrist,
                 "state": frame.state,
                 "actions": frame.action.astype(np.float32),
+                **{name: rows[step] for name, rows in tool.items()},
                 **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
                 **frame.subgoals,
                 "task": goal,

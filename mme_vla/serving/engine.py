@@ -65,7 +65,7 @@ class Engine:
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
-        """The next chunk [h, 8] of an episode, chosen in one batch with whoever waits at the same time."""
+        """The next chunk [h, w] of an episode, chosen in one batch with whoever waits at the same time."""
         chunk: np.ndarray = await self._join(self.turns.acting, episode)
         return chunk
 

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1  # of the files below
 PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
-MEMORY_VIEW = "image"
 FINGERPRINT = "fingerprint.json"
 COMMAND = "python -m mme_vla.data.cache model=<model> data=<data>"
 DTYPES = {"bfloat16": np.uint16, "float32": np.float32}  # bfloat16 is stored as its bits
@@ -61,7 +60,7 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
         "format": FORMAT,
         "encoder": encoder,
         "preprocessing": PREPROCESSING,
-        "view": MEMORY_VIEW,
+        "view": source.columns[source.robot.memory_camera],
         "dtype": dtype,
         "storage": spec.to_dict(),
         "dataset": {"content": source.fingerprint, "episodes": len(source), "frames": int(source.lengths.sum())},
@@ -285,7 +284,7 @@ def run(cfg: "DictConfig") -> None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
     encoder, dtype = policy.vision_fingerprint(), str(policy.history_dtype).removeprefix("torch.")
     root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
-    for source in open_sources(cfg.data.sources):
+    for source in open_sources(cfg.data.sources, policy.embodiment):
         expected = fingerprint(source, memory.storage, encoder, dtype)
         folder = cache_folder(root, source, expected)
         if cfg.dry_run:
