@@ -13,6 +13,7 @@ from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
+from mme_vla.files import SUMS
 from mme_vla.processing.processor import Processor
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 
@@ -82,6 +83,7 @@ def test_a_checkpoint_written_before_robots_could_be_chosen_is_the_panda(tmp_pat
     policy = build_policy("pi05", backbone=TINY)
     policy.require_processor().stats = unit_stats()
     policy.save_pretrained(tmp_path)
+    (tmp_path / SUMS).unlink()
     file = tmp_path / "config.json"
     config = json.loads(file.read_text())
     assert config.pop("embodiment")["name"] == "robomme_joint"

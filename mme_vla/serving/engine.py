@@ -116,7 +116,7 @@ class Engine:
                 waiting.future.set_result(chunk)
 
     def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
-        """Chunks [h, 8], or why there is none. Where a batch fails each is tried alone, so that none fails another."""
+        """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that none fails another."""
         noise = [episode.noise_state for episode in episodes]
         try:
             return list(self.policy.act(episodes, self.flow_steps))

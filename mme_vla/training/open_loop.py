@@ -10,7 +10,7 @@ import torch
 
 from mme_vla.backbone.base import stack_draws
 from mme_vla.data.dataset import TrainingDataset, collate
-from mme_vla.embodiment import ActionSpace
+from mme_vla.embodiment import ActionSpace, Embodiment
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
 
@@ -22,8 +22,8 @@ class OpenLoop:
     steps: [n] frames they start at. predicted, recorded: [n, h, w] absolute actions of the robot's `space`.
     valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99) range of each
         dimension; 1 where it never changes.
-    still: [n, w] the state held, which a policy that does not move would answer; None where actions and state are of
-        different kinds.
+    still: [n, w] the state held, which a policy that does not move would answer; None where an action is not a state
+        to come.
     """
 
     title: str
@@ -90,9 +90,14 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
         scale=np.where(half_range > 0, half_range, 1),
-        still=np.stack([step.state for step in recorded]) if processor.embodiment.action.relative else None,
+        still=np.stack([step.state for step in recorded]) if _held_by_state(processor.embodiment) else None,
         space=processor.embodiment.action,
     )
+
+
+def _held_by_state(robot: Embodiment) -> bool:
+    """Whether the state, given as the action, holds the robot still."""
+    return bool(robot.action.relative) and robot.action.width == robot.state.width
 
 
 def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
