@@ -173,7 +173,7 @@ def test_damaged_and_missing_videos_are_named(copy: Path) -> None:
     with pytest.raises(UserError, match=r"file-000.mp4 holds no picture at 42.650 s"):
         EpisodeSource(copy).frames(3, [200])
     video.write_bytes(b"no video at all")
-    with pytest.raises(UserError, match=r"file-000.mp4 cannot be decoded"):
+    with pytest.raises(UserError, match=r"file-000.mp4 is damaged: it cannot be read as a video"):
         EpisodeSource(copy).frames(0, [0])
     video.unlink()
     with pytest.raises(UserError, match=r"^[^ ]*file-000.mp4 is missing"):

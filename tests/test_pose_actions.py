@@ -124,7 +124,7 @@ def test_a_rollout_of_motions_remembers_every_frame_and_asks_after_each_motion()
     envs = MotionEnvs(robot=policy.embodiment)
     job = Job("VideoUnmask", "test", 1)
     (record,) = roll(policy, [job], envs, max_steps=FACTS.max_steps)
-    assert record.outcome == "timeout" and record.steps % 3 == 0
+    assert record.outcome == "timeout" and record.steps % 3 == 0 and record.action_space == "waypoint"
     assert record.extra["chunks"] == record.steps // 3, "one motion of a chunk is executed, then the policy is asked"
     assert {action[6] for action in envs.made[job].actions} <= {-1.0, 1.0}, "the gripper is opened or closed, no less"
 

@@ -177,5 +177,5 @@ def test_acting_without_statistics_is_refused_before_anything_moves(policy, fram
             policy.act([episode])
     finally:
         policy.processor.stats = stats
-    untouched = policy.start_episode(episode.goal, seed=0).draw_noise()
-    assert torch.equal(episode.draw_noise(), untouched)
+    untouched = policy.start_episode(episode.goal, seed=0).noise_state
+    assert torch.equal(episode.noise_state, untouched)

@@ -24,6 +24,7 @@ from mme_vla.data.cache import store as cache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.envs.vector.jobs import Job
+from mme_vla.memory.history import StorageSpec
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 
 EXAMPLE = REPOSITORY / "examples" / "bimanual"
@@ -141,6 +142,11 @@ def test_columns_are_found_in_both_spellings_joined_or_by_name(place: Path) -> N
         EpisodeSource("demonstrations", robot=Embodiment.from_dict({**plain.to_dict(), "action": {"width": 7}}))
     with pytest.raises(UserError, match=r"lacks the features image, wrist_image.*choose embodiment="):
         EpisodeSource("demonstrations")
+    hand = EpisodeSource(
+        "demonstrations", robot=Embodiment.from_dict({**plain.to_dict(), "memory_camera": "left_wrist"})
+    )
+    places = [cache.cache_folder(place, s, cache.fingerprint(s, StorageSpec(4), "encoder")) for s in (found, hand)]
+    assert places[0] != places[1], "tokens of two cameras lie beside each other"
     video = Embodiment.from_dict({**plain.to_dict(), "conditioning_video": True})
     with pytest.raises(UserError, match="does not mark its conditioning videos"):
         EpisodeSource("demonstrations", robot=video)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment import fields
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 
 _KEYS = (
     "key", "space", "width", "names", "units", "relative", "angles", "binary", "horizon", "execute", "frames",
@@ -58,9 +58,7 @@ class ActionSpace:
             raise UserError(f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer.")
         frames = found.get("frames", 1)
         if frames not in (1, None):
-            raise UserError(f"{where}.frames={frames!r}: expected 1, or null where an action is one planned motion.")
-        angles = {int(place): float(centre) for place, centre in (found.get("angles") or {}).items()}
-        fields.places(list(angles), f"{where}.angles", width)
+            raise UserError(f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion.")
         return cls(
             width=width,
             key=fields.columns(found.get("key"), f"{where}.key"),
@@ -68,7 +66,7 @@ class ActionSpace:
             names=fields.words(found.get("names"), f"{where}.names", width, [f"number {i + 1}" for i in range(width)]),
             units=fields.words(found.get("units"), f"{where}.units", width, [""] * width),
             relative=fields.places(found.get("relative"), f"{where}.relative", min(width, state_width)),
-            angles=angles,
+            angles=fields.centres(found.get("angles"), f"{where}.angles", width),
             binary=fields.places(found.get("binary"), f"{where}.binary", width),
             horizon=horizon,
             execute=execute,

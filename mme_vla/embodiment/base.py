@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from mme_vla.embodiment import fields
 from mme_vla.embodiment.actions import ActionSpace
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.errors import UserError, brief, did_you_mean
 
 AUGMENTATIONS = ("all", "colour", "none")
 _KEYS = ("name", "cameras", "memory_camera", "state", "action", "fps", "conditioning_video")
@@ -75,14 +75,14 @@ class Embodiment:
         memory_camera = found.get("memory_camera") or names[0]
         if memory_camera not in names:
             near = did_you_mean(str(memory_camera), names)
-            raise UserError(f"embodiment.memory_camera={memory_camera!r} is none of the cameras. {near}")
+            raise UserError(f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}")
         state = fields.section(found["state"], "embodiment.state", ("key", "width"), required=("width",))
         width = fields.whole(state["width"], "embodiment.state.width")
         fps, video = found.get("fps"), found.get("conditioning_video", False)
-        if fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not fps > 0):
-            raise UserError(f"embodiment.fps must be a positive number or null, got {fps!r}.")
+        if fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000):
+            raise UserError(f"embodiment.fps must be a positive number to 1000 or null, got {brief(fps)}.")
         if not isinstance(video, bool):
-            raise UserError(f"embodiment.conditioning_video must be true or false, got {video!r}.")
+            raise UserError(f"embodiment.conditioning_video must be true or false, got {brief(video)}.")
         return cls(
             name=str(found["name"]),
             cameras=cameras,
@@ -130,15 +130,17 @@ class Embodiment:
 
 def _cameras(given: Any) -> tuple[Camera, ...]:
     if not isinstance(given, Mapping) or not given:
-        raise UserError(f"embodiment.cameras must name at least one camera with its settings, got {given!r}.")
+        raise UserError(f"embodiment.cameras must name at least one camera with its settings, got {brief(given)}.")
     cameras = []
     for name, settings in given.items():
         where = f"embodiment.cameras.{name}"
         found = fields.section(settings or {}, where, ("key", "augment"))
         augment, key = found.get("augment", "all"), found.get("key")
         if augment not in AUGMENTATIONS:
-            raise UserError(f"{where}.augment={augment!r}. {did_you_mean(str(augment), AUGMENTATIONS)}")
+            raise UserError(f"{where}.augment={brief(augment)}. {did_you_mean(str(augment), AUGMENTATIONS)}")
         if key is not None and not isinstance(key, str):
-            raise UserError(f"{where}.key must be a column of the dataset, got {key!r}.")
+            raise UserError(f"{where}.key must be a column of the dataset, got {brief(key)}.")
+        if name == "state":
+            raise UserError(f"{where}: the state goes under this name in messages; call the camera something else.")
         cameras.append(Camera(str(name), key, augment))
     return tuple(cameras)

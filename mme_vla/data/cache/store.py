@@ -17,6 +17,7 @@ import torch
 
 from mme_vla.config.devices import find_device
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError, brief
 from mme_vla.files import FolderLock, Sums, decoding, read_json, require_file
 from mme_vla.memory.base import Memory
@@ -68,11 +69,13 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
 
 
 def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) -> Path:
-    """The folder of a cache below `root`: readable, and another one for another dataset, encoder or pooling."""
+    """The folder of a cache below `root`: readable, and another one for another dataset, encoder, pooling or camera."""
     spec = StorageSpec(**expected["storage"])
     scorer = f"-{spec.scorer}" if spec.scorer else ""
     encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
-    name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}-{encoder}"
+    # RoboMME's memory camera goes without saying, as in caches that were built before there were others.
+    view = "" if expected["view"] == ROBOMME_JOINT.cameras[0].key else f"-{expected['view']}"
+    name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
 

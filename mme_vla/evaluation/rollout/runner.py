@@ -194,8 +194,10 @@ class Rollout:
         if outcome == "error":
             error = error or f"the environment ended the episode with the status {status!r}"
         spec = metadata.episode(job.task, job.split, job.episode)
+        robot = self.policy.embodiment
         record = EpisodeRecord(
-            **vars(self.facts), task=job.task, episode=job.episode, seed=spec.seed, difficulty=spec.difficulty,
+            **vars(self.facts), action_space=robot.action.space or robot.name, task=job.task, episode=job.episode,
+            seed=spec.seed, difficulty=spec.difficulty,
             outcome=outcome, steps=running.steps, seconds=running.seconds, error=error if outcome == "error" else None,
             extra={
                 "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
