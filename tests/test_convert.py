@@ -77,7 +77,7 @@ def test_an_interrupted_conversion_continues_with_the_missing_episodes(tmp_path:
     monkeypatch.setattr(
         convert_module,
         "_write_part",
-        lambda ref, part, *how: (written.append(part.name), write(ref, part, *how)),
+        lambda ref, part, options: (written.append(part.name), write(ref, part, options)),
     )
     assert convert(refs, tmp_path / "out", PNG) == 2
     assert written == ["000001-Alpha-episode_1", "000002-Beta-episode_0"]

@@ -11,7 +11,7 @@ and the next run continues with the missing ones.
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,6 +45,7 @@ class ConvertOptions:
     fps: frames per second; 20 is the simulator's control rate.
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
+    poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
     """
 
     images: str = "video"
@@ -53,6 +54,7 @@ class ConvertOptions:
     crf: int = 0
     pix_fmt: str = "yuv444p"
     gop: int = 8
+    poses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.images not in ("video", "png"):
@@ -61,10 +63,8 @@ class ConvertOptions:
             raise UserError(f"fps={self.fps} and video.gop={self.gop} must be positive.")
 
 
-def features(
-    shape: tuple[int, int, int], options: ConvertOptions, poses: Sequence[str] = ()
-) -> dict[str, dict[str, Any]]:
-    """The dataset's columns, under the names of the released LeRobot datasets; `poses` are the tool's, beside them."""
+def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
+    """The dataset's columns, under the names of the released LeRobot datasets."""
     tool = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
     joints = [*(f"joint{i}" for i in range(1, 8)), "gripper"]
     kind = "video" if options.images == "video" else "image"
@@ -74,7 +74,7 @@ def features(
         "wrist_image": dict(view),
         "state": {"dtype": "float32", "shape": (8,), "names": joints},
         "actions": {"dtype": "float32", "shape": (8,), "names": joints},
-        **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in poses},
+        **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
@@ -92,11 +92,10 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
         UserError: `output` holds something else, a partial run had other episodes or options, another process converts
             into it, or an episode is damaged. Nothing that exists is overwritten.
     """
-    options = options or ConvertOptions()
     if not episodes:
         raise UserError("There is no episode to convert.")
-    poses = pose_columns(episodes)
-    plan = _plan(episodes, options, poses)
+    options = replace(options or ConvertOptions(), poses=pose_columns(episodes))
+    plan = _plan(episodes, options)
     partial = output.with_name(output.name + ".partial")
     if _finished(output, plan) and not partial.exists():
         return 0
@@ -104,10 +103,10 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
         if _finished(output, plan):  # asked again: another process may have finished it meanwhile
             drop_plan(partial)
             return 0
-        return _convert(episodes, output, partial, plan, options, poses)
+        return _convert(episodes, output, partial, plan, options)
 
 
-def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions, poses: Sequence[str]) -> dict[str, Any]:
+def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
     """What decides the result. Reading whole files takes a small part of what converting them takes."""
     files = list(dict.fromkeys(ref.file for ref in episodes))
     with progress("read", sum(file.stat().st_size for file in files), unit="bytes") as advance:
@@ -119,16 +118,12 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions, poses: Sequen
         {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
         for ref in episodes
     ]
-    return {"options": asdict(options), "episodes": origins} | ({"poses": list(poses)} if poses else {})
+    settings = {key: value for key, value in asdict(options).items() if key != "poses"}  # as plans from before had it
+    return {"options": settings, "episodes": origins} | ({"poses": list(options.poses)} if options.poses else {})
 
 
 def _convert(
-    episodes: Sequence[EpisodeRef],
-    output: Path,
-    partial: Path,
-    plan: dict[str, Any],
-    options: ConvertOptions,
-    poses: Sequence[str],
+    episodes: Sequence[EpisodeRef], output: Path, partial: Path, plan: dict[str, Any], options: ConvertOptions
 ) -> int:
     _claim(partial, plan)
     names = [f"{i:06d}-{ref.task}-{ref.group}" for i, ref in enumerate(episodes)]
@@ -136,7 +131,7 @@ def _convert(
     missing = [i for i, part in enumerate(parts) if not part.is_dir()]
     with progress("convert", len(parts), len(parts) - len(missing), "episodes") as advance:
         for i in missing:
-            _write_part(episodes[i], parts[i], options, poses)
+            _write_part(episodes[i], parts[i], options)
             advance(1)
     _merge(parts, partial / _MERGED, plan)
     (partial / _MERGED).rename(output)
@@ -175,12 +170,12 @@ def _claim(partial: Path, plan: dict[str, Any]) -> None:
     (partial / _PARTS).mkdir(exist_ok=True)
 
 
-def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions, poses: Sequence[str]) -> None:
+def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
     """Write one episode as a dataset of its own; `part` appears only when it is whole."""
     draft = part.parent.parent / "writing"
     shutil.rmtree(draft, ignore_errors=True)
     with open_episode(ref) as episode:
-        _write_dataset(episode, draft, options, poses)
+        _write_dataset(episode, draft, options)
         side = {
             "task": ref.task,
             "source_file": ref.file.name,
@@ -195,13 +190,13 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions, poses: Seq
     draft.rename(part)
 
 
-def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions, poses: Sequence[str]) -> None:
+def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> None:
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     dataset = None
     goal = episode.goals[0]
-    tool = {name: episode.pose_actions(name) for name in poses}
+    tool = {name: episode.pose_actions(name) for name in options.poses}
     for step, frame in enumerate(episode):
         if dataset is None:
             video = options.images == "video"
@@ -209,7 +204,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions, pos
             dataset = LeRobotDataset.create(
                 repo_id=f"local/{episode.ref.task}",
                 fps=options.fps,
-                features=features(frame.front.shape, options, poses),
+                features=features(frame.front.shape, options),
                 root=root,
                 robot_type="panda",
                 use_videos=video,
