@@ -44,7 +44,7 @@ def measure(root: Path, model: str, items: int, caches: Path) -> tuple[int, floa
     import torch
 
     from mme_vla import build_policy
-    from mme_vla.data.cache.store import ensure_cache
+    from mme_vla.data.cache.ensure import ensure_cache
     from mme_vla.data.dataset import TrainingDataset
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.data.statistics import compute_norm_stats

@@ -61,8 +61,8 @@ def _train(inputs: Path, folder: Path) -> None:
 
 
 def _cache(inputs: Path, folder: Path) -> None:
+    from mme_vla.commands.cache import main as run
     from mme_vla.config.composition import compose
-    from mme_vla.data.cache.store import run
 
     run(compose("cache", [*SMALL, f"data.cache.root={folder}", "device=cpu"]))
 
@@ -75,8 +75,8 @@ def _write_demonstrations(folder: Path) -> None:
 
 
 def _convert(inputs: Path, folder: Path) -> None:
+    from mme_vla.commands.convert import main as run
     from mme_vla.config.composition import compose
-    from mme_vla.data.conversion import run
 
     run(compose("convert", [f"input={inputs}", f"output={folder / 'dataset'}"]))
 

@@ -11,12 +11,12 @@ from h5_files import write_file
 
 from mme_vla.data.cache import building as cache_build
 from mme_vla.data.cache.building import build_cache, clear_cache, estimate
+from mme_vla.data.cache.ensure import ensure_cache
 from mme_vla.data.cache.store import (
     FINGERPRINT,
     CacheMissingError,
     VisionCache,
     cache_folder,
-    ensure_cache,
     fingerprint,
     score_file,
     token_file,

@@ -55,16 +55,16 @@ def test_help_names_the_files_of_a_group_and_own_ones_too(tmp_path: Path) -> Non
 
 
 def test_help_under_a_choice_shows_its_keys() -> None:
-    text = ask("mme_vla.commands.train", "--help", "model=framesamp_modul")
+    text = ask("mme_vla.train", "--help", "model=framesamp_modul")
     assert text.startswith("Usage: python -m mme_vla.train ")
     assert "memory=framesamp\n" in text
     assert re.search(r"integration.num_heads=4 +query heads", text)
-    assert "Did you mean 'framesamp_modul'" in ask("mme_vla.commands.train", "--help", "model=framesamp_modl", code=2)
+    assert "Did you mean 'framesamp_modul'" in ask("mme_vla.train", "--help", "model=framesamp_modl", code=2)
 
 
 def test_help_needs_no_torch() -> None:
     watch = "import sys, runpy; sys.argv = ['x', '--help']\n" \
-            "try: runpy.run_module('mme_vla.commands.train', run_name='__main__')\n" \
+            "try: runpy.run_module('mme_vla.train', run_name='__main__')\n" \
             "except SystemExit: pass\nprint('torch' in sys.modules, file=sys.stderr)"  # fmt: skip
     done = subprocess.run([sys.executable, "-c", watch], capture_output=True, text=True, cwd=REPOSITORY)
     assert done.stderr.split()[-1] == "False", done.stderr
@@ -73,9 +73,9 @@ def test_help_needs_no_torch() -> None:
 @pytest.mark.parametrize(
     ("module", "words", "said"),
     [
-        ("mme_vla.commands.train", ["--steps", "10"], "There is no option '--steps'.*write train.steps=10"),
-        ("mme_vla.commands.train", ["--learning-rate=1"], "There is no option '--learning-rate=1'"),
-        ("mme_vla.commands.evaluate", ["--max-steps=9", "tasks=all"], "write max_steps=9"),
+        ("mme_vla.train", ["--steps", "10"], "There is no option '--steps'.*write train.steps=10"),
+        ("mme_vla.train", ["--learning-rate=1"], "There is no option '--learning-rate=1'"),
+        ("mme_vla.evaluate", ["--max-steps=9", "tasks=all"], "write max_steps=9"),
     ],
 )
 def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(

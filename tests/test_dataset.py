@@ -11,7 +11,8 @@ from fakes import LastFrames, encode, same
 from h5_files import Recorded, write_file
 from torch.utils.data import DataLoader
 
-from mme_vla.data.cache.store import VisionCache, ensure_cache
+from mme_vla.data.cache.ensure import ensure_cache
+from mme_vla.data.cache.store import VisionCache
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset, collate
 from mme_vla.data.episodes import EpisodeSource

@@ -52,9 +52,9 @@ def test_own_memory_trains_through_the_same_command(tmp_path, monkeypatch):
     brief = ["train.steps=2", "train.val_samples=2", "train.open_loop_chunks=1", "train.workers=0", "logger=none"]
     options = ["model=last_frames_context", *small, *brief, f"hydra.run.dir={tmp_path / 'run'}"]
     # As `python -m mme_vla.train` would, in a process that has imported the large packages already.
-    monkeypatch.setattr(sys, "argv", ["mme_vla.commands.train", "--config-dir", str(EXAMPLE / "configs"), *options])
+    monkeypatch.setattr(sys, "argv", ["mme_vla.train", "--config-dir", str(EXAMPLE / "configs"), *options])
     monkeypatch.syspath_prepend(EXAMPLE)
     monkeypatch.chdir(EXAMPLE)
-    monkeypatch.delitem(sys.modules, "mme_vla.commands.train", raising=False)
-    runpy.run_module("mme_vla.commands.train", run_name="__main__", alter_sys=True)
+    monkeypatch.delitem(sys.modules, "mme_vla.train", raising=False)
+    runpy.run_module("mme_vla.train", run_name="__main__", alter_sys=True)
     assert list((tmp_path / "run").rglob("model.safetensors"))

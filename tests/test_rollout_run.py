@@ -291,4 +291,4 @@ def test_the_command_evaluates_a_checkpoint_in_the_simulator(checkpoint: Path, t
     assert (record.model, record.checkpoint, record.model_seed) == ("framesamp_modul", 3, 7)
     assert (record.outcome, record.steps, record.memory_budget) == ("timeout", 17, 64)
     assert record.seconds.sim > 0 and record.seconds.policy > 0
-    assert "timeout" in done.stdout and "mme_vla.commands.results" in done.stderr
+    assert "timeout" in done.stdout and "mme_vla.results" in done.stderr

@@ -7,7 +7,7 @@ import numpy as np
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, open_episode
 from mme_vla.data.layout import SAMPLE
-from mme_vla.data.sample import EPISODES
+from mme_vla.data.shipped_sample import EPISODES
 
 
 def test_the_sample_is_small_and_documented() -> None:

@@ -21,7 +21,7 @@ from mme_vla.subgoal.finetuning.examples import (
 )
 from mme_vla.subgoal.finetuning.media import read_image
 from mme_vla.subgoal.finetuning.rows import RowOptions
-from mme_vla.subgoal.finetuning.training import accumulation, find_checkpoint, run
+from mme_vla.subgoal.finetuning.training import accumulation, find_checkpoint, fine_tune
 from mme_vla.subgoal.models.qwen3vl import VLM
 
 pytest.importorskip("peft", reason="needs the extra vlm")
@@ -125,18 +125,18 @@ def test_damaged_rows_and_missing_pictures_are_named(tmp_path, data):
 
 
 def test_the_whole_path_learns_resumes_and_predicts(data, tmp_path):
-    straight = run(settings(data, tmp_path / "straight"))
+    straight = fine_tune(settings(data, tmp_path / "straight"))
     found = losses(tmp_path / "straight")
     assert np.mean(found[-5:]) < 0.5 * found[0], found
     with pytest.raises(UserError, match="resume=auto"):
-        run(settings(data, tmp_path / "straight"))
+        fine_tune(settings(data, tmp_path / "straight"))
 
     halved = tmp_path / "halved"
     assert find_checkpoint(halved, "auto") is None
     (tmp_path / "straight" / "checkpoint-10").rename(tmp_path / "checkpoint-10")
     halved.mkdir()
     (tmp_path / "checkpoint-10").rename(halved / "checkpoint-10")
-    run(settings(data, halved, resume="auto"))
+    fine_tune(settings(data, halved, resume="auto"))
     assert losses(halved) == pytest.approx(found, rel=1e-4), "the resumed run ends as the straight one"
 
     subgoals = {}

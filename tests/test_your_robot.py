@@ -17,10 +17,11 @@ from rollout_stand_ins import InlineEnvs, roll
 from serving_fakes import Served
 
 from mme_vla import MMEPolicy, UserError, build_policy
+from mme_vla.commands import cache
 from mme_vla.commands.inspect import main as inspect_main
 from mme_vla.commands.train import train
 from mme_vla.config.composition import compose
-from mme_vla.data.cache import store as cache
+from mme_vla.data.cache.store import cache_folder, fingerprint
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.envs.vector.jobs import Job
@@ -145,7 +146,7 @@ def test_columns_are_found_in_both_spellings_joined_or_by_name(place: Path) -> N
     hand = EpisodeSource(
         "demonstrations", robot=Embodiment.from_dict({**plain.to_dict(), "memory_camera": "left_wrist"})
     )
-    places = [cache.cache_folder(place, s, cache.fingerprint(s, StorageSpec(4), "encoder")) for s in (found, hand)]
+    places = [cache_folder(place, s, fingerprint(s, StorageSpec(4), "encoder")) for s in (found, hand)]
     assert places[0] != places[1], "tokens of two cameras lie beside each other"
     video = Embodiment.from_dict({**plain.to_dict(), "conditioning_video": True})
     with pytest.raises(UserError, match="does not mark its conditioning videos"):

@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.commands.loading import load_policy, words_of
 from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.config.devices import find_device
+from mme_vla.config.variant import composition_digest
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.policy.variant import composition_digest
 
 if TYPE_CHECKING:
     import torch
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 # Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-logger = logging.getLogger("mme_vla.commands.evaluate")
+logger = logging.getLogger("mme_vla.evaluate")
 SUBGOAL_MODES = ("inline", "background")
 
 

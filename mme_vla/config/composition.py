@@ -34,8 +34,8 @@ from mme_vla.config import plugins
 from mme_vla.config.endings import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
+from mme_vla.config.variant import Sections, decisive, variant_name
 from mme_vla.errors import UserError
-from mme_vla.policy.variant import Sections, decisive, variant_name
 
 VERSION_BASE = "1.3"
 
@@ -124,7 +124,7 @@ def check_overrides(
 
 
 def name_variant(cfg: DictConfig, config_name: str, directory: Path, extra_dirs: Sequence[Path] = ()) -> None:
-    """Set `name` to what the composition is (`mme_vla.policy.variant`); a tree without models has no such name."""
+    """Set `name` to what the composition is (`mme_vla.config.variant`); a tree without models has no such name."""
     if {"name", "memory"} <= set(cfg):
         trees = (directory.resolve(), *(folder.resolve() for folder in extra_dirs))
         cfg.name = _true_name(cfg, config_name, trees)

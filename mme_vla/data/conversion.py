@@ -1,7 +1,5 @@
 """From official HDF5 demonstrations to one LeRobot v3.0 dataset.
 
-`python -m mme_vla.data.convert input=<files or folders> output=<new folder>`
-
 Every episode first becomes a complete small dataset of its own in `<output>.partial`, which is renamed when it is
 whole; at the end all of them are merged and the result is moved to `<output>` in one step. LeRobot's own writer keeps
 files open across episodes, so a killed run would leave files that cannot be read: here it leaves finished episodes,
@@ -13,25 +11,14 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import (
-    SUBGOALS,
-    EpisodeRef,
-    RawEpisode,
-    find_files,
-    list_episodes,
-    open_episode,
-    pose_columns,
-)
+from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json
-
-if TYPE_CHECKING:
-    from omegaconf import DictConfig
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
 _PARTS, _MERGED = "episodes", "merged"
@@ -258,26 +245,3 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
     episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
     (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
-
-
-def run(cfg: "DictConfig") -> None:
-    """Convert as configs/convert.yaml and the command line say."""
-    inputs = [cfg.input] if isinstance(cfg.input, str) else list(cfg.input)
-    episodes = list_episodes(find_files(inputs))
-    if cfg.episodes is not None:
-        episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
-    output = Path(cfg.output)
-    written = convert(episodes, output, ConvertOptions(images=cfg.images, fps=cfg.fps, **cfg.video))
-    already = len(episodes) - written
-    print(f"{output}: {len(episodes)} episodes ({written} written now, {already} already there).")
-
-
-def main() -> None:
-    """Run `python -m mme_vla.data.convert`."""
-    from mme_vla.config.composition import cli
-
-    cli("convert")(run)()
-
-
-if __name__ == "__main__":
-    main()

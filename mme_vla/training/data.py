@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.cache.store import COMMAND, ensure_cache
+from mme_vla.data.cache.ensure import ensure_cache
+from mme_vla.data.cache.store import COMMAND
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes

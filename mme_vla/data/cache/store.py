@@ -7,26 +7,22 @@ never replaced unless asked to.
 """
 
 import os
+import re
 from collections import OrderedDict
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
-from mme_vla.config.devices import find_device
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError, brief
-from mme_vla.files import FolderLock, Sums, decoding, read_json, require_file
-from mme_vla.memory.base import Memory
+from mme_vla.files import Sums, decoding, read_json, require_file
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
-
-    from mme_vla.data.cache.building import Encode
+    pass
 
 FORMAT = 1  # of the files below
 PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
@@ -74,7 +70,7 @@ def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) ->
     scorer = f"-{spec.scorer}" if spec.scorer else ""
     encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
     # RoboMME's memory camera goes without saying, as in caches that were built before there were others.
-    view = "" if expected["view"] == ROBOMME_JOINT.cameras[0].key else f"-{expected['view']}"
+    view = "" if expected["view"] == ROBOMME_JOINT.cameras[0].key else re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
     name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
@@ -224,104 +220,3 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
     if differing:
         details = "; ".join(f"{key} is {brief(found.get(key), 200)}, expected {expected[key]!r}" for key in differing)
         raise UserError(f"The vision cache {folder} is stale: {details}. Rebuild it with: {command} rebuild=true")
-
-
-def ensure_cache(
-    source: EpisodeSource,
-    memory: Memory,
-    encode: "Encode",
-    encoder: str,
-    *,
-    root: Path | str | None = None,
-    dtype: str = "bfloat16",
-    max_build_frames: int = 5000,
-    batch_size: int = 32,
-    command: str = COMMAND,
-) -> VisionCache:
-    """Open the cache of a dataset for this memory; build it first, or finish it, where the dataset is small.
-
-    Args:
-        source, memory: whose tokens. encode: `policy.encode_frames`. encoder: `policy.vision_fingerprint()`.
-        root: folder of all caches; None for `default_cache_root()`.
-        dtype: of the stored tokens. batch_size: frames encoded at once.
-        max_build_frames: datasets of more frames are not built here: that is worth a command of its own.
-        command: that command, for messages.
-
-    Raises:
-        UserError: the dataset is larger than that and its cache is not there, or the cache is stale or damaged.
-    """
-    from mme_vla.data.cache.building import build_cache
-
-    expected = fingerprint(source, memory.storage, encoder, dtype)
-    folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
-    try:
-        return VisionCache(folder, source, expected, command)
-    except CacheMissingError as error:
-        frames = int(source.lengths.sum())
-        if frames > max_build_frames:
-            raise UserError(
-                f"{error} (It is not built here because {source.name} has {frames} frames, more than "
-                f"data.cache.max_build_frames={max_build_frames}; add dry_run=true to see size and time first.)"
-            ) from None
-    # All of it here, also under torchrun, where training has its first process prepare the data for the others.
-    build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
-    return VisionCache(folder, source, expected, command)
-
-
-def run(cfg: "DictConfig") -> None:
-    """Build, or with dry_run only estimate, the caches that configs/cache.yaml and the command line describe."""
-    from mme_vla.data.cache.building import build_cache, clear_cache, estimate, process_rank
-    from mme_vla.data.sources import open_sources
-    from mme_vla.policy.build import build_from_config
-    from mme_vla.training.start import start_from, weights_to_start_from
-
-    if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
-        raise UserError("rebuild=true removes files that other processes write: run it once without torchrun first.")
-    init_from = weights_to_start_from(cfg.init_from)
-    policy = build_from_config(cfg, fresh_backbone=init_from is None)
-    if init_from is not None:
-        print(start_from(policy, init_from))
-    device = _device(cfg.device)
-    memory = policy.to(device).memory
-    if memory is None:
-        raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
-    encoder, dtype = policy.vision_fingerprint(), str(policy.history_dtype).removeprefix("torch.")
-    root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
-    for source in open_sources(cfg.data.sources, policy.embodiment):
-        expected = fingerprint(source, memory.storage, encoder, dtype)
-        folder = cache_folder(root, source, expected)
-        if cfg.dry_run:
-            plan = estimate(source, memory, policy.encode_frames, dtype, cfg.data.cache.batch_size)
-            print(
-                f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode, "
-                f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
-            )
-            continue
-        rank, world = process_rank()
-        if rank == 0:
-            source.verify()  # its pictures are all about to be read, and for the last time
-        # Beside the folder, and one for each share: processes that take other shares, or train, are welcome.
-        with FolderLock(folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"):
-            if cfg.rebuild:
-                clear_cache(folder)
-            batch_size = cfg.data.cache.batch_size
-            written = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
-        print(f"{source.name}: {written} episodes encoded, {len(source)} in all, at {folder}")
-
-
-def _device(name: str) -> torch.device:
-    """`auto` and `cuda` mean this process's own GPU under torchrun."""
-    device = find_device(name)
-    own = int(os.environ.get("LOCAL_RANK", "0"))
-    return torch.device("cuda", own) if device.type == "cuda" and device.index is None else device
-
-
-def main() -> None:
-    """Run `python -m mme_vla.data.cache`."""
-    from mme_vla.config.composition import cli
-
-    cli("cache")(run)()
-
-
-if __name__ == "__main__":
-    main()

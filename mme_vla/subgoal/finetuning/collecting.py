@@ -26,11 +26,10 @@ from mme_vla.errors import UserError, brief
 from mme_vla.files import SUMS, FolderLock, claim_plan, file_sum, plain, read_json, write_atomically, write_sums
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.media import write_mp4, write_png
-from mme_vla.subgoal.finetuning.rows import SETS, RowOptions, episode_rows
-from mme_vla.subgoal.finetuning.swift import write_arguments
+from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
 
 if TYPE_CHECKING:
-    from omegaconf import DictConfig
+    pass
 
 PARTS = "parts"
 
@@ -211,46 +210,3 @@ def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int)
 def _lerobot_pictures(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
     for start in range(0, len(steps), 64):  # what is decoded at once stays small
         yield from source.frames(episode, list(steps[start : start + 64]))
-
-
-def run(cfg: "DictConfig") -> dict[str, int]:
-    """Build what configs/subgoal_build.yaml and the command line say."""
-    inputs = [cfg.input] if isinstance(cfg.input, str) else _list(cfg, "input", str)
-    tasks = None if cfg.tasks is None else Path(str(cfg.tasks))
-    numbers = None if cfg.episodes is None else set(_list(cfg, "episodes", int))
-    sets = _list(cfg, "sets", str)
-    for name in sets:
-        if name not in SETS:
-            raise UserError(f"sets: there is no {name!r}; known: {', '.join(SETS)}.")
-    noise = None if cfg.noise is None else tuple(_list(cfg, "noise", int))
-    options = RowOptions(noise=noise, seed=cfg.seed, **cfg.rows)
-    episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
-    episodes = [episode for episode in episodes if numbers is None or episode.number in numbers]
-    output = Path(cfg.output)
-    counts = build(episodes, output, sets, options)
-    for name, count in counts.items():
-        write_arguments(output, name)
-        print(f"{output / name}.jsonl: {count} rows of {len(episodes)} episodes")
-    return counts
-
-
-def _list(cfg: "DictConfig", key: str, kind: type) -> list[Any]:
-    """A key that is a list of whole numbers or of words."""
-    from omegaconf import ListConfig
-
-    given = cfg[key]
-    if not isinstance(given, ListConfig) or any(not isinstance(v, kind) or isinstance(v, bool) for v in given):
-        wanted, example = ("whole numbers", "[0,1]") if kind is int else ("words", f"[{given}]")
-        raise UserError(f"{key}={given} must be a list of {wanted}, such as {key}={example}.")
-    return list(given)
-
-
-def main() -> None:
-    """Run `python -m mme_vla.subgoal.build`."""
-    from mme_vla.config.composition import cli
-
-    cli("subgoal_build")(run)()
-
-
-if __name__ == "__main__":
-    main()

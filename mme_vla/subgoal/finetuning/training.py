@@ -63,7 +63,7 @@ def find_checkpoint(output: Path, resume: str | None) -> str | None:
     return resume
 
 
-def run(cfg: "DictConfig") -> Path:
+def fine_tune(cfg: "DictConfig") -> Path:
     """Train as configs/subgoal_train.yaml and the command line say; return the adapter's folder."""
     try:
         from peft import LoraConfig, get_peft_model
@@ -129,14 +129,3 @@ def _arguments(cfg: "DictConfig", output: Path, device: str) -> Any:
         report_to=[] if cfg.report_to is None else [cfg.report_to],
         deepspeed=deepspeed,
     )
-
-
-def main() -> None:
-    """Run `python -m mme_vla.subgoal.train`."""
-    from mme_vla.config.composition import cli
-
-    cli("subgoal_train")(run)()
-
-
-if __name__ == "__main__":
-    main()
