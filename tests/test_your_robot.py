@@ -17,7 +17,7 @@ from rollout_stand_ins import InlineEnvs, roll
 from serving_fakes import Served
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.commands import cache
+from mme_vla.commands.cache import main as cache_main
 from mme_vla.commands.inspect import main as inspect_main
 from mme_vla.commands.train import train
 from mme_vla.config.composition import compose
@@ -101,7 +101,7 @@ def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytes
     folders = [place / "configs"]
     inspect_main(compose("inspect", look[5:], extra_dirs=folders))
     assert "25" in capsys.readouterr().out, "frames of both episodes"
-    cache.run(compose("cache", [*cached[5:], *SMALL, "device=cpu"], extra_dirs=folders))
+    cache_main(compose("cache", [*cached[5:], *SMALL, "device=cpu"], extra_dirs=folders))
     assert "2 episodes encoded" in capsys.readouterr().out
     cfg = compose("train", [*training[5:], *SMALL, *BRIEF], extra_dirs=folders)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
