@@ -69,7 +69,7 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
         (action(angles={9: 3.1}), "angles must list numbers from 0 to 7"),
         (action(names=["x"]), "names must hold 8 texts"),
         (action(execute=21), "a chunk has 20 actions"),
-        (action(frames=2), "expected 1, or null"),
+        (action(frames=2), "expected 1; null if"),
     ],
 )
 def test_impossible_robots_are_refused_by_the_key(given: dict[str, Any], message: str) -> None:
