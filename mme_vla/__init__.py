@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mme_vla.backbone.base import Backbone
+    from mme_vla.embodiment import Embodiment
     from mme_vla.envs.make import make_env
     from mme_vla.envs.task import Task
     from mme_vla.envs.vector.pool import make_vec_env
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 _HOME = {
     "build_policy": "mme_vla.policy.build",
     "Policy": "mme_vla.policy.base",
+    "Embodiment": "mme_vla.embodiment",
     "MMEPolicy": "mme_vla.policy.mme",
     "Episode": "mme_vla.policy.episode",
     "Memory": "mme_vla.memory.base",
@@ -72,6 +74,7 @@ __all__ = [
     "Backbone",
     "Batch",
     "CachedHistory",
+    "Embodiment",
     "Episode",
     "History",
     "HistoryTokens",

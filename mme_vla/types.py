@@ -14,9 +14,6 @@ from torch import Tensor
 GRID = 16
 """Side of a view's token grid; memories pool it, and token positions count in its lines."""
 
-VIEWS = ("image", "wrist_image")
-"""The two cameras of RoboMME, front and wrist; the front view feeds memory."""
-
 
 class TensorStruct:
     """A dataclass of tensors (or nested structs, or None) that moves between devices as one."""
@@ -83,13 +80,13 @@ class MemoryTokens(TensorStruct):
 class Batch(TensorStruct):
     """What the network reads, and for training what it should answer.
 
-    images: [b, v, 3, s, s] uint8; the views at the vision tower's resolution, base camera first.
+    images: [b, v, 3, s, s] uint8; the views at the vision tower's resolution, in the embodiment's order.
     image_mask: [b, v] bool; False hides a view.
     prompt: [b, l] int64 token ids; prompt_mask: [b, l] bool.
     history: the memory's selection, None for a policy without memory.
     actions: [b, h, a]; normalised, padded chunk. None when sampling.
     action_mask: [b, h] bool; steps that count in the loss. None counts all.
-    state: [b, 8]; raw joint state, never read by the network: it anchors the joint deltas.
+    state: [b, s]; raw state of the robot, never read by the network: it anchors relative actions.
     """
 
     images: Tensor

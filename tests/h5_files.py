@@ -18,10 +18,23 @@ class Recorded:
     actions: np.ndarray
 
 
+def pose_at(number: int) -> np.ndarray:
+    """A pose of the tool and a gripper command, another for every number."""
+    return np.array([0.1 * number, 0.2, 0.3, np.pi, 0.0, 0.01 * number, 1.0 if number % 2 else -1.0])
+
+
 def write_file(
-    path: Path, lengths: Sequence[int], videos: Sequence[int] = (), numbers: Sequence[int] = (), size: int = 16
+    path: Path,
+    lengths: Sequence[int],
+    videos: Sequence[int] = (),
+    numbers: Sequence[int] = (),
+    size: int = 16,
+    poses: bool = False,
 ) -> list[Recorded]:
-    """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for the last steps."""
+    """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for the last steps.
+
+    With `poses` they hold the tool's poses too, and a waypoint every fourth step: the first one after three.
+    """
     rng = np.random.default_rng(len(path.stem))
     videos, numbers = videos or [0] * len(lengths), numbers or range(len(lengths))
     recorded = []
@@ -41,6 +54,10 @@ def write_file(
                 step["obs/joint_state"] = joints[t].astype(np.float32)
                 step["obs/gripper_state"] = np.array([0.04, 0.03], np.float32)
                 step["action/joint_action"] = actions[t]
+                if poses:
+                    since = t - video if t >= video else t
+                    step["action/eef_action"] = pose_at(t)
+                    step["action/waypoint_action"] = pose_at(100 + t // 4) if since >= 3 else np.full(7, np.nan)
                 done = t >= length - 2
                 for name in ("simple_subgoal", "grounded_subgoal"):
                     text = f"Pick Up {t // 4}" + (" at <1, 2>" if name.startswith("grounded") else "")

@@ -110,7 +110,7 @@ def acted_directly(policy: MMEPolicy, parts: list, steps: int = 2, seed: int = 4
     episode, chunks = policy.start_episode(GOAL, seed=seed), []
     for index, (front, wrist, state) in enumerate(parts):
         demo = np.arange(len(front)) < (len(front) - 1 if index == 0 else 0)
-        episode.observe({"image": front, "wrist_image": wrist}, state, demo)
+        episode.observe({"front": front, "wrist": wrist}, state, demo)
         episode.subgoal = subgoal.get("subgoal")
         chunks.append(policy.act([episode], steps)[0])
     return chunks

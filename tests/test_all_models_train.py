@@ -43,7 +43,7 @@ def opened_once() -> Iterator[None]:
     for source in sources:
         _remember_pictures(source)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(training_data, "open_sources", lambda names: sources)
+        patch.setattr(training_data, "open_sources", lambda names, robot: sources)
         yield
 
 
@@ -51,11 +51,11 @@ def _remember_pictures(source: EpisodeSource) -> None:
     decode = source.frames
 
     @cache
-    def picture(episode: int, index: int, view: str) -> np.ndarray:
-        return decode(episode, [index], view)
+    def picture(episode: int, index: int, camera: str | None) -> np.ndarray:
+        return decode(episode, [index], camera)
 
-    def frames(episode: int, indices: Sequence[int] | np.ndarray, view: str = "image") -> np.ndarray:
-        return picture(episode, int(indices[0]), view) if len(indices) == 1 else decode(episode, indices, view)
+    def frames(episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
+        return picture(episode, int(indices[0]), camera) if len(indices) == 1 else decode(episode, indices, camera)
 
     source.frames = frames  # type: ignore[method-assign]
 

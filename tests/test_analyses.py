@@ -207,7 +207,7 @@ def test_rerun_gets_pictures_words_and_numbers(arguments: list[str], logged: str
     episode = [] if arguments[0] == "selection" else ["--episodes", "0"]
     main([*(word.format(tmp_path) for word in arguments), *episode, "--rerun", str(path)])
     schema = str(rerun.recording.load_recording(path).schema())
-    for entity in ("views/image", "views/wrist_image", "goal", "simple_subgoal", logged):
+    for entity in ("views/front", "views/wrist", "goal", "simple_subgoal", logged):
         assert f"/episode_0/{entity}:" in schema
     assert "timeline:step" in schema
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from mme_vla.errors import UserError
 from mme_vla.processing.augment import augment_views, crop_and_rotate, jitter_colours
 
-VIEWS = ("base_0_rgb", "left_wrist_0_rgb")
+VIEWS = ("all", "colour")
 
 
 def pictures(batch: int = 4, size: int = 40) -> Tensor:
@@ -115,7 +115,7 @@ def test_colour_jitter_works_on_the_hsv_value_and_hue(
 
 
 def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(UserError, match="2 views but 1 names"):
+    with pytest.raises(UserError, match="2 views but 1 cameras"):
         augment_views(pictures(), VIEWS[:1])
     with pytest.raises(UserError, match="square"):
         augment_views(torch.zeros(1, 2, 3, 8, 9), VIEWS)

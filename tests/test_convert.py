@@ -31,7 +31,7 @@ def check(source: EpisodeSource, episodes: list[Recorded], tolerance: int) -> No
     for e, expected in enumerate(episodes):
         assert np.array_equal(source.states(e), expected.state)
         assert np.array_equal(source.actions(e), expected.actions.astype(np.float32))
-        for view, frames in (("image", expected.front), ("wrist_image", expected.wrist)):
+        for view, frames in (("front", expected.front), ("wrist", expected.wrist)):
             decoded = source.frames(e, np.arange(len(frames)), view)
             assert np.abs(decoded.astype(int) - frames).max() <= tolerance
     assert source.subgoals(0, 4)["simple_subgoal_online"] == "pick up 1 online"
@@ -48,7 +48,7 @@ def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(tmp_p
     refs, episodes = recorded
     convert(refs, tmp_path / "out")
     source = EpisodeSource(tmp_path / "out")
-    assert source.video_views == ("image", "wrist_image") and source.fps == 20
+    assert source.video_cameras == ("front", "wrist") and source.fps == 20
     check(source, episodes, tolerance=3)
     frames = source.frames(0, np.arange(12))
     assert np.array_equal(frames[:, :, 8:], np.repeat(frames[:1, :, 8:], 12, axis=0))

@@ -98,7 +98,7 @@ def test_a_chunk_starts_at_the_offset_and_repeats_the_last_action(data, processo
 
 def test_an_item_holds_the_current_pictures_and_words(data, processor) -> None:
     item = TrainingDataset(data[0], processor)[10]
-    frames = [data[0][0].frames(0, [16], view)[0] for view in ("image", "wrist_image")]
+    frames = [data[0][0].frames(0, [16], view)[0] for view in ("front", "wrist")]
     assert torch.equal(item["images"], processor.images(frames)) and item["images"].dtype == torch.uint8
     assert torch.equal(item["prompt"], processor.prompt("do task 0")[0])
     assert item["subgoals"]["grounded_subgoal"] == "pick up 4 at <1, 2>" and item["place"] == (0, 0, 16)
@@ -146,7 +146,7 @@ def test_an_item_decodes_its_two_current_pictures_only(data, processor, caches, 
     asked = []
     frames = EpisodeSource.frames
     monkeypatch.setattr(
-        EpisodeSource, "frames", lambda self, e, i, view="image": (asked.append(i), frames(self, e, i, view))[1]
+        EpisodeSource, "frames", lambda self, e, i, view=None: (asked.append(i), frames(self, e, i, view))[1]
     )
     TrainingDataset(data[0], processor, LastFrames(), caches)[10]
     assert asked == [[16], [16]]

@@ -62,9 +62,9 @@ def test_values_and_pictures_equal_lerobots_own_reader(sample: EpisodeSource) ->
         assert np.array_equal(item["actions"].numpy(), sample.actions(episode, step, step + 1)[0])
         assert item["task"] == sample.goal(episode)
         assert item["grounded_subgoal"] == sample.subgoals(episode, step)["grounded_subgoal"]
-        for view in ("image", "wrist_image"):
-            frame = sample.frames(episode, [step], view)[0]
-            assert np.array_equal(item[view].permute(1, 2, 0).numpy(), frame)
+        for camera, column in (("front", "image"), ("wrist", "wrist_image")):
+            frame = sample.frames(episode, [step], camera)[0]
+            assert np.array_equal(item[column].permute(1, 2, 0).numpy(), frame)
 
 
 def test_single_pictures_equal_the_sequence_in_any_order(sample: EpisodeSource) -> None:
@@ -87,7 +87,7 @@ def test_open_videos_are_bounded_and_not_shared_with_other_processes(sample: Epi
 
     source = EpisodeSource("sample", max_open_videos=1)
     expected = source.frames(0, [3, 90])
-    source.frames(0, [5], "wrist_image")
+    source.frames(0, [5], "wrist")
     assert len(source._reader._open) == 1
     with multiprocessing.get_context("fork").Pool(2) as pool:
         for frames in pool.starmap(source.frames, [(0, [3, 90])] * 4):

@@ -55,7 +55,7 @@ def test_one_episode_acts_as_it_does_in_a_list() -> None:
     chunks = []
     for alone in (True, False):
         episode = policy.start_episode("pick up the red cube", seed=3)
-        episode.observe({"image": frame, "wrist_image": frame}, state)
+        episode.observe({"front": frame, "wrist": frame}, state)
         chunks.append(policy.act(episode) if alone else policy.act([episode])[0])
     assert chunks[0].ndim == 2
     np.testing.assert_array_equal(*chunks)

@@ -8,8 +8,9 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
-from mme_vla.processing.actions import JOINTS, pad_width, to_absolute, to_deltas
+from mme_vla.processing.actions import pad_width
 from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats, normalize, unnormalize
 
 
@@ -30,14 +31,14 @@ def test_action_chain_gives_the_golden_values_both_ways(parity: Path) -> None:
     tensors = load_file(parity / "unit_normalisation.safetensors")
     stats = golden_stats(tensors)
     actions, state = tensors["in/actions"], tensors["in/state"]
-    deltas = to_deltas(actions, state)
+    deltas = ROBOMME_JOINT.action.to_relative(actions, state)
     assert (deltas - tensors["out/delta_actions"]).abs().max() <= 1e-6
     normalised = normalize(deltas, stats.actions)
     assert (normalised - tensors["out/actions_normalised"]).abs().max() <= 1e-5
     width = tensors["out/actions_padded"].shape[-1]
     padded = pad_width(normalised, width)
     assert (padded - tensors["out/actions_padded"]).abs().max() <= 1e-5
-    back = to_absolute(unnormalize(padded, stats.actions)[..., : len(stats.actions)], state)
+    back = ROBOMME_JOINT.action.to_absolute(unnormalize(padded, stats.actions)[..., : len(stats.actions)], state)
     assert (back - tensors["out/actions_absolute_first8"]).abs().max() <= 1e-5
 
 
@@ -113,10 +114,10 @@ def test_normalisation_refuses_values_the_statistics_do_not_fit() -> None:
 
 def test_only_the_joints_are_relative_to_the_state() -> None:
     actions, state = torch.randn(4, 20, 8), torch.randn(4, 8)
-    deltas = to_deltas(actions, state)
-    assert torch.equal(deltas[..., JOINTS:], actions[..., JOINTS:])
-    assert torch.allclose(deltas[2, 13, :JOINTS], actions[2, 13, :JOINTS] - state[2, :JOINTS])
-    assert torch.allclose(to_absolute(deltas, state), actions, atol=1e-6)
+    deltas = ROBOMME_JOINT.action.to_relative(actions, state)
+    assert torch.equal(deltas[..., 7:], actions[..., 7:])
+    assert torch.allclose(deltas[2, 13, :7], actions[2, 13, :7] - state[2, :7])
+    assert torch.allclose(ROBOMME_JOINT.action.to_absolute(deltas, state), actions, atol=1e-6)
 
 
 def test_statistics_survive_their_file(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
+from mme_vla.files import SUMS
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.pictures import to_unit_range
 from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
@@ -261,6 +262,7 @@ def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
     other = small_policy("tokendrop_expert")
     other.save_pretrained(tmp_path / "other")
     (tmp_path / "other" / "config.json").write_text((tmp_path / "damaged" / "config.json").read_text())
+    (tmp_path / "other" / SUMS).unlink()
     with pytest.raises(UserError, match=r"(?s)missing.*unexpected"):
         MMEPolicy.from_pretrained(tmp_path / "other")
 

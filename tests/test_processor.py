@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
 from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.processing.processor import Processor
@@ -77,11 +78,11 @@ def test_prompt_takes_what_its_format_needs_and_ignores_the_rest() -> None:
 
 @pytest.mark.parametrize("with_stats", [True, False])
 def test_processor_comes_out_of_its_folder_unchanged(tmp_path: Path, with_stats: bool) -> None:
-    saved = processor(prompt="subgoal", views=("front",), stats=stats() if with_stats else None)
+    saved = processor(prompt="subgoal", embodiment=ROBOMME_JOINT, stats=stats() if with_stats else None)
     saved.save(tmp_path)
     loaded = Processor.load(tmp_path)
     assert loaded.to_config() == saved.to_config()
-    assert loaded.views == ("front",) and loaded.prompt_name == "subgoal"
+    assert loaded.embodiment == saved.embodiment and loaded.prompt_name == "subgoal"
     assert (loaded.stats and loaded.stats.to_dict()) == (saved.stats and saved.stats.to_dict())
     assert torch.equal(loaded.prompt("a", "b")[0], saved.prompt("a", "b")[0])
 
@@ -115,7 +116,7 @@ def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None
         ({"prompt_lenght": 3}, "Did you mean 'prompt_length'"),
         ({"horizon": 0}, "horizon must be a positive"),
         ({"image_size": "224"}, "image_size must be a positive"),
-        ({"views": "base_0_rgb"}, "list of camera names"),
+        ({"views": ["base_0_rgb"]}, "named in the section 'embodiment'"),
         ({"stats": "nowhere.json"}, "nowhere.json"),
         ({"tokenizer": "nowhere.model"}, "nowhere.model"),
         ({"tokenizer_fingerprint": "0123"}, "fingerprint"),

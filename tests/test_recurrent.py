@@ -144,7 +144,7 @@ def test_acting_carries_the_state_in_the_episode(monkeypatch):
     frames = moving_frames(50)
     episode = policy.start_episode("press the button")
     for start, stop in ((0, 1), (1, 17), (17, 33), (33, 40)):
-        view = {"image": frames[start:stop], "wrist_image": frames[start:stop]}
+        view = {"front": frames[start:stop], "wrist": frames[start:stop]}
         episode.observe(view, np.zeros((stop - start, 8), np.float32))
         policy.act([episode])
     assert counted == [1, 1, 1, 3]  # the last replan came off the stride

@@ -17,10 +17,10 @@ def test_the_sample_is_small_and_documented() -> None:
 
 def test_the_sample_holds_four_real_demonstrations() -> None:
     source = EpisodeSource("sample")
-    assert source.video_views == ("image", "wrist_image") and source.fps == 20
+    assert source.video_cameras == ("front", "wrist") and source.fps == 20
     assert [source.task(e) for e in range(4)] == ["VideoUnmask", "PatternLock", "PickXtimes", "VideoUnmask"]
     assert source.lengths.tolist() == [173, 148, 332, 263] and source.exec_starts.tolist() == [66, 74, 0, 66]
-    assert source.frames(0, [0, 172], "wrist_image").shape == (2, 256, 256, 3)
+    assert source.frames(0, [0, 172], "wrist").shape == (2, 256, 256, 3)
 
 
 def test_the_first_episode_has_its_own_picture_wherever_something_moved(shared: Path) -> None:

@@ -323,7 +323,7 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
 
 
 def test_settings_and_policies_that_cannot_work_are_refused(policy):
-    for bad in ({"port": 70000}, {"action_space": "ee_pose"}, {"action_space": "joints"}, {"api_key": ""},
+    for bad in ({"port": 70000}, {"action_space": "joints"}, {"api_key": ""},
                 {"execute": 0}, {"max_batch": 1.5}, {"limits": Limits(send_s=-1)}):  # fmt: skip
         with pytest.raises(UserError):
             ServeSettings(**bad)
@@ -331,6 +331,8 @@ def test_settings_and_policies_that_cannot_work_are_refused(policy):
     unknowing.require_processor().stats = None
     with pytest.raises(UserError, match="statistics"):
         PolicyServer(unknowing, ServeSettings())
+    with pytest.raises(UserError, match="answers with joint_angle"):
+        PolicyServer(policy, ServeSettings(action_space="ee_pose"))
     with (
         Served(policy) as first,
         pytest.raises(UserError, match="Cannot listen"),

@@ -27,7 +27,7 @@ def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upt
     upto = len(frames) if upto is None else upto
     for start in range(0, upto, chunk):
         part = slice(start, min(start + chunk, upto))
-        view = {"image": frames[part], "wrist_image": frames[part][:, ::-1]}
+        view = {"front": frames[part], "wrist": frames[part][:, ::-1]}
         count = len(frames[part])
         episode.observe(view, np.zeros((count, 8), np.float32), np.arange(start, start + count) < demo)
     return episode
@@ -114,13 +114,13 @@ def test_episodes_refuse_what_they_cannot_use(policy, frames):
     with pytest.raises(UserError, match="no frame yet"):
         policy.act([episode])
     state = np.zeros((2, 8), np.float32)
-    with pytest.raises(UserError, match="wrist_image"):
-        episode.observe({"image": frames[:2]}, state)
+    with pytest.raises(UserError, match="wrist"):
+        episode.observe({"front": frames[:2]}, state)
     with pytest.raises(UserError, match="uint8"):
-        episode.observe({"image": frames[:2] / 255.0, "wrist_image": frames[:2]}, state)
+        episode.observe({"front": frames[:2] / 255.0, "wrist": frames[:2]}, state)
     with pytest.raises(UserError, match="states of shape"):
-        episode.observe({"image": frames[:2], "wrist_image": frames[:2]}, state[:, :7])
-    both = {"image": frames[:2], "wrist_image": frames[:2]}
+        episode.observe({"front": frames[:2], "wrist": frames[:2]}, state[:, :7])
+    both = {"front": frames[:2], "wrist": frames[:2]}
     episode.observe(both, state, is_demo=False)
     with pytest.raises(UserError, match="video goes first"):
         episode.observe(both, state, is_demo=True)
@@ -154,7 +154,7 @@ def test_tokendrop_encodes_only_the_frames_it_can_choose(frames, monkeypatch):
 def test_an_error_leaves_the_episode_as_it_was(policy, frames):
     episode = feed(policy, frames, upto=20, demo=0)
     before = episode.recall()
-    both = {"image": frames[:3], "wrist_image": frames[:3]}
+    both = {"front": frames[:3], "wrist": frames[:3]}
     states = np.zeros((3, 8), np.float32)
     for wrong in (
         {"actions": np.zeros((1, 8))},
@@ -177,5 +177,5 @@ def test_acting_without_statistics_is_refused_before_anything_moves(policy, fram
             policy.act([episode])
     finally:
         policy.processor.stats = stats
-    untouched = policy.start_episode(episode.goal, seed=0).draw_noise()
-    assert torch.equal(episode.draw_noise(), untouched)
+    untouched = policy.start_episode(episode.goal, seed=0).noise_state
+    assert torch.equal(episode.noise_state, untouched)

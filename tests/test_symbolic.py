@@ -78,13 +78,13 @@ def test_a_prompt_that_reads_a_subgoal_needs_its_text(source):
 def test_the_subgoal_of_an_episode_changes_its_actions():
     policy, frames = small_policy("simplesg"), moving_frames(1)
     episode = policy.start_episode("sort the cubes", seed=1)
-    episode.observe({"image": frames, "wrist_image": frames}, np.zeros((1, 8)))
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((1, 8)))
     chunks = []
     for subgoal in ("pick up the red cube", "press the button"):
         episode.subgoal = subgoal
         assert subgoal in policy.processor.tokenizer.decode(episode.prompt[0][episode.prompt[1]].tolist())
         again = policy.start_episode("sort the cubes", seed=1)
-        again.observe({"image": frames, "wrist_image": frames}, np.zeros((1, 8)))
+        again.observe({"front": frames, "wrist": frames}, np.zeros((1, 8)))
         again.subgoal = subgoal
         chunks.append(policy.act([again]))
     assert not np.allclose(*chunks)
@@ -106,7 +106,7 @@ def test_an_episode_knows_its_executed_actions_by_the_frames_that_follow():
     policy, frames = small_policy("pi05_past_actions"), moving_frames(40)
 
     def observe(episode, count, **given):
-        view = {"image": frames[:count], "wrist_image": frames[:count]}
+        view = {"front": frames[:count], "wrist": frames[:count]}
         episode.observe(view, np.zeros((count, 8)), **given)
 
     episode = policy.start_episode("press the button")
@@ -132,7 +132,7 @@ def test_hybrid_reads_subgoal_and_memory_and_both_change_its_actions(source):
 
     def act(past, subgoal):
         episode = policy.start_episode("sort the cubes", seed=1)
-        episode.observe({"image": past, "wrist_image": past}, np.zeros((len(past), 8)))
+        episode.observe({"front": past, "wrist": past}, np.zeros((len(past), 8)))
         episode.subgoal = subgoal
         return policy.act([episode])
 

@@ -45,7 +45,7 @@ def _of_policy(policy: MMEPolicy) -> list[object]:
     stats = None if processor.stats is None else processor.stats.to_dict()
     decisive = {key: value for key, value in policy.config.items() if key != "card"}
     tokens = processor.prompt("pick up the red cube", state=np.zeros(8, np.float32))
-    return [*_arrays(policy.state_dict()), decisive, processor.views, stats, *map(_array, tokens)]
+    return [*_arrays(policy.state_dict()), decisive, processor.embodiment.to_dict(), stats, *map(_array, tokens)]
 
 
 def write_sharded(folder: Path) -> None:

@@ -16,6 +16,7 @@ from mme_vla.data.cache.store import VisionCache, fingerprint
 from mme_vla.data.conversion import convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import SUBGOALS, find_files, list_episodes, open_episode
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.files import write_sums
 from mme_vla.memory.tokendrop import TokenDrop
 
@@ -90,7 +91,7 @@ def read_dataset(folder: Path) -> object:
         steps = range(int(source.lengths[e]))
         read += [source.goal(e), source.task(e), source.states(e), source.actions(e)]
         read += [sorted(source.subgoals(e, t).items()) for t in steps]
-        read += [source.frames(e, list(steps), view) for view in ("image", "wrist_image")]
+        read += [source.frames(e, list(steps), view) for view in source.columns]
     return digest(*read)
 
 
@@ -99,11 +100,12 @@ class _Pictures:
 
     name, fingerprint = "fuzzed", "0123456789abcdef"
     lengths, exec_starts = np.array(LENGTHS), np.array([VIDEO, VIDEO])
+    robot, columns = ROBOMME_JOINT, {"front": "image", "wrist": "wrist_image"}
 
     def __len__(self) -> int:
         return len(LENGTHS)
 
-    def frames(self, episode: int, indices: Any, view: str) -> np.ndarray:
+    def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
         values = np.random.default_rng(episode).integers(0, 255, (LENGTHS[episode], SIDE, SIDE, 3), np.uint8)
         return values[np.asarray(indices)]
 

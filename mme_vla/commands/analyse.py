@@ -212,14 +212,14 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
 
     if (args.checkpoint is None) == (args.model is None):
         raise UserError("Name one policy: --checkpoint FOLDER, or --model NAME for one with fresh weights.")
-    source = EpisodeSource(args.dataset)
     if args.checkpoint is not None:
         policy = MMEPolicy.from_pretrained(
             resolve_checkpoint(args.checkpoint), device=args.device, trust_plugins=args.trust_plugins
         )
-        return policy, source, safe_name(str(policy.config.get("name") or args.checkpoint.name), "the policy's name")
+        name = safe_name(str(policy.config.get("name") or args.checkpoint.name), "the policy's name")
+        return policy, EpisodeSource(args.dataset, robot=policy.embodiment), name
     print(f"{args.model} with fresh weights: what it shows is where a model starts, not what one learns.")
-    return build_policy(args.model, backbone=args.backbone, device=args.device), source, args.model
+    return build_policy(args.model, backbone=args.backbone, device=args.device), EpisodeSource(args.dataset), args.model
 
 
 def _paper(table: str, model: str) -> dict[str, str]:

@@ -36,7 +36,7 @@ def main(cfg: DictConfig) -> None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
     encoder, dtype = policy.vision_fingerprint(), str(policy.history_dtype).removeprefix("torch.")
     root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
-    for source in open_sources(cfg.data.sources):
+    for source in open_sources(cfg.data.sources, policy.embodiment):
         expected = fingerprint(source, memory.storage, encoder, dtype)
         folder = cache_folder(root, source, expected)
         if cfg.dry_run:

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
 from mme_vla.errors import UserError
@@ -33,8 +33,10 @@ def main(cfg: DictConfig) -> None:
     if cfg.checkpoint is not None:
         return show_checkpoint(Path(cfg.checkpoint), console, bool(cfg.trust_plugins))
     from mme_vla.data.episodes import EpisodeSource
+    from mme_vla.embodiment import Embodiment
 
-    source = EpisodeSource(cfg.dataset, cfg.exec_starts)
+    robot = Embodiment.from_dict(OmegaConf.to_container(cfg.embodiment, resolve=True))  # type: ignore[arg-type]
+    source = EpisodeSource(cfg.dataset, cfg.exec_starts, robot=robot)
     if cfg.episode is None:
         return show_dataset(source, console)
     episode, step = check_place(source, cfg.episode, cfg.step)
@@ -76,7 +78,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     console.print(settings)
     stats = policy.require_processor().stats
     if stats is not None:
-        numbers = _table("normalisation", "", *(str(i + 1) for i in range(len(stats.actions))))
+        numbers = _table("normalisation", "", *(str(i + 1) for i in range(max(len(stats.state), len(stats.actions)))))
         for name, of in (("state", stats.state), ("action delta", stats.actions)):
             for quantile in ("q01", "q99"):
                 numbers.add_row(f"{name} {quantile}", *(f"{x:.3f}" for x in getattr(of, quantile)))
@@ -102,7 +104,7 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     console.print(table)
     console.print(
         f"{frames - video} execution steps to train on · {source.fps:g} frames per second · pictures as "
-        f"{'video' if source.video_views else 'images'} · subgoals: {', '.join(source.subgoal_names) or 'none'}",
+        f"{'video' if source.video_cameras else 'images'} · subgoals: {', '.join(source.subgoal_names) or 'none'}",
         highlight=False,
     )
     console.print(

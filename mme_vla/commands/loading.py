@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _MODEL_KEYS = (
     "name",
     "model",
+    "embodiment",
     "backbone",
     "memory",
     "integration",
@@ -74,7 +75,7 @@ def load_policy(
     if cfg.dtype != "float32":
         raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
-    policy.require_processor().stats = unit_stats()
+    policy.require_processor().stats = unit_stats(policy.embodiment)
     logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
     return LoadedPolicy(policy, str(cfg.name), None)
 

@@ -13,6 +13,9 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.embodiment.robomme import embodiment_of
+
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
 FREE = ("memory.budget", "processor.tokenizer")
@@ -78,10 +81,13 @@ def composition_digest(config: Mapping[str, Any]) -> str:
     Args:
         config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was trained on and in
             which precision it computes do not count; nor do keys that are not set, so that a later option with an
-            empty default changes no digest.
+            empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
     """
     kept = _flat({key: config.get(key) for key in (*DECISIVE, "backbone")})
     kept = {key: value for key, value in kept.items() if value is not None and key != "processor.tokenizer"}
+    robot = embodiment_of(config)
+    if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
+        kept |= _flat({"embodiment": robot.to_dict()})
     return _digest(kept, 12)
 
 

@@ -9,13 +9,13 @@ and the next run continues with the missing ones.
 import json
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode
+from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json
@@ -32,6 +32,7 @@ class ConvertOptions:
     fps: frames per second; 20 is the simulator's control rate.
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
+    poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
     """
 
     images: str = "video"
@@ -40,6 +41,7 @@ class ConvertOptions:
     crf: int = 0
     pix_fmt: str = "yuv444p"
     gop: int = 8
+    poses: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.images not in ("video", "png"):
@@ -50,6 +52,7 @@ class ConvertOptions:
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
     """The dataset's columns, under the names of the released LeRobot datasets."""
+    tool = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
     joints = [*(f"joint{i}" for i in range(1, 8)), "gripper"]
     kind = "video" if options.images == "video" else "image"
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
@@ -58,6 +61,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "wrist_image": dict(view),
         "state": {"dtype": "float32", "shape": (8,), "names": joints},
         "actions": {"dtype": "float32", "shape": (8,), "names": joints},
+        **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
@@ -75,9 +79,9 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
         UserError: `output` holds something else, a partial run had other episodes or options, another process converts
             into it, or an episode is damaged. Nothing that exists is overwritten.
     """
-    options = options or ConvertOptions()
     if not episodes:
         raise UserError("There is no episode to convert.")
+    options = replace(options or ConvertOptions(), poses=pose_columns(episodes))
     plan = _plan(episodes, options)
     partial = output.with_name(output.name + ".partial")
     if _finished(output, plan) and not partial.exists():
@@ -101,7 +105,8 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
         {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
         for ref in episodes
     ]
-    return {"options": asdict(options), "episodes": origins}
+    settings = {key: value for key, value in asdict(options).items() if key != "poses"}  # as plans from before had it
+    return {"options": settings, "episodes": origins} | ({"poses": list(options.poses)} if options.poses else {})
 
 
 def _convert(
@@ -178,6 +183,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
 
     dataset = None
     goal = episode.goals[0]
+    tool = {name: episode.pose_actions(name) for name in options.poses}
     for step, frame in enumerate(episode):
         if dataset is None:
             video = options.images == "video"
@@ -203,6 +209,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 "wrist_image": frame.wrist,
                 "state": frame.state,
                 "actions": frame.action.astype(np.float32),
+                **{name: rows[step] for name, rows in tool.items()},
                 **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
                 **frame.subgoals,
                 "task": goal,

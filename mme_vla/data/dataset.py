@@ -15,7 +15,7 @@ from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory, stack_history
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.subgoal_text import SubgoalText
-from mme_vla.types import VIEWS, Batch
+from mme_vla.types import Batch
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Step:
 
     source, episode, index: where it lies; index counts the episode's frames, video included.
     exec_start: the episode's first execution frame. goal: the task in words. subgoals: the texts of this step by name.
-    state: [8] float32. actions: [h, 8] float32, the chunk, its last recorded action repeated past the end.
+    state: [s] float32. actions: [h, w] float32, the chunk, its last recorded action repeated past the end.
     recorded: [h] bool, False on repeated actions.
     """
 
@@ -100,13 +100,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         chosen = [np.arange(len(source)) for source in sources] if episodes is None else episodes
         self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(chosen)]).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in chosen])
-        counts = [source.lengths[part] - source.exec_starts[part] for source, part in zip(sources, chosen, strict=True)]
-        self._ends = np.concatenate(counts).cumsum() if len(self._episode) else np.zeros(0, np.int64)
+        pairs = zip(self._source, self._episode, strict=True)
+        self._ends = np.cumsum([len(sources[s].decisions(int(e))) for s, e in pairs], dtype=np.int64)
         if not len(self):
-            raise UserError("The data hold no execution step.")
+            raise UserError("The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
-        """Number of execution steps."""
+        """Number of steps at which the robot decides: all of the execution, or those before a planned motion."""
         return int(self._ends[-1]) if len(self._ends) else 0
 
     @property
@@ -124,14 +124,14 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             raise IndexError(f"item {index} of {len(self)}")
         at = int(np.searchsorted(self._ends, index, side="right"))
         source, episode = int(self._source[at]), int(self._episode[at])
-        length = int(self.sources[source].lengths[episode])
-        return source, episode, length - (int(self._ends[at]) - index)
+        decisions = self.sources[source].decisions(episode)
+        return source, episode, int(decisions[len(decisions) - (int(self._ends[at]) - index)])
 
     def step(self, index: int) -> Step:
         """Return what is recorded of an item, unprocessed."""
         s, episode, frame = self.locate(index)
         source = self.sources[s]
-        actions, recorded = source.action_chunk(episode, frame + self.action_offset, self.processor.horizon)
+        actions, recorded = source.action_chunk(episode, frame, self.processor.horizon, self.action_offset)
         return Step(
             source=s,
             episode=episode,
@@ -145,23 +145,21 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         )
 
     def past_actions(self, step: Step) -> np.ndarray:
-        """The robot's own actions right before the chunk, [n, 8], as many as the prompt reads and there are."""
-        first = step.index + self.action_offset
-        start = max(step.exec_start, first - self.processor.prompt_format.past_actions)
-        if start >= first:
-            return np.zeros((0, 8), np.float32)
-        return self.sources[step.source].actions(step.episode, start, first)
+        """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and there are."""
+        most = self.processor.prompt_format.past_actions
+        return self.sources[step.source].past_actions(step.episode, step.index, most, self.action_offset)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
         source = self.sources[step.source]
         rng = np.random.default_rng([self.seed, self.epoch, index])
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
+        cameras = self.processor.embodiment.camera_names
         prompt, prompt_mask = self.processor.prompt(
             step.goal, subgoal=subgoal, state=step.state, past_actions=self.past_actions(step)
         )
         item = {
-            "images": self.processor.images([source.frames(step.episode, [step.index], view)[0] for view in VIEWS]),
+            "images": self.processor.images([source.frames(step.episode, [step.index], name)[0] for name in cameras]),
             "prompt": prompt,
             "prompt_mask": prompt_mask,
             "state": torch.from_numpy(step.state),

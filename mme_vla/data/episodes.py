@@ -13,12 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.columns import find_columns, width_of
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
-    VECTORS,
-    VIEWS,
-    check_features,
     content_fingerprint,
     read_exec_starts,
     read_info,
@@ -26,7 +24,9 @@ from mme_vla.data.layout import (
 )
 from mme_vla.data.tables import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
-from mme_vla.errors import UserError, brief
+from mme_vla.data.waypoints import Motions, find_motions
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import Sums, decoding, read_json
 
 SIDE_FILE = "meta/robomme_episodes.json"
@@ -37,6 +37,7 @@ class EpisodeSource:
     """The episodes of one dataset.
 
     name: short name (the folder's, or `sample`). fps: frames per second.
+    robot: whose columns are read. columns: the dataset's column of each camera.
     lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0 without a video).
     """
 
@@ -46,15 +47,17 @@ class EpisodeSource:
         exec_starts: str | Path | None = None,
         name: str | None = None,
         max_open_videos: int = 8,
+        robot: Embodiment = ROBOMME_JOINT,
     ) -> None:
         """Open a dataset; nothing is downloaded.
 
         Args:
-            root: folder of a LeRobot v3.0 dataset with RoboMME's feature names, or `sample`.
+            root: folder of a LeRobot v3.0 dataset, or `sample`.
             exec_starts: side file with each episode's first execution frame (JSON or parquet), for datasets that
                 do not mark their conditioning video.
             name: short name, which the validation split and the cache folder use; by default the folder's.
             max_open_videos: most video files kept open.
+            robot: says which columns hold its pictures, states and actions.
 
         Raises:
             UserError: not a v3.0 dataset, a feature is missing, the demonstration flag is missing and no side file
@@ -64,22 +67,33 @@ class EpisodeSource:
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
         info = read_info(self.root)
         features = info["features"]
-        columns = check_features(self.root, features)
+        self.robot = robot
+        found = find_columns(self.root, features, robot)
+        columns, self.columns = list(found.tables), found.cameras
         self.fps = float(info["fps"])
-        self.video_views = tuple(view for view in VIEWS if features[view]["dtype"] == "video")
+        if robot.fps is not None and robot.fps != self.fps:
+            log.warning("%s has %g frames per second; the robot %s has %g.", self.name, self.fps, robot.name, robot.fps)
+        self._vectors_of = {
+            kind: {name: width_of(features[name]) for name in names}
+            for kind, names in (("state", found.state), ("action", found.action))
+        }
+        self._motions: dict[int, Motions] = {}
+        videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
+        self.video_cameras = tuple(videos)
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
         self._check_tables()
-        episodes = read_episode_table(self.root, self.video_views)
+        episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
         self._starts, self.lengths = np.asarray(episodes["starts"]), np.asarray(episodes["lengths"])
         self._goals = list(episodes["goals"])
         self._videos = {
-            view: _VideoFiles(self.root, info.get("video_path"), view, episodes) for view in self.video_views
+            name: _VideoFiles(self.root, info.get("video_path"), column, episodes) for name, column in videos.items()
         }
         self._table = open_table(self.root, columns, features)
         self._reader = VideoReader(max_open_videos)
         self._check_rows()
-        for vector in VECTORS:
-            check_vectors(self.root, self._table, vector, features[vector]["shape"][0])
+        for vectors in self._vectors_of.values():
+            for name, width in vectors.items():
+                check_vectors(self.root, self._table, name, width)
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
     def __len__(self) -> int:
@@ -134,7 +148,7 @@ class EpisodeSource:
         """The same for what every opening reads anyway; tables that hold pictures are left to `verify`."""
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
         for name in sums.table:
-            if name.startswith("meta/") or (name.startswith("data/") and len(self.video_views) == len(VIEWS)):
+            if name.startswith("meta/") or (name.startswith("data/") and len(self.video_cameras) == len(self.columns)):
                 sums.check(name)
 
     def goal(self, episode: int) -> str:
@@ -142,48 +156,79 @@ class EpisodeSource:
         return self._goals[episode]
 
     def states(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Joint angles and first finger, [stop − start, 8] float32."""
+        """What the robot felt, [stop − start, s] float32."""
         return self._vectors("state", episode, start, stop)
 
     def actions(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """Absolute joint targets and gripper command, [stop − start, 8] float32."""
-        return self._vectors("actions", episode, start, stop)
+        """The action recorded with each frame, absolute, [stop − start, w] float32."""
+        return self._vectors("action", episode, start, stop)
 
-    def action_chunk(self, episode: int, start: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-        """Actions start … start + horizon − 1, the last one repeated past the episode's end.
+    def decisions(self, episode: int) -> Sequence[int] | np.ndarray:
+        """The frames at which the robot decides on actions: all of the execution, or those before a motion begins."""
+        if self.robot.action.frames is None:
+            return self._motions_of(episode).decisions
+        return range(int(self.exec_starts[episode]), int(self.lengths[episode]))
+
+    def action_chunk(self, episode: int, start: int, horizon: int, offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        """The chunk decided at frame `start`, the last action repeated past the episode's end.
+
+        Where an action takes a frame these are actions start + offset … start + offset + horizon − 1.
 
         Returns:
-            actions [horizon, 8] float32, and [horizon] bool that is False on repeated ones.
+            actions [horizon, w] float32, and [horizon] bool that is False on repeated ones.
         """
+        if self.robot.action.frames is None:
+            return self._motions_of(episode).chunk(start, horizon)
+        start += offset
         length = int(self.lengths[episode])
         steps = np.arange(start, start + horizon)
         first = min(start, length - 1)
         recorded = self.actions(episode, first, min(start + horizon, length) if start < length else length)
         return recorded[np.minimum(steps, length - 1) - first], steps < length
 
+    def past_actions(self, episode: int, start: int, most: int, offset: int = 0) -> np.ndarray:
+        """The robot's own actions right before the chunk of `start`, oldest first, [n, w]; as many as there are."""
+        if self.robot.action.frames is None:
+            return self._motions_of(episode).before(start, most)
+        stop = start + offset
+        first = max(int(self.exec_starts[episode]), stop - most)
+        if first >= stop:
+            return np.zeros((0, self.robot.action.width), np.float32)
+        return self.actions(episode, first, stop)
+
+    def _motions_of(self, episode: int) -> Motions:
+        if episode not in self._motions:
+            first = int(self.exec_starts[episode])
+            self._motions[episode] = find_motions(self.actions(episode, first), first)
+        return self._motions[episode]
+
     def subgoals(self, episode: int, step: int) -> dict[str, str]:
         """The subgoal texts of one step, lower-case, under the names in `subgoal_names`."""
         row = self._rows(episode, step, step + 1)
         return {name: str(_flat(row[name])[0].as_py()).lower() for name in self.subgoal_names}
 
-    def frames(self, episode: int, indices: Sequence[int] | np.ndarray, view: str = "image") -> np.ndarray:
-        """Decode pictures [n, H, W, 3] uint8 of `view` (`image`: front camera, `wrist_image`) at these frames.
+    def frames(self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
+        """Decode pictures [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory.
 
         Raises:
-            UserError: a frame outside the episode, or a damaged or missing video.
+            UserError: no such camera, a frame outside the episode, or a damaged or missing video.
         """
         indices = np.asarray(indices, np.int64)
         length = int(self.lengths[episode])
         if not len(indices) or indices.min() < 0 or indices.max() >= length:
             raise UserError(f"{self.name}, episode {episode}: frames {indices.tolist()[:5]} asked of {length}.")
-        if view in self._videos:
-            path, offset = self._videos[view].locate(episode)
+        camera = self.robot.memory_camera if camera is None else camera
+        if camera not in self.columns:
+            raise UserError(f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
+        if camera in self._videos:
+            path, offset = self._videos[camera].locate(episode)
             return self._reader.read(path, offset + indices / self.fps, self.fps)
         from PIL import Image
 
         start = int(self._starts[episode])
-        cells = [self._table[start + int(i) : start + int(i) + 1][view][0].as_py() for i in indices]
-        with decoding(f"{self.root}, episode {episode}, {view}", "pictures", REMEDY):
+        column = self.columns[camera]
+        cells = [self._table[start + int(i) : start + int(i) + 1][column][0].as_py() for i in indices]
+        with decoding(f"{self.root}, episode {episode}, {column}", "pictures", REMEDY):
             return np.stack([np.asarray(Image.open(io.BytesIO(cell["bytes"])).convert("RGB")) for cell in cells])
 
     def _rows(self, episode: int, start: int, stop: int | None) -> Any:
@@ -194,9 +239,13 @@ class EpisodeSource:
         offset = int(self._starts[episode])
         return self._table[offset + start : offset + stop]
 
-    def _vectors(self, column: str, episode: int, start: int, stop: int | None) -> np.ndarray:
-        values = _flat(self._rows(episode, start, stop)[column]).to_numpy(zero_copy_only=False)
-        return values.astype(np.float32).reshape(-1, 8)
+    def _vectors(self, kind: str, episode: int, start: int, stop: int | None) -> np.ndarray:
+        rows = self._rows(episode, start, stop)
+        parts = [
+            _flat(rows[name]).to_numpy(zero_copy_only=False).astype(np.float32).reshape(-1, width)
+            for name, width in self._vectors_of[kind].items()
+        ]
+        return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
     def _check_rows(self) -> None:
         """The tables hold the episodes back to back, as the metadata say."""
@@ -221,12 +270,15 @@ class EpisodeSource:
         elif "exec_start_idx" in columns:
             log.warning("%s has no is_demo; its exec_start_idx says where the conditioning video ends.", self.root)
             starts = self._column("exec_start_idx")[self._starts].astype(np.int64)
+        elif not self.robot.conditioning_video:
+            starts = np.zeros(len(self), np.int64)
         else:
             raise UserError(
                 f"{self.root} does not mark its conditioning videos: it has neither is_demo nor exec_start_idx. "
                 "Without them video frames would be trained on as if the robot had acted. Give a side file: "
                 'exec_starts=<file>.json with {"<episode_index>": <first execution frame>, …}, or a parquet table '
-                "with the columns episode_index and exec_start_idx (0 for an episode without video)."
+                "with the columns episode_index and exec_start_idx (0 for an episode without video). A robot whose "
+                "episodes never begin with a video has embodiment.conditioning_video=false."
             )
         if (starts < 0).any() or (starts >= self.lengths).any():
             episode = int(np.flatnonzero((starts < 0) | (starts >= self.lengths))[0])

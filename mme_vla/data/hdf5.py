@@ -14,6 +14,8 @@ from mme_vla.files import decoding, require_file
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
 _REMEDY = "Download or copy the file again."
+POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
+"""Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
 _REQUIRED = (
     "obs/front_rgb", "obs/wrist_rgb", "obs/joint_state", "obs/gripper_state", "action/joint_action",
     "info/is_video_demo", "info/is_completed", *(f"info/{name}" for name in SUBGOALS),
@@ -83,6 +85,16 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     return refs
 
 
+def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
+    """The columns of `POSE_ACTIONS` that every one of these episodes has."""
+    files = {file: [ref.group for ref in refs if ref.file == file] for file in dict.fromkeys(ref.file for ref in refs)}
+    found = set(POSE_ACTIONS)
+    for file, groups in files.items():
+        with _open(file) as handle:
+            found = {n for n in found if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
+    return tuple(name for name in POSE_ACTIONS if name in found)
+
+
 class RawEpisode:
     """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
 
@@ -115,13 +127,14 @@ class RawEpisode:
         with decoding(place, "a dataset of HDF5", _REMEDY):
             return self._group[name][()]
 
-    def _numbers(self, step: int, name: str, least: int) -> np.ndarray:
-        """A list of at least `least` finite numbers."""
+    def _numbers(self, step: int, name: str, least: int, finite: bool = True) -> np.ndarray:
+        """A list of at least `least` numbers, finite unless told otherwise."""
         found = np.atleast_1d(np.asarray(self._step(step, name)))
-        if found.dtype.kind not in "fiu" or found.ndim != 1 or len(found) < least or not np.isfinite(found).all():
+        right = found.dtype.kind in "fiu" and found.ndim == 1 and len(found) >= least
+        if not right or (finite and not np.isfinite(found).all()):
             raise UserError(
                 f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected at "
-                f"least {least} finite numbers. {_REMEDY}"
+                f"least {least} {'finite ' if finite else ''}numbers. {_REMEDY}"
             )
         return found
 
@@ -188,6 +201,25 @@ class RawEpisode:
         angles = [self._numbers(k, "obs/joint_state", 7)[:7] for k in range(self.length)]
         targets = [self._numbers(k, "action/joint_action", 7)[:7] for k in range(self.length)]
         return np.stack(angles), np.stack(targets)
+
+    def pose_actions(self, column: str) -> np.ndarray:
+        """A column of `POSE_ACTIONS`, [t, 7] float32.
+
+        Of waypoints, which are noted when a motion begins: the one under way, and before the first one of the video
+        or the execution that first one; a part without any is one motion to where it ends.
+
+        Raises:
+            UserError: a step has no 7 numbers, or none that are finite where there is no motion to take them from.
+        """
+        steps = [self._numbers(k, POSE_ACTIONS[column], 7, finite=False)[:7] for k in range(self.length)]
+        rows = np.stack(steps).astype(np.float32)
+        for part in (slice(0, self.exec_start), slice(self.exec_start, self.length)):
+            unknown = np.count_nonzero(np.isfinite(rows[part]), axis=1) < rows.shape[1]
+            if part.stop > part.start and unknown.all():
+                rows[part] = self._numbers(part.stop - 1, POSE_ACTIONS["ee_pose_actions"], 7)[:7]
+            elif unknown.any():
+                rows[part][unknown] = rows[part][~unknown][0]
+        return rows
 
     def front(self, step: int) -> np.ndarray:
         """The front picture of one step, [H, W, 3] uint8."""

@@ -8,12 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import SUBGOALS
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, brief
 from mme_vla.files import decoding, inside, read_json, require_file
 
-VIEWS = ("image", "wrist_image")
-VECTORS = ("state", "actions")
 SAMPLE = Path(__file__).resolve().parent.parent / "assets" / "sample"
 
 
@@ -66,28 +63,6 @@ def _is_feature(feature: object) -> bool:
         return False
     shape = feature.get("shape")
     return isinstance(shape, list) and all(type(side) is int and 0 < side < 2**20 for side in shape)
-
-
-def check_features(root: Path, features: dict[str, dict[str, Any]]) -> list[str]:
-    """Return the columns to read (pictures included only where they lie in the table).
-
-    Raises:
-        UserError: a needed feature is absent, or a state or action is not 8 numbers; all problems in one message.
-    """
-    missing = [name for name in (*VIEWS, *VECTORS) if name not in features]
-    if missing:
-        raise UserError(
-            f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
-            "Expected the names of the released RoboMME datasets; rename the features in a copy of the dataset."
-        )
-    for name in VECTORS:
-        if tuple(features[name]["shape"]) != (8,):
-            raise UserError(
-                f"{root}: {name} has shape {list(features[name]['shape'])}; expected [8] (7 joints, gripper)."
-            )
-    optional = ("is_demo", "exec_start_idx", *SUBGOALS)
-    columns = ["episode_index", *VECTORS, *(name for name in optional if name in features)]
-    return columns + [name for name in VIEWS if features[name]["dtype"] == "image"]
 
 
 def read_exec_starts(file: Path, episodes: int) -> np.ndarray:

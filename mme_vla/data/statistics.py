@@ -7,8 +7,8 @@ import torch
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
-from mme_vla.processing.actions import to_deltas
 from mme_vla.processing.normalisers import NormStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
@@ -20,8 +20,9 @@ def compute_norm_stats(
     horizon: int = 20,
     action_offset: int = 0,
     seed: int = 42,
+    robot: Embodiment = ROBOMME_JOINT,
 ) -> NormStats:
-    """Mean, deviation and 1 % / 99 % quantiles of states and of joint-delta action chunks.
+    """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are predicted.
 
     As released: one pass over all execution steps in shuffled order, in batches of 128 of which an incomplete last one
     is left out (unless it is the only one), every step of every chunk counted, repeated last actions included.
@@ -30,7 +31,7 @@ def compute_norm_stats(
         sources: the datasets.
         episodes: which of each dataset's episodes count; None counts all.
         horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
-        seed: of the order.
+        seed: of the order. robot: says which numbers of an action are relative to the state.
 
     Raises:
         UserError: fewer than two execution steps.
@@ -47,7 +48,7 @@ def compute_norm_stats(
             state = torch.from_numpy(np.stack([row[0] for row in rows]))
             chunk = torch.from_numpy(np.stack([row[1] for row in rows]))
             states.update(state.numpy())
-            actions.update(to_deltas(chunk, state).numpy())
+            actions.update(robot.action.to_relative(chunk, state).numpy())
             advance(1)
     return NormStats(state=states.result(), actions=actions.result())
 
@@ -57,7 +58,7 @@ def _execution_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.nda
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
         for episode in range(len(source)) if episodes is None else episodes[i]:
-            step = np.arange(source.exec_starts[episode], source.lengths[episode], dtype=np.int32)
+            step = np.asarray(source.decisions(int(episode)), np.int32)
             parts.append(np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1))
     return np.concatenate(parts)
 
@@ -66,5 +67,5 @@ def _row(
     sources: Sequence[EpisodeSource], place: np.ndarray, horizon: int, offset: int
 ) -> tuple[np.ndarray, np.ndarray]:
     source, episode, step = (int(x) for x in place)
-    chunk, _ = sources[source].action_chunk(episode, step + offset, horizon)
+    chunk, _ = sources[source].action_chunk(episode, step, horizon, offset)
     return sources[source].states(episode, step, step + 1)[0], chunk

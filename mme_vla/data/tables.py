@@ -17,6 +17,7 @@ from mme_vla.files import decoding, inside, require_file
 
 REMEDY = "Copy, download or convert the dataset again."
 _MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
+_WHOLE = ("episode_index", "is_demo", "exec_start_idx")  # columns of whole numbers or flags, whatever is announced
 _FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
 
 
@@ -99,7 +100,7 @@ def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> 
 
 
 def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
-    """Make sure that every row of a column is `width` finite numbers.
+    """Make sure that every row of a column is `width` finite numbers; one alone may stand without a list around it.
 
     Raises:
         UserError: a row is absent, shorter or longer, or holds NaN or an infinity; the first one is named.
@@ -109,10 +110,12 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
     first = 0
     for chunk in table.data[name].chunks:
         # Counting is not enough: rows of 7 and 9 numbers have 8 on average.
-        lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False)
-        wrong = lengths != width
+        listed = _is_list(chunk.type)
+        lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False) if listed else width
+        wrong = np.broadcast_to(lengths != width, len(chunk))
         if not wrong.any():
-            values = chunk.flatten().to_numpy(zero_copy_only=False).reshape(-1, width)  # nulls become NaN
+            numbers = chunk.flatten() if listed else chunk
+            values = numbers.to_numpy(zero_copy_only=False).reshape(-1, width)  # nulls become NaN
             wrong = ~np.isfinite(values).all(axis=1)
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
@@ -173,7 +176,9 @@ def _check_schema(file: Path, columns: Sequence[str], features: dict[str, Any]) 
         elif name in SUBGOALS:
             right = inner is not None and (pa.types.is_string(inner) or pa.types.is_large_string(inner))
         elif len(features[name]["shape"]) == 1 and features[name]["shape"][0] > 1:
-            right = found is not None and _is_list(found) and pa.types.is_floating(inner)
+            right = found is not None and _is_list(found) and _is_number(inner)
+        elif name not in _WHOLE:
+            right = inner is not None and _is_number(inner)
         else:
             right = inner is not None and (pa.types.is_integer(inner) or pa.types.is_boolean(inner))
         if not right:
@@ -181,6 +186,12 @@ def _check_schema(file: Path, columns: Sequence[str], features: dict[str, Any]) 
                 f"{file}: the column {name} is {found or 'absent'}, where meta/info.json announces "
                 f"{brief(features[name]['dtype'])} {list(features[name]['shape'])}. {REMEDY}"
             )
+
+
+def _is_number(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
 
 
 def _is_list(kind: Any) -> bool:

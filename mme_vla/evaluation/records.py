@@ -65,7 +65,7 @@ class EpisodeRecord:
     model_seed: of the policy's noise; it does not reach the environment.
     task, episode: which episode of the split; seed, difficulty: the environment's, from the benchmark's metadata.
     outcome: `success`, `fail` (the environment ended it), `timeout` (`max_steps` passed), `error` (see `error`).
-    steps: actions executed. seconds: where the time went.
+    steps: control steps executed, one an action but for planned motions. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
     composition: `composition_digest` (config/variant.py) of the policy, so that no two configurations are averaged

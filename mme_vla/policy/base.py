@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.episode import Episode
@@ -38,6 +40,11 @@ class Policy(Saved):
     @property
     def device(self) -> torch.device:
         return next(self.parameters()).device
+
+    @property
+    def embodiment(self) -> Embodiment:
+        """The robot this policy is for: its processor's, else its configuration's."""
+        return embodiment_of(self.config) if self.processor is None else self.processor.embodiment
 
     # Training
 
@@ -84,7 +91,7 @@ class Policy(Saved):
         """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
 
         Returns:
-            float32 [n, h, width], or [h, width] for one episode: actions as the embodiment executes them.
+            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them.
         """
         raise NotImplementedError
 

@@ -9,13 +9,15 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose, import_plugins
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.prompt import PROMPTS
 
 SECTIONS = (
-    "name", "plugins", "backbone", "memory", "integration", "policy", "processor", "subgoal_text", "token_budget",
+    "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
+    "token_budget",
 )  # fmt: skip
 
 
@@ -108,8 +110,9 @@ def build_processor(sections: Mapping[str, Any]) -> Processor:
         UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
     """
     backbone = sections["backbone"]
-    sizes = {"image_size": backbone["vision"]["image_size"], **{k: backbone[k] for k in ("action_dim", "horizon")}}
-    processor = Processor.from_config({**sections["processor"], **sizes})
+    sizes = {"image_size": backbone["vision"]["image_size"], "action_dim": backbone["action_dim"]}
+    robot = embodiment_of(sections).to_dict()
+    processor = Processor.from_config({**sections["processor"], **sizes, "embodiment": robot})
     if processor.tokenizer.vocab_size > backbone["vocab_size"]:
         raise UserError(
             f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "

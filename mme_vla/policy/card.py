@@ -19,6 +19,7 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
         "memory": _part(config.get("memory")),
         "integration": _part(config.get("integration")),
         "backbone": f"{backbone.get('name', 'pi05')}, {backbone.get('depth', '?')} layers",
+        "robot": str((config.get("embodiment") or {}).get("name", "robomme_joint")),
         "action chunk": f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers",
         "parameters": f"{sum(p.numel() for p in policy.parameters()) / 1e6:.1f} M",
     }

@@ -7,11 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.processing.limits import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
-from mme_vla.types import VIEWS, HistoryTokens
+from mme_vla.types import HistoryTokens
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
@@ -23,6 +24,9 @@ class Host(Protocol):
 
     @property
     def memory(self) -> "Memory | None": ...
+
+    @property
+    def embodiment(self) -> Embodiment: ...
 
     def require_memory(self) -> "Memory": ...
 
@@ -51,7 +55,8 @@ class Episode:
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.frames_seen = 0
         self._chunk: np.ndarray | None = None
-        self._executed = np.zeros((0, 8), np.float32)
+        self._robot = policy.embodiment
+        self._executed = self._no_actions
 
     def observe(
         self,
@@ -63,70 +68,78 @@ class Episode:
         """Take frames in order, each once, the current one last; the conditioning video comes first.
 
         Args:
-            frames: `image` and `wrist_image`, each [t, H, W, 3] uint8.
-            states: [t, 8]; seven joint angles and the first finger's position.
+            frames: of every camera by its name (`front` and `wrist`), each [t, H, W, 3] uint8.
+            states: [t, s].
             is_demo: whether the frames belong to the conditioning video; one bool, or [t].
-            actions: [t, 8] absolute actions that led to these frames. By default they are the first t of the last
-                chunk, one action a frame; give them where something else was executed.
+            actions: [t, w] absolute actions that led to these frames. By default they are the first t of the last
+                chunk, one action a frame; give them where something else was executed. Where an action is a motion of
+                many frames, however many it were: [n, w].
 
         Raises:
-            UserError: a missing view, a wrong dtype or shape, or a video frame after execution has begun.
+            UserError: a missing camera, a wrong dtype or shape, or a video frame after execution has begun.
         """
         # Everything is checked before anything is remembered: after an error the same frames can be given again.
-        front, wrist = (self._checked_view(frames, view) for view in VIEWS)
+        views = {name: self._checked_view(frames, name) for name in self._robot.camera_names}
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
-        if states.shape != (len(front), 8) or len(wrist) != len(front) or demo.shape not in ((), (len(front),)):
+        count, width = len(states) if states.ndim else 0, self._robot.state.width
+        even = all(len(view) == count for view in views.values())
+        if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
+            counts = ", ".join(f"{len(view)} {name}" for name, view in views.items())
             raise UserError(
-                f"observe() needs as many wrist images, 8-number states and is_demo flags as front images: got "
-                f"{len(front)} front, {len(wrist)} wrist, states of shape {states.shape} and is_demo of {demo.shape}."
+                f"observe() needs as many {width}-number states and is_demo flags as images of every camera: got "
+                f"{counts}, states of shape {states.shape} and is_demo of {demo.shape}."
             )
-        if len(front) == 0:
+        if count == 0:
             return
         processor = self._policy.require_processor()
         check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
-        demo, executed = self._checked_course(len(front), demo, actions)
-        images = processor.images([front[-1], wrist[-1]])
-        self._take(front, demo, executed)
+        demo, executed = self._checked_course(count, demo, actions)
+        images = processor.images([view[-1] for view in views.values()])
+        self._take(views[self._robot.memory_camera], demo, executed)
         self._images, self._state = images, torch.from_numpy(states[-1].copy())
 
     def remember(
-        self, front: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
+        self, frames: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
     ) -> None:
         """Take frames into memory alone, for a client that sends past frames and the current view apart.
 
         Followed by `look` at the last of them it is what `observe` does.
 
         Args:
-            front: [t, H, W, 3] uint8, in order, each once.
+            frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
             is_demo, actions: as for `observe`.
 
         Raises:
             UserError: a wrong dtype or shape, or a video frame after execution has begun.
         """
-        front = self._checked_view({VIEWS[0]: front}, VIEWS[0])
+        camera = self._robot.memory_camera
+        frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
-        if demo.shape not in ((), (len(front),)):
-            raise UserError(f"is_demo must be one flag or {len(front)}, one a frame; got {demo.shape}.")
-        if len(front):
-            self._take(front, *self._checked_course(len(front), demo, actions))
+        if demo.shape not in ((), (len(frames),)):
+            raise UserError(f"is_demo must be one flag or {len(frames)}, one a frame; got {demo.shape}.")
+        if len(frames):
+            self._take(frames, *self._checked_course(len(frames), demo, actions))
 
-    def look(self, image: np.ndarray, wrist_image: np.ndarray, state: np.ndarray) -> None:
+    def look(self, pictures: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
 
         Args:
-            image, wrist_image: [H, W, 3] uint8.
-            state: [8]; seven joint angles and the first finger's position.
+            pictures: of every camera by its name, [H, W, 3] uint8.
+            state: [s].
 
         Raises:
             UserError: pictures or a state of another form.
         """
         state = finite_array(state, "the state")
-        if state.shape != (8,):
-            raise UserError(f"look() needs a state of 8 finite numbers, got shape {state.shape}.")
+        width, names = self._robot.state.width, self._robot.camera_names
+        if state.shape != (width,):
+            raise UserError(f"look() needs a state of {width} finite numbers, got shape {state.shape}.")
+        if lacking := [name for name in names if name not in pictures]:
+            raise UserError(f"look() needs a picture of {', '.join(lacking)} too; got {', '.join(pictures) or 'none'}.")
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
-        images = processor.images([image, wrist_image])
+        images = processor.images([pictures[name] for name in names])
         self._images, self._state = images, torch.from_numpy(state.copy())
 
     def _checked_course(
@@ -138,11 +151,11 @@ class Episode:
             raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
         return demo, self._executed_now(int((~demo).sum()), actions)
 
-    def _take(self, front: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
+    def _take(self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            wanted = self.history.wanted(len(front))
-            self.history.append(front, self._policy.encode_frames(front[wanted]))
+            wanted = self.history.wanted(len(frames))
+            self.history.append(frames, self._policy.encode_frames(frames[wanted]))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().prompt_format.past_actions
@@ -150,7 +163,7 @@ class Episode:
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
-        self.frames_seen += len(front)
+        self.frames_seen += len(frames)
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -177,7 +190,7 @@ class Episode:
 
     @property
     def state(self) -> Tensor:
-        """The current state [8]."""
+        """The current state [s]."""
         self._require_observation()
         assert self._state is not None
         return self._state
@@ -189,18 +202,27 @@ class Episode:
         return processor.prompt(self.goal, subgoal=self.subgoal, state=self._state, past_actions=self._executed)
 
     def acted(self, chunk: np.ndarray) -> None:
-        """Note the chunk [h, 8] the policy chose; the frames that follow say how much of it was executed."""
+        """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""
         self._chunk = chunk
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
         """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
+        space = self._robot.action
         if actions is None:
-            return np.zeros((0, 8), np.float32) if self._chunk is None else self._chunk[:count]
+            return self._no_actions if self._chunk is None or space.frames is None else self._chunk[:count]
         given = finite_array(actions, "actions")
+        if space.frames is None and given.ndim:
+            count = len(given)
         executed = given[max(len(given) - count, 0) :] if given.ndim else given
-        if executed.shape != (count, 8):
-            raise UserError(f"actions must be [{count}, 8], one for each execution frame; got {executed.shape}.")
+        if executed.shape != (count, space.width):
+            raise UserError(
+                f"actions must be [{count}, {space.width}], one for each execution frame; got {executed.shape}."
+            )
         return executed
+
+    @property
+    def _no_actions(self) -> np.ndarray:
+        return np.zeros((0, self._robot.action.width), np.float32)
 
     @property
     def noise_state(self) -> Tensor:
@@ -221,8 +243,8 @@ class Episode:
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:
         if view not in frames:
-            raise UserError(f"observe() needs the view {view!r}; got {sorted(frames)}.")
+            raise UserError(f"observe() needs the camera {view!r}; got {sorted(frames)}.")
         array = np.asarray(frames[view])
         if array.ndim != 4 or array.shape[-1] != 3 or array.dtype != np.uint8:
-            raise UserError(f"View {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.")
+            raise UserError(f"Camera {view!r} must be uint8 [t, height, width, 3]; got {array.dtype} {array.shape}.")
         return array

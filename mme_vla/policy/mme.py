@@ -14,6 +14,7 @@ import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import Memory
@@ -78,6 +79,7 @@ class MMEPolicy(Policy):
         section = dict(config["backbone"])
         backbone_cls: type[Backbone] = BACKBONES[section.pop("name")]
         sizes = backbone_cls.Config.from_dict(section)
+        embodiment_of(config)  # a robot that does not fit is told before anything is built
         chosen = config.get("integration")
         integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
         if chosen and (unhosted := integration.uses() - backbone_cls.hosts):
@@ -174,10 +176,9 @@ class MMEPolicy(Policy):
     def _views(self, batch: Batch) -> Tensor:
         from mme_vla.processing.augment import augment_views
         from mme_vla.processing.pictures import to_unit_range
-        from mme_vla.types import VIEWS
 
         images = to_unit_range(batch.images)
-        return augment_views(images, VIEWS) if self.training and self.augment else images
+        return augment_views(images, self.embodiment.augmentations) if self.training and self.augment else images
 
     # Sampling
 
@@ -215,19 +216,19 @@ class MMEPolicy(Policy):
         """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
 
         Returns:
-            float32 [n, h, 8], or [h, 8] for one episode: absolute joint targets and gripper commands.
+            float32 [n, h, w], or [h, w] for one episode: the embodiment's actions, absolute.
         """
         if isinstance(episodes, Episode):
             alone: np.ndarray = self.act([episodes], steps)[0]
             return alone
         if not episodes:
-            return np.zeros((0, self.horizon, 8), np.float32)
+            return np.zeros((0, self.horizon, self.embodiment.action.width), np.float32)
         processor = self.require_processor()
         processor.require_stats()  # before any episode's noise or memory moves on
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),
-            image_mask=torch.ones(len(episodes), len(processor.views), dtype=torch.bool),
+            image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
         )
@@ -285,12 +286,19 @@ class MMEPolicy(Policy):
                     f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
                     "two checkpoints, or one was changed."
                 )
+        robot = embodiment_of(self.config)
+        if self.config.get("embodiment") is not None and robot != processor.embodiment:
+            raise UserError(
+                f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
+                f"{brief(robot.name)}, or the two say different things of it. The files are from two checkpoints, or "
+                "one was changed."
+            )
 
     def parts(self) -> Mapping[str, str]:
         """The backbone's parts; the memory and its integration are the part `memory`."""
-        return {"memory": r"memory\.|integration\.", **{
-            part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items() if part != "memory"
-        }}  # fmt: skip
+        parts = {part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items()}
+        own = [r"memory\.|integration\."] + ([parts["memory"]] if "memory" in parts else [])
+        return {**parts, "memory": "|".join(own)}
 
 
 def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:

@@ -1,6 +1,6 @@
 """What stands between raw data and the network: images, normalisation, actions, prompt and tokenizer."""
 
-from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
+from mme_vla.processing.actions import pad_width
 from mme_vla.processing.augment import augment_views
 from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats, normalize, unnormalize
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
@@ -26,8 +26,6 @@ __all__ = [
     "pad_width",
     "resize_with_pad",
     "resize_with_pad_uint8",
-    "to_absolute",
-    "to_deltas",
     "to_unit_range",
     "unnormalize",
 ]

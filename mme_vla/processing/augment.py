@@ -20,26 +20,26 @@ BRIGHTNESS, CONTRAST, HUE = 0.3, 0.4, 0.1
 
 
 @torch.no_grad()
-def augment_views(images: Tensor, views: Sequence[str], generator: torch.Generator | None = None) -> Tensor:
+def augment_views(images: Tensor, augmentations: Sequence[str], generator: torch.Generator | None = None) -> Tensor:
     """Augment a batch of current observations on the device they are on.
 
     All views of one sample share their random numbers, as released.
 
     Args:
         images: [b, v, 3, s, s] float in [-1, 1].
-        views: the v camera names; only those without "wrist" in their name are cropped and rotated.
+        augmentations: what is done to each of the v views: `all`, `colour` (neither cropped nor rotated) or `none`.
         generator: source of all randomness; None uses PyTorch's default one.
 
     Returns:
         [b, v, 3, s, s] float32 in [-1, 1].
 
     Raises:
-        UserError: shape and `views` do not fit together, or the images are not square.
+        UserError: shape and `augmentations` do not fit together, or the images are not square.
     """
     if images.ndim != 5 or images.shape[2] != 3 or images.shape[-1] != images.shape[-2]:
         raise UserError(f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.")
-    if images.shape[1] != len(views):
-        raise UserError(f"Got {images.shape[1]} views but {len(views)} names ({', '.join(views)}).")
+    if images.shape[1] != len(augmentations):
+        raise UserError(f"Got {images.shape[1]} views but {len(augmentations)} cameras are described.")
     # Everything is drawn at once, so that the numbers do not depend on which cameras there are.
     source = images.device if generator is None else generator.device
     draws = torch.rand(len(images), 7, generator=generator, device=source).to(images.device)
@@ -49,11 +49,12 @@ def augment_views(images: Tensor, views: Sequence[str], generator: torch.Generat
     jittered = draws[:, 6] < JITTER_PROBABILITY
 
     pixels = (images.float() + 1) / 2  # in [0, 1] the zero fill of the resampling is black
-    base = [i for i, name in enumerate(views) if "wrist" not in name]
+    base = [i for i, kind in enumerate(augmentations) if kind == "all"]
     if base:
         pixels[:, base] = crop_and_rotate(pixels[:, base], offset, angle)
     coloured = jitter_colours(pixels, brightness, contrast, hue)
-    pixels = torch.where(jittered[:, None, None, None, None], coloured, pixels)
+    coloured_views = torch.tensor([kind != "none" for kind in augmentations], device=pixels.device)
+    pixels = torch.where((jittered[:, None] & coloured_views)[:, :, None, None, None], coloured, pixels)
     return pixels.clamp(0, 1) * 2 - 1
 
 

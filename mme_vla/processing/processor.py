@@ -10,9 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.files import check_sums, inside, read_json
-from mme_vla.processing.actions import pad_width, to_absolute, to_deltas
+from mme_vla.processing.actions import pad_width
 from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
@@ -22,7 +23,7 @@ CONFIG_FILE = "processor.json"
 STATS_FILE = "norm_stats.json"
 TOKENIZER_FILE = "tokenizer.model"
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
-VIEWS = ("base_0_rgb", "left_wrist_0_rgb")  # π0.5's names of the front and the wrist camera
+OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]  # what processors named before robots could be chosen: front and wrist
 
 
 class Processor:
@@ -37,12 +38,12 @@ class Processor:
         prompt_length: l; longest prompt in tokens.
         subgoal_length: longest subgoal in it, in tokens; None for no limit of its own.
         action_dim: a; width of the network's actions, the robot's own padded with zeros.
-        horizon: h; steps in a chunk.
-        views: camera names in the order the network sees them.
+        horizon: h; steps in a chunk; None for the embodiment's.
+        embodiment: the robot: its cameras, in the order the network sees them, its state and its actions.
         stats: normalisation statistics; without them everything works but states and actions.
 
     Raises:
-        UserError: an unknown prompt format, or a size that is not positive.
+        UserError: an unknown prompt format, a size that is not positive, or actions wider than the network's.
     """
 
     def __init__(
@@ -52,8 +53,8 @@ class Processor:
         prompt: str = "plain",
         prompt_length: int = 64,
         action_dim: int = 32,
-        horizon: int = 20,
-        views: Sequence[str] = VIEWS,
+        horizon: int | None = None,
+        embodiment: Embodiment = ROBOMME_JOINT,
         stats: NormStats | None = None,
         subgoal_length: int | None = None,
     ) -> None:
@@ -61,14 +62,12 @@ class Processor:
             "image_size": image_size,
             "prompt_length": prompt_length,
             "action_dim": action_dim,
-            "horizon": horizon,
+            **({} if horizon is None else {"horizon": horizon}),
             **({} if subgoal_length is None else {"subgoal_length": subgoal_length}),
         }
         for name, value in sizes.items():
             if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST:
                 raise UserError(f"processor.{name} must be a positive whole number to {LARGEST}, not {brief(value)}.")
-        if isinstance(views, str) or not views or not all(isinstance(view, str) for view in views):
-            raise UserError(f"processor.views must be a list of camera names, got {brief(views)}.")
         if not isinstance(prompt, str):
             raise UserError(f"processor.prompt must be a name, got {brief(prompt)}.")
         self.prompt_format = PROMPTS[prompt]()
@@ -78,9 +77,14 @@ class Processor:
         self.prompt_length = prompt_length
         self.subgoal_length = subgoal_length
         self.action_dim = action_dim
-        self.horizon = horizon
-        self.views = tuple(views)
+        self.embodiment = embodiment if horizon is None else embodiment.with_horizon(horizon)
+        self.embodiment.check_network(action_dim, self.horizon)
         self.stats = stats
+
+    @property
+    def horizon(self) -> int:
+        """h; steps in a chunk."""
+        return self.embodiment.action.horizon
 
     @property
     def stats(self) -> NormStats | None:
@@ -89,10 +93,11 @@ class Processor:
 
     @stats.setter
     def stats(self, stats: NormStats | None) -> None:
-        if stats is not None and len(stats.actions) > self.action_dim:
+        robot = self.embodiment
+        if stats is not None and (len(stats.state), len(stats.actions)) != (robot.state.width, robot.action.width):
             raise UserError(
-                f"Statistics of {len(stats.actions)}-dimensional actions do not fit action_dim={self.action_dim}; "
-                "raise action_dim, or give the statistics of this robot."
+                f"Statistics of {len(stats.state)}-number states and {len(stats.actions)}-number actions are not those "
+                f"of {robot.name!r}, which has {robot.state.width} and {robot.action.width}: give this robot's."
             )
         self._stats = stats
 
@@ -100,7 +105,7 @@ class Processor:
         """Resize the current pictures of all cameras with Pillow, as released.
 
         Args:
-            views: one entry a camera in the order of `self.views`: [H, W, 3], or [n, H, W, 3] for n observations;
+            views: one entry a camera in the order of the embodiment's: [H, W, 3], or [n, H, W, 3] for n observations;
                 uint8, or float in [0, 1].
 
         Returns:
@@ -109,8 +114,9 @@ class Processor:
         Raises:
             UserError: a camera too many or too few, or pictures of another form.
         """
-        if len(views) != len(self.views):
-            raise UserError(f"Expected {len(self.views)} views ({', '.join(self.views)}), got {len(views)}.")
+        names = self.embodiment.camera_names
+        if len(views) != len(names):
+            raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
         if len({view.shape for view in resized}) > 1:
             raise UserError(f"All views need as many pictures, got shapes {[list(view.shape) for view in resized]}.")
@@ -134,8 +140,8 @@ class Processor:
         Args:
             goal: the task in words.
             subgoal: the language subgoal; formats that do not use one ignore it.
-            state: [8] raw state; formats that do not use it ignore it.
-            past_actions: [n, 8] absolute actions executed so far, oldest first; formats that do not use them ignore
+            state: [s] raw state; formats that do not use it ignore it.
+            past_actions: [n, w] absolute actions executed so far, oldest first; formats that do not use them ignore
                 them, the others read the last ones, relative to `state`.
 
         Returns:
@@ -149,7 +155,7 @@ class Processor:
             normalised = normalize(_float(state), self.require_stats().state).numpy()
         wanted = self.prompt_format.past_actions
         if wanted and state is not None and past_actions is not None:
-            recent = to_deltas(_float(past_actions)[-wanted:], _float(state))
+            recent = self.embodiment.action.to_relative(_float(past_actions)[-wanted:], _float(state))
             past = normalize(recent, self.require_stats().actions).numpy()
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
@@ -160,11 +166,11 @@ class Processor:
         """Turn recorded actions into what the network should answer.
 
         Args:
-            chunk: [h, 8] absolute joint targets and gripper commands.
-            state: [8] raw state at the observation.
+            chunk: [h, w] absolute actions.
+            state: [s] raw state at the observation.
 
         Returns:
-            [h, action_dim] float32: joint deltas, quantile-normalised, padded with zeros.
+            [h, action_dim] float32: relative where the embodiment says so, quantile-normalised, padded with zeros.
 
         Raises:
             UserError: there are no statistics, or the shapes do not fit.
@@ -176,24 +182,25 @@ class Processor:
                 f"Expected actions [{self.horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
                 f"got {list(chunk.shape)} and {list(state.shape)}."
             )
-        return pad_width(normalize(to_deltas(chunk, state), stats.actions), self.action_dim)
+        relative = self.embodiment.action.to_relative(chunk, state)
+        return pad_width(normalize(relative, stats.actions), self.action_dim)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
         """Turn the network's answer into actions the robot takes: the inverse of `actions`.
 
         Args:
             chunk: [..., h, action_dim] normalised.
-            state: [..., 8] raw.
+            state: [..., s] raw.
 
         Returns:
-            [..., h, 8] float32 on the device of `chunk`.
+            [..., h, w] float32 on the device of `chunk`.
 
         Raises:
             UserError: there are no statistics.
         """
         stats = self.require_stats()
-        deltas = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
-        return to_absolute(deltas, state.to(deltas))
+        relative = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
+        return self.embodiment.action.to_absolute(relative, state.to(relative))
 
     def to_config(self) -> dict[str, Any]:
         """Describe this processor as `processor.json` does; file names are relative to the folder `save` wrote."""
@@ -206,8 +213,7 @@ class Processor:
             "prompt_length": self.prompt_length,
             "subgoal_length": self.subgoal_length,
             "action_dim": self.action_dim,
-            "horizon": self.horizon,
-            "views": list(self.views),
+            "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,
         }
 
@@ -216,14 +222,15 @@ class Processor:
         """Build a processor.
 
         Args:
-            config: the constructor's arguments by name, two of them in words: `tokenizer` as `Tokenizer.load` takes it,
-                `stats` as the path of a `norm_stats.json` or None. `tokenizer_fingerprint`, if given, is checked.
+            config: the constructor's arguments by name, some in words: `tokenizer` as `Tokenizer.load` takes it,
+                `stats` as the path of a `norm_stats.json` or None, `embodiment` as `Embodiment.to_dict` writes it (left
+                out: RoboMME's Panda, as before). `tokenizer_fingerprint`, if given, is checked.
 
         Raises:
             UserError: an unknown, missing or impossible entry.
         """
         settings = dict(config)
-        known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint"}
+        known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint", "views"}
         for key in settings:
             if key not in known:
                 raise UserError(f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}")
@@ -232,6 +239,10 @@ class Processor:
                 raise UserError(f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
         PROMPTS[str(settings.get("prompt", "plain"))]  # a misspelt name is told before any file is read
         fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
+        if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
+            raise UserError(f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now.")
+        if (robot := settings.pop("embodiment", None)) is not None:
+            settings["embodiment"] = Embodiment.from_dict(robot)
         tokenizer = Tokenizer.load(settings.pop("tokenizer"))
         if fingerprint is not None and tokenizer.fingerprint != fingerprint:
             raise UserError(

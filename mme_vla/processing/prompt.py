@@ -128,7 +128,7 @@ class PastActions(PromptFormat):
         """
         if given.past_actions is None:
             raise UserError(
-                "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, 8])."
+                "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, w])."
             )
         levels = " ".join(map(str, discretize(given.past_actions.reshape(-1))))
         return [(f"Task: {_one_line(given.goal)}; Past actions: {levels};\nAction: ", True)]

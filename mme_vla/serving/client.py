@@ -86,8 +86,8 @@ class Client:
         """Send frames to remember, the current one included, before `infer` (MME-VLA schema).
 
         Args:
-            images: front view [t, H, W, 3] or [t, 1, H, W, 3] uint8.
-            states: [t, 8]; seven joint angles and the first finger's position.
+            images: of the camera that feeds memory (RoboMME: front) [t, H, W, 3] or [t, 1, H, W, 3] uint8.
+            states: [t, s].
             exec_start: index of the episode's first execution frame, when these frames begin with a video.
         """
         images = np.asarray(images)
@@ -103,7 +103,7 @@ class Client:
                 `prompt`; or the challenge's lists.
 
         Returns:
-            `actions` [n, 8] float32 absolute joint angles and gripper command, and `infer_time_ms`.
+            `actions` [n, w] float32, absolute, and `infer_time_ms`.
         """
         return self.request(observation)
 

@@ -65,7 +65,7 @@ class Engine:
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
-        """The next chunk [h, 8] of an episode, chosen in one batch with whoever waits at the same time."""
+        """The next chunk [h, w] of an episode, chosen in one batch with whoever waits at the same time."""
         chunk: np.ndarray = await self._join(self.turns.acting, episode)
         return chunk
 
@@ -116,7 +116,7 @@ class Engine:
                 waiting.future.set_result(chunk)
 
     def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
-        """Chunks [h, 8], or why there is none. Where a batch fails each is tried alone, so that none fails another."""
+        """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that none fails another."""
         noise = [episode.noise_state for episode in episodes]
         try:
             return list(self.policy.act(episodes, self.flow_steps))

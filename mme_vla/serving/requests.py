@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
 from mme_vla.errors import UserError, did_you_mean
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
-STATE = 8  # seven joint angles and the first finger's position
+PICTURES = {"front": "observation/image", "wrist": "observation/wrist_image"}  # openpi's names of RoboMME's cameras
 MOST_GOAL = 4000  # characters
 SIDES = (8, 4096)  # pixels of a picture's side
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
@@ -28,11 +30,11 @@ class Reset:
 class AddBuffer:
     """Frames to remember, the current one included; nothing is chosen yet.
 
-    front: t pictures [H, W, 3] uint8.
+    frames: t pictures [H, W, 3] uint8 of the camera that feeds memory.
     exec_start: index of the episode's first execution frame; 0 where it is not said.
     """
 
-    front: Sequence[np.ndarray]
+    frames: Sequence[np.ndarray]
     exec_start: int
 
 
@@ -40,45 +42,44 @@ class AddBuffer:
 class Infer:
     """Choose a chunk.
 
-    image, wrist_image: the current pictures. state [8]. goal: the task in words. subgoals: by kind, those given.
-    front: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
+    pictures: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind, those given.
+    frames: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
     first: whether the message begins an episode; None where the schema does not say.
     """
 
-    image: np.ndarray
-    wrist_image: np.ndarray
+    pictures: Mapping[str, np.ndarray]
     state: np.ndarray
     goal: str
     subgoals: Mapping[str, str] = field(default_factory=dict)
-    front: Sequence[np.ndarray] | None = None
+    frames: Sequence[np.ndarray] | None = None
     first: bool | None = None
 
 
 Request = Reset | AddBuffer | Infer
 
 
-def parse(message: Any, most_frames: int) -> Request:
+def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> Request:
     """Recognise a decoded message.
 
     Args:
-        most_frames: longest list of frames taken.
+        most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
 
     Raises:
         UserError: neither schema, a missing key, or a value of the wrong form; it names the key.
     """
     if not isinstance(message, dict):
         raise UserError(f"A request is a map, got {type(message).__name__}.")
-    space = message.get("action_space", "joint_angle")
-    if space != "joint_angle":
-        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with joint angles (joint_angle) only.")
+    space = message.get("action_space", robot.action.space)
+    if space != robot.action.space:
+        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with {robot.action.space} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
-        return _add_buffer(message, most_frames)
+        return _add_buffer(message, most_frames, robot)
     if "front_rgb_list" in message or "task_goal" in message:
-        return _challenge(message, most_frames)
+        return _challenge(message, most_frames, robot)
     if any(isinstance(key, str) and key.startswith("observation/") for key in message):
-        return _observation(message)
+        return _observation(message, robot)
     keys = [key for key in message if isinstance(key, str)][:10]
     near = did_you_mean(keys[0], KNOWN) if keys else f"Known: {', '.join(KNOWN)}."
     raise UserError(f"No known request has the keys {keys}. {near}")
@@ -94,47 +95,52 @@ def _flag(message: dict[Any, Any], key: str) -> bool:
     raise UserError(f"{key} must be true or false, got {type(value).__name__}.")
 
 
-def _add_buffer(message: dict[Any, Any], most_frames: int) -> AddBuffer:
+def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> AddBuffer:
     images = _array(message, "images")
     if images.ndim != 5 or images.shape[1] != 1:
         raise UserError(f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype} {list(images.shape)}.")
     count = len(images)
-    front = _frames("images", list(images[:, 0]), most_frames)
+    frames = _frames("images", list(images[:, 0]), most_frames)
     states = _numbers("state", _array(message, "state"))
-    if states.shape != (count, STATE):
-        raise UserError(f"state must be [{count}, {STATE}], one row a frame, got {list(states.shape)}.")
+    width = robot.state.width
+    if states.shape != (count, width):
+        raise UserError(f"state must be [{count}, {width}], one row a frame, got {list(states.shape)}.")
     start = message.get("exec_start_idx", 0)
     if isinstance(start, np.integer):
         start = int(start)
     if type(start) is not int or start < 0:
         raise UserError(f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.")
-    return AddBuffer(front, start)
+    return AddBuffer(frames, start)
 
 
-def _observation(message: dict[Any, Any]) -> Infer:
-    views = [_picture(key, _get(message, key)) for key in ("observation/image", "observation/wrist_image")]
+def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
+    keys = {name: PICTURES.get(name, f"observation/{name}") for name in robot.camera_names}
+    pictures = {name: _picture(key, _get(message, key)) for name, key in keys.items()}
     state = _numbers("observation/state", _array(message, "observation/state"))
-    if state.shape != (STATE,):
-        raise UserError(f"observation/state must be [{STATE}], got {list(state.shape)}.")
-    return Infer(views[0], views[1], state, _text("prompt", _get(message, "prompt")), _subgoals(message))
+    if state.shape != (robot.state.width,):
+        raise UserError(f"observation/state must be [{robot.state.width}], got {list(state.shape)}.")
+    return Infer(pictures, state, _text("prompt", _get(message, "prompt")), _subgoals(message))
 
 
-def _challenge(message: dict[Any, Any], most_frames: int) -> Infer:
-    front = _frames("front_rgb_list", _get(message, "front_rgb_list"), most_frames)
-    wrist = _frames("wrist_rgb_list", _get(message, "wrist_rgb_list"), most_frames)
-    joints, grippers = (_rows(message, key, size) for key, size in (("joint_state_list", 7), ("gripper_state_list", 2)))
-    lengths = {len(front), len(wrist), len(joints), len(grippers)}
-    if len(lengths) != 1:
-        raise UserError(
-            f"All lists need one entry a frame: front_rgb_list has {len(front)}, wrist_rgb_list {len(wrist)}, "
-            f"joint_state_list {len(joints)}, gripper_state_list {len(grippers)}."
-        )
+def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
+    if robot.action.space is None:
+        raise UserError(f"The robot {robot.name!r} is not the benchmark's: send observation/… messages.")
+    keys = {name: f"{name}_rgb_list" for name in robot.camera_names}
+    views = {name: _frames(key, _get(message, key), most_frames) for name, key in keys.items()}
+    sizes = (("joint_state_list", ARM_JOINTS), ("gripper_state_list", 2))
+    joints, grippers = (_rows(message, key, size) for key, size in sizes)
+    lengths = {keys[name]: len(view) for name, view in views.items()}
+    lengths |= {"joint_state_list": len(joints), "gripper_state_list": len(grippers)}
+    if len(set(lengths.values())) != 1:
+        counts = ", ".join(f"{key} has {length}" for key, length in lengths.items())
+        raise UserError(f"All lists need one entry a frame: {counts}.")
     first = _get(message, "is_first_step")
     if not isinstance(first, bool | np.bool_):
         raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
     goal = _text("task_goal", _get(message, "task_goal"))
-    state = np.concatenate([joints[-1], grippers[-1][:1]]).astype(np.float32)
-    return Infer(front[-1], wrist[-1], state, goal, _subgoals(message), front, bool(first))
+    state = benchmark_state(joints[-1], grippers[-1])
+    pictures = {name: view[-1] for name, view in views.items()}
+    return Infer(pictures, state, goal, _subgoals(message), views[robot.memory_camera], bool(first))
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:

@@ -45,6 +45,7 @@ class PolicyServer:
 
     def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
         policy.require_processor().require_stats()
+        settings.check_robot(policy.embodiment, policy.require_processor().prompt_format.past_actions)
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
@@ -132,10 +133,14 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "version": version("mme-vla"),
         "model": name,
         "trained": trained,
-        "action_space": settings.action_space,
-        "action_dim": 8,
+        "embodiment": policy.embodiment.name,
+        "cameras": list(policy.embodiment.camera_names),
+        "memory_camera": policy.embodiment.memory_camera,
+        "state_dim": policy.embodiment.state.width,
+        "action_space": policy.embodiment.action.space,
+        "action_dim": policy.embodiment.action.width,
         "horizon": policy.horizon,
-        "execute": min(settings.execute, policy.horizon),
+        "execute": settings.executed(policy.embodiment),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),
         "schemas": ["mme_vla", "robomme_challenge"],

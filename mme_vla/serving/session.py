@@ -28,7 +28,7 @@ async def read_request(engine: Engine, settings: ServeSettings, data: bytes | by
     """
 
     def read() -> Request:
-        return parse(unpack(data), settings.limits.frames)
+        return parse(unpack(data), settings.limits.frames, engine.policy.embodiment)
 
     return read() if len(data) <= SMALL else await engine.decode(read)
 
@@ -79,8 +79,8 @@ class Session:
     async def _add(self, request: AddBuffer) -> None:
         if request.exec_start > 0:
             self._exec_start = request.exec_start
-        self._check_room(len(request.front))
-        await self._engine.run(self._remember(request.front), self._pieces(request.front))
+        self._check_room(len(request.frames))
+        await self._engine.run(self._remember(request.frames), self._pieces(request.frames))
 
     async def _infer(self, request: Infer) -> np.ndarray:
         policy = self._engine.policy
@@ -91,12 +91,12 @@ class Session:
                 "is_first_step is false but this episode has no frame here: its first request must come first. Was the "
                 "server restarted, or the connection lost? Reset and begin the episode again."
             )
-        if request.front is None and self.episode.frames_seen == 0 and policy.memory is not None:
+        if request.frames is None and self.episode.frames_seen == 0 and policy.memory is not None:
             raise UserError("This policy remembers past frames: send them with add_buffer, the current one included.")
-        if request.front is not None:
-            self._check_room(len(request.front))
+        if request.frames is not None:
+            self._check_room(len(request.frames))
             if request.first:
-                self._exec_start = len(request.front) - 1
+                self._exec_start = len(request.frames) - 1
         elif self._reads_past_actions and self._seen_when_acting == self.episode.frames_seen:
             raise UserError(
                 "This policy reads which actions were executed, one a frame: send the frames since the last chunk with "
@@ -104,29 +104,29 @@ class Session:
             )
         episode = self.episode
         episode.goal, episode.subgoal = request.goal, self._subgoal(request)
-        await self._engine.run(self._observe(request), self._pieces(request.front or ()))
+        await self._engine.run(self._observe(request), self._pieces(request.frames or ()))
         chunk = await self._engine.act(episode)
         if not np.isfinite(chunk).all():
             raise RuntimeError("the policy's answer is not finite")
         self._seen_when_acting = episode.frames_seen
         # A challenge client executes all it is given; an MME-VLA client cuts the chunk itself.
-        return chunk if request.front is None else chunk[: self._settings.execute]
+        return chunk if request.frames is None else chunk[: self._settings.executed(policy.embodiment)]
 
     def _observe(self, request: Infer) -> Iterator[None]:
-        if request.front is not None:
-            yield from self._remember(request.front)
-        self.episode.look(request.image, request.wrist_image, request.state)
+        if request.frames is not None:
+            yield from self._remember(request.frames)
+        self.episode.look(request.pictures, request.state)
         _ = self.episode.prompt  # a goal that cannot be read fails here, and not in a batch with others
 
-    def _remember(self, front: Sequence[np.ndarray]) -> Iterator[None]:
+    def _remember(self, frames: Sequence[np.ndarray]) -> Iterator[None]:
         """Take frames into memory, pausing after every `encode_chunk` frames that have to be encoded."""
         episode, piece = self.episode, self._piece
-        for start in range(0, len(front), piece):
+        for start in range(0, len(frames), piece):
             if start:
                 yield
-            frames = np.stack(front[start : start + piece])
-            demo = episode.frames_seen + np.arange(len(frames)) < self._exec_start
-            episode.remember(frames, demo)
+            taken = np.stack(frames[start : start + piece])
+            demo = episode.frames_seen + np.arange(len(taken)) < self._exec_start
+            episode.remember(taken, demo)
 
     @property
     def _piece(self) -> int:
@@ -134,8 +134,8 @@ class Session:
         memory = self._engine.policy.memory
         return self._settings.encode_chunk * (1 if memory is None else memory.storage.keep_every)
 
-    def _pieces(self, front: Sequence[np.ndarray]) -> int:
-        return max(1, -(-len(front) // self._piece))
+    def _pieces(self, frames: Sequence[np.ndarray]) -> int:
+        return max(1, -(-len(frames) // self._piece))
 
     def _check_room(self, count: int) -> None:
         total, most = self.episode.frames_seen + count, self._settings.limits.frames

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
+from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.serving.listen import is_local
 
@@ -39,8 +40,8 @@ class ServeSettings:
     host: str = "127.0.0.1"
     port: int = 8001
     api_key: str | None = field(default=None, repr=False)
-    action_space: str = "joint_angle"
-    execute: int = 16
+    action_space: str | None = None
+    execute: int | None = None
     flow_steps: int = 10
     seed: int = 42
     max_batch: int = 16
@@ -49,13 +50,8 @@ class ServeSettings:
     limits: Limits = Limits()
 
     def __post_init__(self) -> None:
-        if self.action_space not in ACTION_SPACES:
+        if self.action_space is not None and self.action_space not in ACTION_SPACES:
             raise UserError(f"action_space={self.action_space!r}. {did_you_mean(self.action_space, ACTION_SPACES)}")
-        if self.action_space != "joint_angle":
-            raise UserError(
-                f"action_space={self.action_space}: these policies answer with joint angles, 8 numbers a step. Ask the "
-                "client for joint_angle; no conversion to end-effector poses is offered."
-            )
         key = self.api_key
         if key is not None and not (
             isinstance(key, str) and key.isascii() and key.isprintable() and key.strip() == key != ""
@@ -63,7 +59,7 @@ class ServeSettings:
             raise UserError("api_key must be a text of plain ASCII without blanks around it; null asks for none.")
         if not isinstance(self.port, int) or not 0 <= self.port < 65536:
             raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
-        for name in ("execute", "flow_steps", "max_batch", "encode_chunk"):
+        for name in ("flow_steps", "max_batch", "encode_chunk", *(() if self.execute is None else ("execute",))):
             _positive(name, getattr(self, name), whole=True)
         _positive("log_every_s", self.log_every_s)
         for spec in fields(self.limits):
@@ -78,6 +74,27 @@ class ServeSettings:
         if found.get("api_key") == "":  # an empty environment variable, as compose files leave it
             found["api_key"] = None
         return cls(**found, limits=Limits(**config.get("limits", {})))
+
+    def executed(self, robot: Embodiment) -> int:
+        """Actions of a chunk that a challenge client gets, and executes."""
+        return min(self.execute or robot.action.execute, robot.action.horizon)
+
+    def check_robot(self, robot: Embodiment, past_actions: int = 0) -> None:
+        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this.
+
+        Raises:
+            UserError: it answers in another action space, or would have to know what no request tells.
+        """
+        if past_actions and robot.action.frames is None:
+            raise UserError(
+                f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
+                f"many motions of {robot.name!r} they took: it cannot be served."
+            )
+        if self.action_space not in (None, robot.action.space):
+            raise UserError(
+                f"action_space={self.action_space}: this policy answers with {robot.action.space}, "
+                f"{robot.action.width} numbers an action, and nothing is converted. Ask the client for that."
+            )
 
     @property
     def local_only(self) -> bool:

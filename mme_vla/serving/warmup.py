@@ -15,6 +15,8 @@ def warm_up(policy: Policy, settings: ServeSettings) -> None:
     for episode in episodes:
         episode.subgoal = "warm up"
         episode.remember(frames)
-        episode.look(frames[0], frames[0], np.zeros(8, np.float32))
+        robot = policy.embodiment
+        view = dict.fromkeys(robot.camera_names, frames[0])
+        episode.look(view, np.zeros(robot.state.width, np.float32))
     policy.act(episodes[:1], settings.flow_steps)
     policy.act(episodes, settings.flow_steps)

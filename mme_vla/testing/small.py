@@ -8,6 +8,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy
@@ -23,19 +24,20 @@ ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hyb
 SMALL_VISION = {"image_size": 64, "patch_size": 4, "width": 32, "depth": 1, "mlp_dim": 64, "num_heads": 2}
 
 
-def unit_stats() -> NormStats:
+def unit_stats(robot: Embodiment = ROBOMME_JOINT) -> NormStats:
     """Statistics that leave numbers about as they are."""
 
-    def quantiles() -> QuantileStats:
-        return QuantileStats(q01=-np.ones(8), q99=np.ones(8), mean=np.zeros(8), std=np.ones(8))
+    def quantiles(width: int) -> QuantileStats:
+        ones = np.ones(width)
+        return QuantileStats(q01=-ones, q99=ones.copy(), mean=np.zeros(width), std=ones.copy())
 
-    return NormStats(state=quantiles(), actions=quantiles())
+    return NormStats(state=quantiles(robot.state.width), actions=quantiles(robot.action.width))
 
 
 def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
     """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive norms are shut)."""
     policy = build_from_config(_composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed)
-    policy.require_processor().stats = unit_stats()
+    policy.require_processor().stats = unit_stats(policy.embodiment)
     open_gates(policy)
     return policy
 
@@ -82,12 +84,12 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
 def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:
     """A batch of noise pictures, short prompts and random actions."""
     generator = torch.Generator().manual_seed(seed)
-    size, length = policy.backbone.image_size, 16
+    size, length, views = policy.backbone.image_size, 16, len(policy.embodiment.cameras)
     prompt_mask = torch.zeros(batch, length, dtype=torch.bool)
     prompt_mask[:, : length // 2] = True
     return Batch(
-        images=torch.randint(0, 256, (batch, 2, 3, size, size), generator=generator, dtype=torch.uint8),
-        image_mask=torch.ones(batch, 2, dtype=torch.bool),
+        images=torch.randint(0, 256, (batch, views, 3, size, size), generator=generator, dtype=torch.uint8),
+        image_mask=torch.ones(batch, views, dtype=torch.bool),
         prompt=torch.randint(4, 100, (batch, length), generator=generator) * prompt_mask,
         prompt_mask=prompt_mask,
         history=random_history(policy, batch, valid, seed),

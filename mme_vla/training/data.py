@@ -48,14 +48,14 @@ def prepare_data(
     Raises:
         UserError: whatever is wrong with the data, before any training.
     """
-    sources = open_sources(data["sources"])
+    sources = open_sources(data["sources"], policy.embodiment)
     split = split_episodes(sources, data["val_fraction"], data["val_episodes"])
     processor, offset = policy.require_processor(), data["action_offset"]
     if stats_from is not None:
         check_sums(stats_from, [STATS_FILE])
         processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
-        processor.stats = compute_norm_stats(sources, split.train, processor.horizon, offset, seed)
+        processor.stats = compute_norm_stats(sources, split.train, processor.horizon, offset, seed, policy.embodiment)
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:

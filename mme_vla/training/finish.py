@@ -42,11 +42,14 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
 
 
 def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
-    """A sentence on the joints that holding still would predict better; empty where there are none.
+    """A sentence on the numbers that holding still would predict better; empty where there are none.
 
     Args:
-        summary: of the open-loop check. steps: updates of the run.
+        summary: of the open-loop check; without `mean_abs_error_holding_still` where the state is no action.
+        steps: updates of the run.
     """
+    if "mean_abs_error_holding_still" not in summary:
+        return ""
     pairs = zip(summary["mean_abs_error"], summary["mean_abs_error_holding_still"], strict=True)
     worse = sum(error > still for error, still in pairs)
     if not worse:

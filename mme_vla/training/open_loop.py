@@ -10,19 +10,20 @@ import torch
 
 from mme_vla.backbone.base import stack_draws
 from mme_vla.data.dataset import TrainingDataset, collate
+from mme_vla.embodiment import ActionSpace, Embodiment
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
-
-JOINTS = (*(f"joint {i}" for i in range(1, 8)), "gripper")
 
 
 @dataclass(frozen=True)
 class OpenLoop:
     """Chunks of n steps along one episode.
 
-    steps: [n] frames they start at. predicted, recorded: [n, h, 8] absolute joint angles (rad) and gripper command.
-    valid: [n, h] False on actions beyond the episode's end. scale: [8] half the (q01, q99) range of each dimension.
-    still: [n, 8] the state held, which a policy that does not move would answer.
+    steps: [n] frames they start at. predicted, recorded: [n, h, w] absolute actions of the robot's `space`.
+    valid: [n, h] False on actions beyond the episode's end. scale: [w] half the (q01, q99) range of each
+        dimension; 1 where it never changes.
+    still: [n, w] the state held, which a policy that does not move would answer; None where an action is not a state
+        to come.
     """
 
     title: str
@@ -31,22 +32,26 @@ class OpenLoop:
     recorded: np.ndarray
     valid: np.ndarray
     scale: np.ndarray
-    still: np.ndarray
+    still: np.ndarray | None
+    space: ActionSpace
 
     def error(self, predicted: np.ndarray | None = None) -> np.ndarray:
-        """Mean absolute error [8] in physical units (radians; gripper −1 … 1)."""
+        """Mean absolute error [w] in the units of the actions."""
         difference = np.abs((self.predicted if predicted is None else predicted) - self.recorded)
         return (difference * self.valid[..., None]).sum((0, 1)) / self.valid.sum()
 
     def summary(self) -> dict[str, Any]:
         """The errors, plain: physical and normalised (1 = half the range of the training data's deltas)."""
         physical = self.error()
-        still = np.broadcast_to(self.still[:, None], self.recorded.shape)
+        still = {}
+        if self.still is not None:
+            held = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
+            still = {"mean_abs_error_holding_still": held.round(5).tolist()}
         return {
-            "joints": list(JOINTS),
+            "joints": list(self.space.names),
             "mean_abs_error": physical.round(5).tolist(),
             "mean_abs_error_normalised": (physical / self.scale).round(5).tolist(),
-            "mean_abs_error_holding_still": self.error(still).round(5).tolist(),
+            **still,
             "chunks": len(self.steps),
         }
 
@@ -60,8 +65,8 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     """
     processor = policy.require_processor()
     horizon = policy.horizon
-    source, episode, first = samples.locate(0)
-    count = int(samples.sources[source].lengths[episode]) - first
+    source, episode, _ = samples.locate(0)
+    count = len(samples.sources[source].decisions(episode))
     starts = np.arange(0, count, horizon)
     starts = starts[np.linspace(0, len(starts) - 1, min(chunks, len(starts))).round().astype(int)].tolist()
     predicted = []
@@ -75,6 +80,7 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     recorded = [samples.step(i) for i in starts]
     stats = processor.stats
     assert stats is not None
+    half_range = (stats.actions.q99 - stats.actions.q01) / 2
     kind = "held-out" if held_out else "training"
     name = samples.sources[source]
     return OpenLoop(
@@ -83,36 +89,41 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
         predicted=torch.cat(predicted).numpy(),
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
-        scale=(stats.actions.q99 - stats.actions.q01) / 2,
-        still=np.stack([step.state for step in recorded]),
+        scale=np.where(half_range > 0, half_range, 1),
+        still=np.stack([step.state for step in recorded]) if _held_by_state(processor.embodiment) else None,
+        space=processor.embodiment.action,
     )
 
 
+def _held_by_state(robot: Embodiment) -> bool:
+    """Whether the state, given as the action, holds the robot still."""
+    return bool(robot.action.relative) and robot.action.width == robot.state.width
+
+
 def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
-    """Draw the recorded actions as a line and each predicted chunk on top, one panel a joint."""
+    """Draw the recorded actions as a line and each predicted chunk on top, one panel a number."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(13, 9.5), layout="constrained")
+    rows = -(-result.space.width // 2)
+    figure = Figure(figsize=(13, 2.4 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(4, 2, sharex=True).flatten()
+    panels = figure.subplots(rows, 2, sharex=True, squeeze=False).flatten()
     errors, scaled = result.error(), result.error() / result.scale
     time = result.steps[:, None] + np.arange(result.recorded.shape[1])
-    for joint, panel in enumerate(panels):
+    for joint, panel in enumerate(panels[: result.space.width]):
         panel.plot(*_unbroken(time, result.recorded[..., joint], result.valid), color="0.25", lw=2.2, label="recorded")
         for i, valid in enumerate(result.valid):
             chunk = result.predicted[i, valid, joint]
             panel.plot(time[i, valid], chunk, color="tab:orange", lw=1.5, label="predicted chunk" if i == 0 else None)
             panel.plot(time[i, :1], chunk[:1], "o", color="tab:orange", ms=4)
-        unit = " rad" if joint < 7 else ""
         panel.set_title(
-            f"{JOINTS[joint]}: mean error {errors[joint]:.3f}{unit} ({scaled[joint]:.2f} normalised)",
+            f"{result.space.names[joint]}: mean error {errors[joint]:.3f} ({scaled[joint]:.2f} normalised)",
             fontsize=10, loc="left",
         )  # fmt: skip
-        panel.set_ylabel("rad" if joint < 7 else "−1 closed · 1 open", fontsize=9)
+        panel.set_ylabel(result.space.units[joint], fontsize=9)
         panel.grid(alpha=0.25)
         panel.margins(x=0.01)
-    panels[-1].set_ylim(-1.4, 1.4)
     for panel in panels[-2:]:
         panel.set_xlabel("step of the episode; a dot marks where a chunk was predicted", fontsize=9)
     figure.suptitle(f"{name}, open loop on {result.title}", x=0.01, ha="left", fontsize=12)
@@ -129,7 +140,11 @@ def _unbroken(time: np.ndarray, values: np.ndarray, valid: np.ndarray) -> tuple[
 
 def error_lines(summary: Mapping[str, Any]) -> Sequence[str]:
     """The errors as a small table for the console."""
-    keys = ("joints", "mean_abs_error", "mean_abs_error_normalised", "mean_abs_error_holding_still")
-    rows = zip(*(summary[key] for key in keys), strict=True)
-    head = f"{'':8}  {'error':>8}  {'normalised':>10}  {'holding still':>13}"
-    return [head, *(f"{name:8}  {error:8.4f}  {scaled:10.3f}  {still:13.4f}" for name, error, scaled, still in rows)]
+    columns = {"error": "mean_abs_error", "normalised": "mean_abs_error_normalised"}
+    if "mean_abs_error_holding_still" in summary:
+        columns["holding still"] = "mean_abs_error_holding_still"
+    width = max(map(len, [*summary["joints"], " " * 8]))
+    lines = ["  ".join([" " * width, *(f"{title:>13}" for title in columns)])]
+    for i, name in enumerate(summary["joints"]):
+        lines.append("  ".join([f"{name:{width}}", *(f"{summary[key][i]:13.4f}" for key in columns.values())]))
+    return lines

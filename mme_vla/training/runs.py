@@ -6,6 +6,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.files import FolderLock, plain
 from mme_vla.files.locks import LOCK
@@ -90,7 +91,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     if checkpoint is None:
         return Run(folder)
     state = read_state(checkpoint)
-    changed = differing_keys(state["config"], config)
+    then, now = ({**c, "embodiment": embodiment_of(c).to_dict()} for c in (state["config"], config))
+    changed = differing_keys(then, now)
     if changed:
         pairs = [
             f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now" for key, (old, new) in changed.items()

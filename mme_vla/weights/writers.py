@@ -12,13 +12,14 @@ from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.normalisers import NormStats
-from mme_vla.processing.processor import STATS_FILE, VIEWS
+from mme_vla.processing.processor import STATS_FILE
 from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
 from mme_vla.weights.source import VARIANTS
 
+VIEWS = {"front": "base_0_rgb", "wrist": "left_wrist_0_rgb"}  # π0.5's names of RoboMME's cameras
 ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
 _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 
@@ -45,14 +46,15 @@ def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: No
 
     LeRobot's own processors write the state into the prompt, and know no RoboMME statistics: they are not part of this.
     """
-    size = policy.backbone.image_size
-    features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in VIEWS}
-    width = 8 if stats is None else len(stats.actions)
+    size, robot = policy.backbone.image_size, policy.embodiment
+    views = [VIEWS.get(name, name) for name in robot.camera_names]
+    features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in views}
+    absolute = [name for i, name in enumerate(robot.action.names) if i not in robot.action.relative]
     about = {
         "type": "pi05",
         "n_obs_steps": 1,
-        "input_features": {**features, "observation.state": {"type": "STATE", "shape": [width]}},
-        "output_features": {"action": {"type": "ACTION", "shape": [width]}},
+        "input_features": {**features, "observation.state": {"type": "STATE", "shape": [robot.state.width]}},
+        "output_features": {"action": {"type": "ACTION", "shape": [robot.action.width]}},
         **_SIZES,
         "dtype": _name(dtype),
         "chunk_size": policy.horizon,
@@ -60,9 +62,9 @@ def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: No
         "max_state_dim": policy.action_dim,
         "max_action_dim": policy.action_dim,
         "image_resolution": [size, size],
-        # Joints against the current state, the gripper as it is: what these weights answer with.
-        "use_relative_actions": True,
-        "relative_exclude_joints": ["gripper"],
+        # Of RoboMME's Panda: joints against the current state, the gripper as it is.
+        "use_relative_actions": bool(robot.action.relative),
+        "relative_exclude_joints": absolute,
     }
     _write_json(folder / "config.json", about)
     _write_safetensors(to_lerobot(policy, policy.state_dict()), folder, dtype)

@@ -12,15 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.data.cache.store import (
-    DTYPES,
-    FINGERPRINT,
-    MEMORY_VIEW,
-    check_fingerprint,
-    score_file,
-    sum_file,
-    token_file,
-)
+from mme_vla.data.cache.store import DTYPES, FINGERPRINT, check_fingerprint, score_file, sum_file, token_file
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
@@ -133,7 +125,7 @@ def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int
         wanted = np.arange(start, stop) if scorer is not None else here
         if not len(wanted):
             continue
-        pictures = source.frames(episode, wanted, MEMORY_VIEW)
+        pictures = source.frames(episode, wanted)
         frames, values = [], []
         if scorer is not None:
             for frame, picture in zip(wanted.tolist(), pictures, strict=True):

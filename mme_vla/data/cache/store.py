@@ -7,6 +7,7 @@ never replaced unless asked to.
 """
 
 import os
+import re
 from collections import OrderedDict
 from hashlib import sha256
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError, brief
 from mme_vla.files import Sums, decoding, read_json, require_file
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
@@ -24,7 +26,6 @@ if TYPE_CHECKING:
 
 FORMAT = 1  # of the files below
 PREPROCESSING = "antialiased bilinear resize with padding to the encoder's size, [-1, 1]"
-MEMORY_VIEW = "image"
 FINGERPRINT = "fingerprint.json"
 COMMAND = "python -m mme_vla.data.cache model=<model> data=<data>"
 DTYPES = {"bfloat16": np.uint16, "float32": np.float32}  # bfloat16 is stored as its bits
@@ -56,7 +57,7 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
         "format": FORMAT,
         "encoder": encoder,
         "preprocessing": PREPROCESSING,
-        "view": MEMORY_VIEW,
+        "view": source.columns[source.robot.memory_camera],
         "dtype": dtype,
         "storage": spec.to_dict(),
         "dataset": {"content": source.fingerprint, "episodes": len(source), "frames": int(source.lengths.sum())},
@@ -64,11 +65,13 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
 
 
 def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) -> Path:
-    """The folder of a cache below `root`: readable, and another one for another dataset, encoder or pooling."""
+    """The folder of a cache below `root`: readable, and another one for another dataset, encoder, pooling or camera."""
     spec = StorageSpec(**expected["storage"])
     scorer = f"-{spec.scorer}" if spec.scorer else ""
     encoder = sha256(f"{expected['encoder']}{expected['dtype']}".encode()).hexdigest()[:8]
-    name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}-{encoder}"
+    # RoboMME's memory camera goes without saying, as in caches that were built before there were others.
+    view = "" if expected["view"] == ROBOMME_JOINT.cameras[0].key else re.sub(r"[^\w.-]", "_", f"-{expected['view']}")
+    name = f"{spec.grid}x{spec.grid}-{spec.pooling}-every{spec.keep_every}{scorer}{view}-{encoder}"
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
 

@@ -21,7 +21,7 @@ from mme_vla.evaluation.results.cost_table import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.types import VIEWS, Batch, HistoryTokens
+from mme_vla.types import Batch, HistoryTokens
 
 
 def count_model(model: str, budget: int | None = None, backbone: str = "pi05") -> ModelCost:
@@ -68,16 +68,16 @@ def on_meta(model: str, budget: int | None = None, backbone: str = "pi05") -> tu
 
 
 def full_batch(policy: MMEPolicy, prompt: int, device: str = "cpu") -> Batch:
-    """A batch of one without content: two views, `prompt` tokens without padding, and a memory that is full."""
-    size, history = policy.backbone.image_size, None
+    """A batch of one without content: all views, `prompt` tokens without padding, and a memory that is full."""
+    size, views, history = policy.backbone.image_size, len(policy.embodiment.cameras), None
     if policy.memory is not None:
         n = policy.memory.padded_length(policy.memory.capacity)
         features = torch.zeros(1, n, policy.backbone.vision_width, device=device)
         mask = torch.ones(1, n, dtype=torch.bool, device=device)
         history = HistoryTokens(features, torch.zeros(1, n, 3, device=device), mask)
     return Batch(
-        images=torch.zeros(1, len(VIEWS), 3, size, size, dtype=torch.uint8, device=device),
-        image_mask=torch.ones(1, len(VIEWS), dtype=torch.bool, device=device),
+        images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
+        image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
         prompt=torch.full((1, prompt), 5, device=device),
         prompt_mask=torch.ones(1, prompt, dtype=torch.bool, device=device),
         history=history,

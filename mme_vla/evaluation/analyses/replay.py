@@ -10,7 +10,6 @@ from mme_vla.errors import UserError
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.subgoal_text import SubgoalText
-from mme_vla.types import VIEWS
 
 STRIDE = 16
 """Steps between two chunks, as an evaluation executes them."""
@@ -44,9 +43,11 @@ def replay(
     running, seen = policy.start_episode(source.goal(episode)), 0
     for step in steps.tolist():
         indices = np.arange(seen, step + 1)
-        views = {view: source.frames(episode, indices, view) for view in VIEWS}
+        views = {view: source.frames(episode, indices, view) for view in policy.embodiment.camera_names}
         executed = indices[indices >= start]
         actions = source.actions(episode)[np.maximum(executed - 1, 0)]
+        if source.robot.action.frames is None:
+            actions = source.past_actions(episode, step, len(actions))
         running.observe(views, source.states(episode, seen, step + 1), indices < start, actions)
         seen = step + 1
         if text is not None:
@@ -83,4 +84,4 @@ def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:
     """Normalisation statistics for a fresh policy, which has none: those of the data it is shown."""
     processor = policy.require_processor()
     if processor.stats is None:
-        processor.stats = compute_norm_stats([source], horizon=processor.horizon)
+        processor.stats = compute_norm_stats([source], horizon=processor.horizon, robot=processor.embodiment)

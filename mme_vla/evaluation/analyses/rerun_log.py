@@ -9,7 +9,6 @@ from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.types import VIEWS
 
 _JPEG_QUALITY = 90
 
@@ -59,7 +58,7 @@ class RerunLog:
     def views(self, source: EpisodeSource, episode: int, step: int) -> None:
         """Go to a step of a recorded episode, and log its pictures and words."""
         self.at(episode, step)
-        for view in VIEWS:
+        for view in source.robot.camera_names:
             self.picture(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
         self.words("goal", source.goal(episode))
         for kind, text in source.subgoals(episode, step).items():

@@ -5,15 +5,18 @@ policy reads, and its report says where the time went.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment.robomme import CAMERAS, benchmark_state
 from mme_vla.envs.make import make_env
 from mme_vla.envs.task_names import STICK_TASKS
+from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.film import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
@@ -24,7 +27,7 @@ REPORTED = (
 _BLIND = np.zeros((256, 256, 3), np.uint8)
 
 Observation = dict[str, Any]
-"""`front`, `wrist`: lists of uint8 [H, W, 3]; `state`: float32 [t, 8], seven joint angles and the first finger."""
+"""Every camera by its name: lists of uint8 [H, W, 3]; `state`: float32 [t, s]."""
 
 
 class RenderClock:
@@ -54,20 +57,27 @@ class RenderClock:
 
 
 class ChunkEnv:
-    """One episode that takes chunks of joint-angle actions.
+    """One episode that takes chunks of actions.
 
     Args:
         make: builds an environment with the benchmark's interface.
-        stick: its robot holds a stick, and takes 7 numbers instead of 8.
+        stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
         max_steps: actions after which the outcome is `timeout`, should the environment itself not say so: one more
             than this is executed, as in the benchmark.
         video: draws the episode as it goes.
+        robot: says which cameras are read and how wide an action is.
     """
 
     def __init__(
-        self, make: Callable[[], Any], stick: bool = False, max_steps: int = 1300, video: EpisodeVideo | None = None
+        self,
+        make: Callable[[], Any],
+        stick: bool = False,
+        max_steps: int = 1300,
+        video: EpisodeVideo | None = None,
+        robot: Embodiment = ROBOMME_JOINT,
     ) -> None:
-        self._numbers, self._max_steps, self._video = 7 if stick else 8, max_steps, video
+        self._robot, self._numbers = robot, robot.action.width - stick
+        self._max_steps, self._video = max_steps, video
         self._clock = RenderClock()
         self._simulating = self._rendered = 0.0
         self._steps = 0
@@ -79,7 +89,7 @@ class ChunkEnv:
         """All frames of the conditioning video, the current one last, and the report."""
         with self._simulation():
             observation, info = self._env.reset()
-        frames = _Frames()
+        frames = _Frames(self._robot.camera_names)
         count = frames.add(observation)
         self._draw(frames, count, demo=count - 1)
         return frames.observation(), self._report(info)
@@ -88,12 +98,13 @@ class ChunkEnv:
         """Execute actions one after the other until they, or the episode, are over.
 
         Args:
-            command: `actions` [n, 8]; `subgoal`, the text that stands in the video meanwhile.
+            command: `actions` [n, w]; `subgoal`, the text that stands in the video meanwhile.
 
         Returns:
-            One frame an executed action, 0, terminated, truncated, and the report with `executed`.
+            The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
+            actions, and `steps`, that of frames.
         """
-        frames, executed = _Frames(), 0
+        frames, executed, seen = _Frames(self._robot.camera_names), 0, 0
         terminated = truncated = False
         info: dict[str, Any] = {}
         for action in np.asarray(command["actions"]):
@@ -102,15 +113,19 @@ class ChunkEnv:
             terminated, truncated = bool(ended), bool(cut)
             if info.get("status") == "error":
                 terminated = True
+                if _is_unreachable(observation, info):
+                    info = {**info, "status": "fail"}
                 break
             executed += 1
-            self._steps += 1
-            self._draw(frames, frames.add(observation), caption=command.get("subgoal"))
+            count = frames.add(observation)
+            seen += count
+            self._steps += count
+            self._draw(frames, count, caption=command.get("subgoal"))
             if not (terminated or truncated) and self._steps > self._max_steps:
                 truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
                 break
-        report = self._report(info) | {"executed": executed}
+        report = self._report(info) | {"executed": executed, "steps": seen}
         if terminated or truncated:
             report |= self._finish_video(report)
         return frames.observation(), 0.0, terminated, truncated, report
@@ -150,33 +165,37 @@ class ChunkEnv:
         return {} if path is None else {"video": path.name}
 
 
-class _Frames:
-    """Collects frames in the policy's form."""
+def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
+    """Whether an action asked for a pose that no joints or no motion reach: the policy's failure, not the machine's."""
+    return observation == {} or info.get("exception_type") == "PlanningError"
 
-    def __init__(self) -> None:
-        self._front: list[np.ndarray] = []
-        self._wrist: list[np.ndarray] = []
+
+class _Frames:
+    """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
+
+    def __init__(self, cameras: Sequence[str]) -> None:
+        self._cameras = cameras
+        self._pictures: dict[str, list[np.ndarray]] = {name: [] for name in (*cameras, *CAMERAS)}
         self._states: list[np.ndarray] = []
 
     def add(self, observation: dict[str, list[Any]]) -> int:
         """Take the benchmark's lists; how many frames they hold."""
         joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
-        self._states += [
-            np.concatenate([np.asarray(q, np.float32)[:7], np.asarray(f, np.float32)[:1]])
-            for q, f in zip(joints, fingers, strict=True)
-        ]
-        blind = [_BLIND] * len(joints)  # of an environment that was asked not to render
-        self._front += observation.get("front_rgb_list", blind)
-        self._wrist += observation.get("wrist_rgb_list", blind)
+        self._states += [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
+        blind = not any(key.endswith("_rgb_list") for key in observation)  # it was asked not to render
+        for name, pictures in self._pictures.items():
+            if not blind and name in self._cameras and f"{name}_rgb_list" not in observation:
+                raise UserError(f"The environment has no camera {name!r}; it shows {', '.join(sorted(observation))}.")
+            pictures += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         return len(joints)
 
     def newest(self, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        start = len(self._front) - count
-        return zip(self._front[start:], self._wrist[start:], strict=True)
+        front, wrist = (self._pictures[name][len(self._states) - count :] for name in CAMERAS)
+        return zip(front, wrist, strict=True)
 
     def observation(self) -> Observation:
-        state = np.stack(self._states) if self._states else np.zeros((0, 8), np.float32)
-        return {"front": self._front, "wrist": self._wrist, "state": state}
+        state = np.stack(self._states) if self._states else np.zeros((0, ROBOMME_JOINT.state.width), np.float32)
+        return {**{name: self._pictures[name] for name in self._cameras}, "state": state}
 
 
 def make_rollout_env(
@@ -187,6 +206,7 @@ def make_rollout_env(
     base: Callable[..., Any] = make_env,
     max_steps: int = 1300,
     videos: tuple[str, str] | None = None,
+    robot: Embodiment = ROBOMME_JOINT,
     **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
@@ -194,6 +214,7 @@ def make_rollout_env(
     Args:
         base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
         videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
+        robot: the policy's.
     """
     video = None
     if videos is not None:
@@ -204,4 +225,5 @@ def make_rollout_env(
         stick=task in STICK_TASKS or (task in TASKS and bool(getattr(TASKS[task], "stick", False))),
         max_steps=max_steps,
         video=video,
+        robot=robot,
     )

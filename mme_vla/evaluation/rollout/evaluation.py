@@ -6,7 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mme_vla.envs.make import make_env
+from mme_vla.embodiment.robomme import check_benchmark
+from mme_vla.envs.make import ACTION_SPACES, make_env
 from mme_vla.envs.vector.jobs import Job
 from mme_vla.envs.vector.pool import VecEnv
 from mme_vla.errors import UserError
@@ -73,6 +74,8 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
+    if base is make_env:
+        check_benchmark(policy.embodiment, ACTION_SPACES)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
     shard = shard or Shard()
     mine = take_share(jobs, shard)
@@ -101,9 +104,10 @@ def _run(
 ) -> Workload:
     if not jobs:
         return Workload()
-    options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps}
+    robot = policy.embodiment
+    options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
     if base is make_env:
-        options |= {"env": settings.env, "render": settings.render}
+        options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
     workers = settings.worker_count(len(jobs))
@@ -126,7 +130,7 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
     batches may change the last bits of an action.
     """
-    kept = ("seed", "split", "env", "max_steps", "execute", "flow_steps", "render")
+    kept = ("seed", "split", "env", "max_steps", "flow_steps", "render")
     dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
     return {
         "model": facts.model,
@@ -135,6 +139,7 @@ def run_settings(
         "policy": fingerprint(dict(policy.config)),
         "dtype": dtype,
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
+        "execute": settings.execute or policy.embodiment.action.execute,
         **{name: getattr(settings, name) for name in kept},
     }
 

@@ -180,7 +180,7 @@ class Rollout:
         share = (time.perf_counter() - begun) / len(batch)
         for running, chunk in zip(batch, chunks, strict=True):
             running.thought(share)
-            actions = chunk[: self.settings.execute]
+            actions = chunk[: self.settings.execute or self.policy.embodiment.action.execute]
             if not np.isfinite(actions).all():
                 self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
                 continue
@@ -194,12 +194,15 @@ class Rollout:
         if outcome == "error":
             error = error or f"the environment ended the episode with the status {status!r}"
         spec = metadata.episode(job.task, job.split, job.episode)
+        robot = self.policy.embodiment
         record = EpisodeRecord(
-            **vars(self.facts), task=job.task, episode=job.episode, seed=spec.seed, difficulty=spec.difficulty,
-            outcome=outcome, steps=running.steps, seconds=running.seconds, error=error,
+            **vars(self.facts), action_space=robot.action.space or robot.name, task=job.task, episode=job.episode,
+            seed=spec.seed, difficulty=spec.difficulty,
+            outcome=outcome, steps=running.steps, seconds=running.seconds, error=error if outcome == "error" else None,
             extra={
                 "env": self.settings.env, "goal": running.episode.goal, "chunks": running.chunks,
                 "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
+                **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
                 **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },

@@ -50,10 +50,11 @@ class RunningEpisode:
         self.video_frames = 0
         self.video = ""
         self._actions = hashlib.sha256()
-        self._sent = np.zeros((0, 8), np.float32)
+        self._robot = policy.embodiment
+        self._sent = np.zeros((0, self._robot.action.width), np.float32)
         self._sim = self._render = self._thinking = 0.0
         self._begun = time.perf_counter()
-        self._frames: Observation = {"front": [], "wrist": [], "state": np.zeros((0, 8), np.float32)}
+        self._frames: Observation = {"state": np.zeros((0, self._robot.state.width), np.float32)}
         self._demo = np.zeros(0, bool)
         self._led: np.ndarray | None = None
         self._info: dict[str, Any] = {}
@@ -65,14 +66,15 @@ class RunningEpisode:
         self.episode.goal = goal
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
-            video = np.stack(frames["front"][:-1]) if self.video_frames else None
+            video = np.stack(frames[self._robot.memory_camera][:-1]) if self.video_frames else None
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
         self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None, info)
 
     def go_on(self, frames: Observation, info: dict[str, Any]) -> None:
-        """Take the frames that the executed actions led to, one each."""
+        """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
         count = self._count(info)
-        self._expect(frames, np.zeros(count, bool), self._sent[:count], info)
+        seen = count if self._robot.action.frames is not None else len(frames["state"])
+        self._expect(frames, np.zeros(seen, bool), self._sent[:count], info)
 
     def end(self, info: dict[str, Any]) -> None:
         """Take the report of the last actions; their frames are not needed any more."""
@@ -94,11 +96,13 @@ class RunningEpisode:
         """Take one piece of the waiting frames into memory."""
         begun = time.perf_counter()
         part = slice(self._at, self._at + self._piece)
-        front, wrist = (np.stack(self._frames[view][part]) for view in ("front", "wrist"))
-        led = None if self._led is None else self._led[part]
-        self.episode.observe({"image": front, "wrist_image": wrist}, self._frames["state"][part], self._demo[part], led)
+        views = {name: np.stack(self._frames[name][part]) for name in self._robot.camera_names}
+        led = self._led
+        if led is not None:  # one action a frame; or some motions, all told with the first of their frames
+            led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
+        self.episode.observe(views, self._frames["state"][part], self._demo[part], led)
         if self.watched is not None and not self._demo[part][-1]:
-            self.watched.observe(front[~self._demo[part]], self._info)
+            self.watched.observe(views[self._robot.memory_camera][~self._demo[part]], self._info)
         self._at = part.stop
         self.thought(time.perf_counter() - begun)
 
@@ -113,7 +117,7 @@ class RunningEpisode:
             self.trace.add(self.watched, subgoal, latency_s)
 
     def chosen(self, actions: np.ndarray) -> None:
-        """Note the actions [n, 8] that are sent to the environment."""
+        """Note the actions [n, w] that are sent to the environment."""
         self._sent = actions
         self.chunks += 1
 
@@ -133,7 +137,7 @@ class RunningEpisode:
 
     def _count(self, info: dict[str, Any]) -> int:
         count = int(info.get("executed", 0))
-        self.steps += count
+        self.steps += int(info.get("steps", count))
         self._actions.update(np.ascontiguousarray(self._sent[:count], np.float32).tobytes())
         return count
 

@@ -17,7 +17,7 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
-    execute: actions of a chunk that are executed before the policy is asked again.
+    execute: actions of a chunk that are executed before the policy is asked again; None: as the robot says.
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
     encode_chunk: frames encoded before other episodes may act.
@@ -30,7 +30,7 @@ class RolloutSettings:
     split: str = "test"
     env: str = "mme_vla"
     max_steps: int = MAX_STEPS
-    execute: int = 16
+    execute: int | None = None
     flow_steps: int = 10
     workers: int | None = None
     max_batch: int = 16
@@ -47,12 +47,13 @@ class RolloutSettings:
         ):  # fmt: skip
             if value not in known:
                 raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")
-        least = {"max_steps": 1, "execute": 1, "flow_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
+        least = {"max_steps": 1, "flow_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
         for name, smallest in least.items():
             self._whole(name, getattr(self, name), smallest)
         self._whole("seed", self.seed, 0)
-        if self.workers is not None:
-            self._whole("workers", self.workers, 1)
+        for name in ("workers", "execute"):
+            if getattr(self, name) is not None:
+                self._whole(name, getattr(self, name), 1)
         if not self.timeout_s > 0:
             raise UserError(f"timeout_s={self.timeout_s!r} must be a positive number of seconds.")
         if self.env == "official" and not self.render:

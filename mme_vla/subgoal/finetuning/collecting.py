@@ -21,6 +21,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.layout import SAMPLE
 from mme_vla.data.progress import progress
+from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.errors import UserError, brief
 from mme_vla.files import SUMS, FolderLock, claim_plan, file_sum, plain, read_json, write_atomically, write_sums
 from mme_vla.subgoal.finetuning.labels import Labels
@@ -201,8 +202,8 @@ def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int)
         int(source.exec_starts[episode]),
         [text["simple_subgoal"] for text in texts],
         [text["grounded_subgoal"] for text in texts],
-        source.states(episode)[:, :7],
-        source.actions(episode)[:, :7],
+        source.states(episode)[:, :ARM_JOINTS],
+        source.actions(episode)[:, :ARM_JOINTS],
     )
 
 

@@ -1,0 +1,50 @@
+"""Episodes as a sequence of planned motions: where each was decided, and where it was to end."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Motions:
+    """The motions of one episode's execution.
+
+    decisions: [m] int64, ascending; the last frame seen before each motion began. targets: [m, w] float32.
+    """
+
+    decisions: np.ndarray
+    targets: np.ndarray
+
+    def chunk(self, frame: int, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+        """The motions decided at `frame` and after it, the last one repeated.
+
+        Returns:
+            [horizon, w] float32, and [horizon] bool that is False on repeated ones.
+        """
+        places = np.searchsorted(self.decisions, frame) + np.arange(horizon)
+        return self.targets[np.minimum(places, len(self.targets) - 1)], places < len(self.targets)
+
+    def before(self, frame: int, most: int) -> np.ndarray:
+        """The last motions, at most so many, that were decided before `frame`; [n, w]."""
+        stop = int(np.searchsorted(self.decisions, frame))
+        return self.targets[max(stop - most, 0) : stop]
+
+
+def find_motions(rows: np.ndarray, first: int) -> Motions:
+    """Take apart a column that holds, for every frame, the target of the motion under way.
+
+    A motion begins where its target first stands in the column: that frame was seen when it had already begun, so it
+    was decided one frame before. The first one was decided at the first execution frame.
+
+    Args:
+        rows: [t, w] of the execution frames; NaN where no motion was noted yet. first: number of their first frame.
+    """
+    noted = np.flatnonzero(np.isfinite(rows).all(1))
+    targets = rows[noted]
+    new = np.ones(len(noted), bool)
+    new[1:] = (targets[1:] != targets[:-1]).any(1)
+    begun = noted[new]
+    decisions = np.maximum(begun - 1, np.arange(len(begun)))
+    if len(decisions):
+        decisions[0] = 0
+    return Motions(decisions.astype(np.int64) + first, targets[new].astype(np.float32))

@@ -1,0 +1,75 @@
+"""RoboMME's Panda in joint space: the robot of every checkpoint that does not say what robot it is for."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mme_vla.embodiment.actions import ActionSpace
+from mme_vla.embodiment.base import Camera, Embodiment, State
+from mme_vla.errors import UserError
+
+ARM_JOINTS = 7
+CAMERAS = ("front", "wrist")
+"""What the benchmark's environments show."""
+
+ROBOMME_JOINT = Embodiment(
+    name="robomme_joint",
+    cameras=(Camera("front", "image", "all"), Camera("wrist", "wrist_image", "colour")),
+    memory_camera="front",
+    state=State(ARM_JOINTS + 1, ("state",)),
+    action=ActionSpace(
+        width=ARM_JOINTS + 1,
+        key=("actions",),
+        space="joint_angle",
+        names=(*(f"joint {i}" for i in range(1, ARM_JOINTS + 1)), "gripper"),
+        units=(*["rad"] * ARM_JOINTS, "−1 closed · 1 open"),
+        relative=tuple(range(ARM_JOINTS)),
+        horizon=20,
+        execute=16,
+    ),
+    fps=20.0,
+    conditioning_video=True,
+)
+"""The same as `configs/embodiment/robomme_joint.yaml`; here too, so that a checkpoint loads without any YAML."""
+
+
+def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
+    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots could be chosen.
+
+    Raises:
+        UserError: a section `embodiment` that cannot be, or that does not fit the section `backbone`.
+    """
+    backbone = config.get("backbone", {})
+    if config.get("embodiment") is None:
+        return ROBOMME_JOINT.with_horizon(backbone.get("horizon", ROBOMME_JOINT.action.horizon))
+    found = Embodiment.from_dict(config["embodiment"])
+    if {"action_dim", "horizon"} <= set(backbone):
+        found.check_network(backbone["action_dim"], backbone["horizon"])
+    return found
+
+
+def benchmark_state(joints: Sequence[float] | np.ndarray, fingers: Sequence[float] | np.ndarray) -> np.ndarray:
+    """The state [8] float32 that RoboMME's robots have for a policy: the arm's joint angles and the first finger."""
+    arm, gripper = np.asarray(joints, np.float32)[:ARM_JOINTS], np.asarray(fingers, np.float32)[:1]
+    return np.concatenate([arm, gripper])
+
+
+def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
+    """Make sure that a robot can take part in the benchmark.
+
+    Raises:
+        UserError: it has no action space of `spaces`, other cameras, or another state than the benchmark's.
+    """
+    if robot.action.space not in spaces:
+        raise UserError(
+            f"The robot {robot.name!r} cannot be evaluated on the benchmark: its action space is "
+            f"{robot.action.space!r}, not one of {', '.join(spaces)} (embodiment.action.space)."
+        )
+    other = [name for name in robot.camera_names if name not in CAMERAS]
+    if other or robot.state.width != ROBOMME_JOINT.state.width:
+        seen = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"
+        raise UserError(
+            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {seen}, and the benchmark gives "
+            f"the cameras {', '.join(CAMERAS)} and {ROBOMME_JOINT.state.width} numbers."
+        )
