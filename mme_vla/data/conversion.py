@@ -238,7 +238,7 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
     from lerobot.utils.utils import SuppressProgressBars
 
-    sides = [json.loads((part / SIDE_FILE).read_text()) for part in parts]
+    sides = [read_json(part / SIDE_FILE, "the facts of a converted episode") for part in parts]
     with SuppressProgressBars():  # one bar for the merge, not one for every file it reads
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
