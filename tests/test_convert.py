@@ -54,6 +54,18 @@ def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(tmp_p
     assert np.array_equal(frames[:, :, 8:], np.repeat(frames[:1, :, 8:], 12, axis=0))
 
 
+def test_a_flipped_bit_in_a_converted_dataset_is_found(tmp_path: Path, recorded) -> None:
+    convert(recorded[0], tmp_path / "out")
+    assert EpisodeSource(tmp_path / "out").verify() > 5
+    for pattern in ("data/**/*.parquet", "videos/**/*.mp4"):
+        file = next((tmp_path / "out").glob(pattern))
+        whole = file.read_bytes()
+        file.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
+        with pytest.raises(UserError, match=f"{file.name} is damaged"):
+            EpisodeSource(tmp_path / "out").verify()
+        file.write_bytes(whole)
+
+
 def test_an_interrupted_conversion_continues_with_the_missing_episodes(tmp_path: Path, recorded, monkeypatch) -> None:
     refs, episodes = recorded
     from lerobot.datasets.lerobot_dataset import LeRobotDataset

@@ -18,7 +18,7 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
-from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json
+from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
 _PARTS, _MERGED = "episodes", "merged"
@@ -245,3 +245,4 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
     episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
     (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
+    write_sums(merged)  # LeRobot's format has none: damage would be read as data
