@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.config.composition import print_user_errors
+from mme_vla.config.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.files import safe_name
@@ -29,6 +30,11 @@ if TYPE_CHECKING:
     from mme_vla.evaluation.analyses.rerun_log import RerunLog
     from mme_vla.policy.mme import MMEPolicy
 
+EXAMPLES = (
+    "attention --checkpoint outputs/tokendrop_expert/latest",
+    "selection --memory framesamp --episode 0 --output remembered.mp4",
+    "cost --models tokendrop_expert pi05",
+)
 BUDGETS = (64, 128, 256, 512, 1024)
 
 
@@ -251,9 +257,7 @@ def _tera(flops: int) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "python -m mme_vla.analyse", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser("python -m mme_vla.analyse", __doc__, EXAMPLES)
     commands = parser.add_subparsers(required=True, metavar="WHAT")
 
     def command(run: Callable[[argparse.Namespace], None], output: str) -> argparse.ArgumentParser:

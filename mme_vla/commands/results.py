@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mme_vla.config.composition import print_user_errors
+from mme_vla.config.help import argument_parser
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
@@ -37,6 +38,13 @@ DEMO = (
     ("tokendrop_modul", None),
     ("framesamp_modul", None),
     ("ttt_expert", None),
+)
+
+
+EXAMPLES = (
+    "outputs/evaluation --html report.html",
+    "runs/a runs/b --compare framesamp_modul pi05",
+    "--demo --brief",
 )
 
 
@@ -128,9 +136,7 @@ def _pairs(results: Results, asked: Sequence[Sequence[str]] | None) -> list[tupl
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "python -m mme_vla.results", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argument_parser("python -m mme_vla.results", __doc__, EXAMPLES)
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="file of episode records, or folder")
     parser.add_argument("--compare", nargs=2, action="append", metavar=("A", "B"), help="pair two methods; repeatable")
     parser.add_argument("--csv", type=Path, help="every figure, one a row")

@@ -1,15 +1,9 @@
 """`python -m mme_vla.weights.convert SRC DST`: a checkpoint from one format to another.
 
-    python -m mme_vla.weights.convert lerobot/pi05_base base                         # to ours
-    python -m mme_vla.weights.convert runs/modul/79999 modul model=framesamp_modul   # a released JAX run
-    python -m mme_vla.weights.convert base for_lerobot --to lerobot
-    python -m mme_vla.weights.convert base - --to openpi --dry-run                   # the mapping alone
-
 Words after the two places are overrides of configs/policy.yaml, as for every command; a checkpoint of ours brings its
 own configuration. The full backbone is assumed unless `backbone=…` says otherwise.
 """
 
-import argparse
 import shutil
 import sys
 from collections.abc import Sequence
@@ -17,6 +11,7 @@ from pathlib import Path
 
 import torch
 
+from mme_vla.config.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
@@ -28,11 +23,17 @@ from mme_vla.weights.mapping_report import print_mapping
 from mme_vla.weights.source import FORMATS, Source, open_source
 from mme_vla.weights.writers import WRITERS, check_target
 
+EXAMPLES = (
+    "lerobot/pi05_base base                         # to ours",
+    "runs/modul/79999 modul model=framesamp_modul   # a released JAX run",
+    "base for_lerobot --to lerobot",
+    "base - --to openpi --dry-run                   # the mapping alone",
+)
+
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read the command line and convert; a mistake of the user's ends with a sentence and code 2."""
-    style = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser("python -m mme_vla.weights.convert", description=__doc__, formatter_class=style)
+    parser = argument_parser("python -m mme_vla.weights.convert", __doc__, EXAMPLES)
     parser.add_argument("source", help="folder, safetensors file, Orbax run or step, or owner/name on the hub")
     parser.add_argument("destination", help="new folder; never one that exists ('-' with --dry-run)")
     parser.add_argument("overrides", nargs="*", help="model=…, backbone=…, memory.budget=…")
