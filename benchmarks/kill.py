@@ -1,6 +1,6 @@
 """Commands killed (SIGKILL) before every change they make to a file, then repeated with the same words.
 
-    python benchmarks/kill.py [train cache convert record evaluate] [--every 1] [--json killed.json] [--minutes 60]
+    python benchmarks/kill.py [train cache convert record evaluate] [--every 1] [--only rename …] [--minutes 60]
 
 What comes out must equal an undisturbed run's result bit by bit, but for times. `kill_tracer.py` says what is seen of a
 process; `kill_commands.py` what is run: small models, made-up demonstrations, a scripted environment, the made-up
@@ -16,14 +16,16 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 os.environ |= {"OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "TQDM_DISABLE": "1"}
 sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parent.parent / "tests")]
 
-from kill_commands import COMMANDS, import_for, results  # noqa: E402
+from kill_commands import COMMANDS, Command, results  # noqa: E402
 from kill_tracer import trace  # noqa: E402
 
 
@@ -52,21 +54,27 @@ class Outcome:
         return self.refused + self.wrong + self.outlived
 
 
-def attack(name: str, every: int, base: Path, until: float = float("inf"), first: int = 1) -> Outcome:
-    """Kill a command before its changes number `first`, `first` + `every`, …, each time in a new folder."""
+def attack(
+    name: str, every: int, base: Path, until: float = float("inf"), first: int = 1, only: Sequence[str] = ()
+) -> Outcome:
+    """Kill a command before every so manieth of its changes from number `first` on, each time in a new folder.
+
+    Args:
+        only: kinds of change to kill before, such as `rename`; empty: all.
+    """
     command, begun, found = COMMANDS[name], time.monotonic(), Outcome(name)
     inputs, log = base / f"{name}-inputs", base / f"{name}.log"
     inputs.mkdir()
-    _finish(partial(_quiet, partial(command.prepare, inputs), log), inputs, log)
-    whole = base / f"{name}-whole"
-    expected, changes = _run(command.run, inputs, whole, log)
+    folder = base / name  # the same for all runs: some results say where they lie
+    _import_what_it_uses(command, inputs, folder, log)
+    expected, changes = _run(command.run, inputs, folder, log)
     found.changes = len(changes)
-    numbers = list(range(first, len(changes) + 1, every))
+    numbers = [n for n, change in enumerate(changes, 1) if n >= first and (not only or change.split()[0] in only)]
+    numbers = numbers[::every]
     random.Random(0).shuffle(numbers)  # so that what there is time for is spread over the run
     for number in numbers:
         if time.monotonic() > until:
             break
-        folder = base / f"{name}-killed"
         folder.mkdir()
         work = partial(_quiet, partial(command.run, inputs, folder), log)
         killed = trace(work, folder, kill_at=number)
@@ -85,6 +93,26 @@ def attack(name: str, every: int, base: Path, until: float = float("inf"), first
         shutil.rmtree(folder)
     found.seconds = round(time.monotonic() - begun, 1)
     return found
+
+
+def _import_what_it_uses(command: Command, inputs: Path, folder: Path, log: Path) -> None:
+    """Prepare the inputs and run the command once, elsewhere, and import here what it imported.
+
+    Forked processes then need not, and this one has neither threads nor drawn numbers of a run.
+    """
+    modules = log.with_suffix(".modules")
+
+    def rehearse() -> None:
+        command.prepare(inputs)
+        folder.mkdir()
+        command.run(inputs, folder)
+        modules.write_text("\n".join(sys.modules))
+
+    _finish(partial(_quiet, rehearse, log), folder, log)
+    shutil.rmtree(folder)
+    for name in modules.read_text().split("\n"):
+        with suppress(Exception):  # some register modules that cannot be imported by their name
+            import_module(name)
 
 
 def _run(
@@ -117,18 +145,18 @@ def main() -> None:
     parser.add_argument("commands", nargs="*", default=list(COMMANDS), help=f"of {', '.join(COMMANDS)}; default: all")
     parser.add_argument("--every", type=int, default=1, help="kill before every so manieth operation (default: each)")
     parser.add_argument("--first", type=int, default=1, help="number of the first operation to kill before")
+    parser.add_argument("--only", nargs="+", default=(), help="kinds of operation, such as rename (default: all)")
     parser.add_argument("--minutes", type=float, default=60, help="stop killing after so long (default: 60)")
     parser.add_argument("--json", type=Path, help="write the outcomes here")
     given = parser.parse_args()
     if unknown := set(given.commands) - set(COMMANDS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
-    import_for(given.commands)
     until, outcomes = time.monotonic() + 60 * given.minutes, []
     print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |")
     print("|---|" + "---:|" * 7)
     with tempfile.TemporaryDirectory() as base:
         for name in given.commands:
-            o = attack(name, given.every, Path(base).resolve(), until, given.first)
+            o = attack(name, given.every, Path(base).resolve(), until, given.first, given.only)
             outcomes.append(o)
             numbers = (o.changes, o.kills, o.refused, o.wrong, o.left, o.outlived, o.seconds)
             print(f"| {name} | " + " | ".join(map(str, numbers)) + " |", flush=True)

@@ -2,9 +2,8 @@
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,8 +19,8 @@ RECIPE = [
     "train.batch_size=1", "train.open_loop_chunks=1", "train.device=cpu", "train.workers=0", "train.keep.last=1",
     "logger=none",
 ]  # fmt: skip
-# What only tells when and how fast.
-_TIMES = re.compile(r'"(?:seconds|when|begun|speed/\w+|memory/gib)": ?(?:"[^"]*"|\{[^}]*\}|[-+.\w]+)')
+# What only tells when and how fast, and the seals of lines that do.
+_TIMES = re.compile(r'"(?:seconds|when|begun|speed/\w+|memory/gib|crc32)": ?(?:"[^"]*"|\{[^}]*\}|[-+.\w]+)')
 
 
 @dataclass(frozen=True)
@@ -29,12 +28,10 @@ class Command:
     """One command.
 
     prepare: makes what it reads, once, in a folder. run: carries it out, with that folder and the one it writes to.
-    imports: modules that it needs; loaded before it is forked.
     """
 
     prepare: Callable[[Path], None]
     run: Callable[[Path, Path], object]
-    imports: tuple[str, ...]
 
 
 def results(folder: Path) -> dict[str, str]:
@@ -150,28 +147,10 @@ def _warm_cache(inputs: Path) -> None:
     _cache(inputs, inputs)
 
 
-_LEARNING = (
-    "accelerate",
-    "mme_vla.commands.train",
-    "mme_vla.training.loop",
-    "mme_vla.training.finish",
-    "mme_vla.policy.build",
-)
-_LEARNING += ("mme_vla.data.cache.building", "mme_vla.weights", "lerobot.datasets.dataset_metadata")
-_WRITING = ("lerobot.datasets.lerobot_dataset", "lerobot.datasets.aggregate", "mme_vla.data.conversion", "av")
 COMMANDS = {
-    "train": Command(_warm_cache, _train, _LEARNING),
-    "cache": Command(_nothing, _cache, _LEARNING),
-    "convert": Command(_write_demonstrations, _convert, _WRITING),
-    "record": Command(
-        _nothing, _record, (*_WRITING, "mme_vla.envs.recording.recorder", "mme_vla.envs.recording.hdf5_writer")
-    ),
-    "evaluate": Command(_nothing, _evaluate, ("rollout_stand_ins", "av")),
+    "train": Command(_warm_cache, _train),
+    "cache": Command(_nothing, _cache),
+    "convert": Command(_write_demonstrations, _convert),
+    "record": Command(_nothing, _record),
+    "evaluate": Command(_nothing, _evaluate),
 }
-
-
-def import_for(names: Iterable[str]) -> None:
-    """What these commands import, so that a forked process has it."""
-    for name in names:
-        for module in COMMANDS[name].imports:
-            import_module(module)

@@ -10,7 +10,6 @@ import os
 import signal
 import struct
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +20,7 @@ _FOLLOW = 0x2 | 0x4 | 0x8 | 0x80 | 0x100000  # fork, vfork, clone, seccomp; end 
 _NO_NEW_PRIVS, _SET_SECCOMP, _FILTER = 38, 22, 2
 _ALLOW, _TRACE = 0x7FFF0000, 0x7FF00000
 _AT_FDCWD = -100
+_GRACE = 5.0
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 # name: (number, how its path is found)
@@ -53,31 +53,45 @@ def trace(work: Callable[[], object], folder: Path, kill_at: int | None = None, 
     main = os.fork()
     if main == 0:
         _be_traced(work)
-    found, below, until = Traced(), str(folder.resolve()), time.monotonic() + limit_s
-    alive, died = {main}, 0.0
-    os.waitpid(main, 0)
-    _ptrace(_SETOPTIONS, main, 0, _FOLLOW)
-    _ptrace(_CONT, main, 0, 0)
+    found, below, alive = Traced(), str(folder.resolve()), {main}
+    signal.signal(signal.SIGALRM, _over)
+    signal.setitimer(signal.ITIMER_REAL, limit_s)
+    try:
+        os.waitpid(main, 0)
+        _ptrace(_SETOPTIONS, main, 0, _FOLLOW)
+        _ptrace(_CONT, main, 0, 0)
+        _follow(main, alive, found, below, kill_at)
+    except _TimeIsOverError:
+        found.outlived = len({_group(task) for task in alive} - {main, 0})
+        for task in alive:
+            _kill(task)
+        if found.code is None:
+            raise TimeoutError(f"still running after {limit_s:g} s") from None
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    return found
+
+
+class _TimeIsOverError(Exception):
+    """The time is over."""
+
+
+def _over(*_: object) -> None:
+    raise _TimeIsOverError
+
+
+def _follow(main: int, alive: set[int], found: Traced, below: str, kill_at: int | None) -> None:
+    """Answer every stop of these tasks until all have ended; what outlives the main process has `_GRACE` seconds."""
     while alive:
-        now = time.monotonic()
-        if now > until or (died and now > died + 5):
-            found.outlived = len({_group(task) for task in alive} - {main, 0})
-            for task in alive:
-                _kill(task)
-            if not died:
-                raise TimeoutError(f"still running after {limit_s:g} s")
-            return found
         try:
-            task, status = os.waitpid(-1, 0x40000000 | os.WNOHANG)  # __WALL: threads as well
+            task, status = os.waitpid(-1, 0x40000000)  # __WALL: threads as well
         except ChildProcessError:
             break
-        if task == 0:
-            time.sleep(0.0005)
-            continue
         if os.WIFEXITED(status) or os.WIFSIGNALED(status):
             alive.discard(task)
             if task == main:
-                found.code, died = os.waitstatus_to_exitcode(status), now
+                found.code = os.waitstatus_to_exitcode(status)
+                signal.setitimer(signal.ITIMER_REAL, _GRACE)
             continue
         alive.add(task)
         passed_on = os.WSTOPSIG(status)
@@ -92,7 +106,6 @@ def trace(work: Callable[[], object], folder: Path, kill_at: int | None = None, 
         elif status >> 16 or passed_on in (signal.SIGTRAP, signal.SIGSTOP):  # a new thread or process
             passed_on = 0
         _ptrace(_CONT, task, 0, passed_on, gone_is_fine=True)
-    return found
 
 
 def _be_traced(work: Callable[[], object]) -> None:

@@ -1,6 +1,8 @@
 """The vision cache: equal to the online history, resumable, and refused where it does not fit."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -89,6 +91,20 @@ def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_pa
     for episode in range(3):
         assert np.array_equal(np.load(token_file(whole.folder, episode)), np.load(token_file(folder, episode)))
     assert resumed.width == whole.width
+
+
+def test_drafts_of_a_killed_build_are_removed_by_the_next(source, tmp_path) -> None:
+    memory = LastFrames(scored=True)
+    build = (
+        "import os, sys; from pathlib import Path; import numpy as np; from mme_vla.data.cache.building import _draft;"
+        "_draft(Path(sys.argv[1]), np.save, np.zeros(3)); os.kill(os.getpid(), 9)"
+    )
+    folder = cache_folder(tmp_path, source, expected := fingerprint(source, memory.storage, "abc", "float32"))
+    folder.mkdir(parents=True)
+    subprocess.run([sys.executable, "-c", build, str(token_file(folder, 0))])
+    assert len(list(folder.iterdir())) == 1
+    build_cache(source, memory, encode, folder, expected)
+    assert not [path for path in folder.iterdir() if path.name.endswith(".partial")]
 
 
 def test_processes_share_the_episodes(source, tmp_path, monkeypatch) -> None:

@@ -144,7 +144,8 @@ def test_training_data_that_changed_are_noticed(tmp_path: Path) -> None:
     checkpoint.mkdir()
     for name in ("raw.safetensors", "optimizer.safetensors"):
         (checkpoint / name).touch()
-    state = {"format": "mme_vla training checkpoint 1", "step": 1, "config": {"data": {"content": ["a", "b"]}}}
+    state = {"format": "mme_vla training checkpoint 1", "step": 1, "versions": {}}
+    state["config"] = {"data": {"content": ["a", "b"]}}
     write_json(checkpoint / "training_state.json", state)
     check_content(checkpoint, ["a", "b"])
     with pytest.raises(UserError, match=r"number 1 of data\.sources"):
@@ -160,3 +161,14 @@ def test_a_finished_recording_is_recognised_and_others_are_not(tmp_path: Path) -
     with pytest.raises(UserError, match="not what this command records"):
         Wanted([other], None, tmp_path).missing(PNG)
     assert Wanted([job], tmp_path / "dataset", None).missing(PNG) == [tmp_path / "dataset"]
+
+
+def test_what_a_recording_left_that_was_killed_after_its_last_move_is_removed(tmp_path: Path) -> None:
+    dataset, work = tmp_path / "dataset", tmp_path / "dataset.partial"
+    dataset.mkdir()
+    assert claim_plan(work, {"a": 1})
+    (work / "episodes" / "one").mkdir(parents=True)
+    Wanted([], dataset, None).tidy()
+    assert list(tmp_path.iterdir()) == [dataset]
+    with FolderLock(work), pytest.raises(UserError, match="in use by another conversion"):
+        Wanted([], dataset, None).tidy()

@@ -149,6 +149,7 @@ def run(cfg: "DictConfig") -> None:
             print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
+        wanted.tidy()
         drop_plan(work)
 
 

@@ -89,7 +89,7 @@ def _train(
     from mme_vla.data.dataset import collate
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.finetune import apply_finetuning
-    from mme_vla.policy.tensor_files import assign_tensors, load_tensors
+    from mme_vla.policy.tensor_files import assign_tensors, load_tensors, take_memory
     from mme_vla.training.checkpoint import check_disk
     from mme_vla.training.console import ProgressLine
     from mme_vla.training.data import check_frozen, prepare_data
@@ -114,7 +114,7 @@ def _train(
         line.say(f"going on from {run.checkpoint}")
     recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
-    policy.to(accelerator.device)
+    take_memory(policy.to(accelerator.device))
     with accelerator.main_process_first():
         data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
     if run.checkpoint is not None:

@@ -83,7 +83,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
         raise UserError("There is no episode to convert.")
     options = replace(options or ConvertOptions(), poses=pose_columns(episodes))
     plan = _plan(episodes, options)
-    partial = output.with_name(output.name + ".partial")
+    partial = _work_folder(output)
     if _finished(output, plan) and not partial.exists():
         return 0
     with FolderLock(partial, "conversion"):
@@ -91,6 +91,22 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
             drop_plan(partial)
             return 0
         return _convert(episodes, output, partial, plan, options)
+
+
+def drop_work(output: Path) -> None:
+    """Remove what a conversion left beside `output` that was killed after it had moved its result there.
+
+    Raises:
+        UserError: another process converts into it.
+    """
+    partial = _work_folder(output)
+    if partial.exists():
+        with FolderLock(partial, "conversion"):
+            drop_plan(partial)
+
+
+def _work_folder(output: Path) -> Path:
+    return output.with_name(output.name + ".partial")
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:

@@ -193,6 +193,17 @@ def assign_tensors(
         parameter.requires_grad_(trainable[name])
 
 
+def take_memory(module: nn.Module) -> None:
+    """Move those of a module's tensors that lie in a memory-mapped file into memory that torch allots.
+
+    Files place tensors at any multiple of a few bytes, and matrix products round differently from there: what goes on
+    from a file would differ in the last bits from what never stopped.
+    """
+    for tensor in (*module.parameters(), *module.buffers()):
+        if tensor.device.type == "cpu":
+            tensor.data = tensor.data.clone()
+
+
 def check_kinds(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], source: str) -> None:
     """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are.
 

@@ -94,7 +94,7 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
     policy.load_state_dict({**averaged, **raw})
     state = optimizer.state_dict()
     state["state"] = {
-        i: {key: moments[f"{name}/{key}"] for key in _MOMENTS}
+        i: {key: moments[f"{name}/{key}"].clone() for key in _MOMENTS}  # no longer in a mapped file
         for i, name in enumerate(parameters)
         if f"{name}/step" in moments
     }

@@ -1,6 +1,5 @@
 """Building a vision cache: episode by episode, each written whole or not at all."""
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -16,7 +15,7 @@ from mme_vla.data.cache.store import DTYPES, FINGERPRINT, check_fingerprint, sco
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
-from mme_vla.files import sum_line
+from mme_vla.files import draft_of, remove_drafts, sum_line, write_atomically, write_json
 from mme_vla.memory.base import Memory
 
 Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
@@ -74,8 +73,9 @@ def build_cache(
     if not (folder / FINGERPRINT).is_file():
         if any(not path.name.endswith(".partial") for path in folder.iterdir()):
             check_fingerprint(folder, expected)
-        _replace(folder / FINGERPRINT, json.dumps(expected, indent=1).encode())
+        write_json(folder / FINGERPRINT, expected, indent=1)
     check_fingerprint(folder, expected)
+    remove_drafts(folder)
     mine = range(rank, len(source), world)
     missing = [episode for episode in mine if not token_file(folder, episode).is_file()]
     total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
@@ -167,7 +167,8 @@ def _build_episode(
     path = token_file(folder, episode)
     drafts[path] = _draft(path, np.save, np.concatenate(rows))
     sums = "".join(sum_line(draft, path.name) for path, draft in drafts.items())
-    _replace(sum_file(folder, episode), sums.encode())
+    with write_atomically(sum_file(folder, episode)) as draft:
+        draft.write_text(sums)
     for path, draft in drafts.items():  # tokens last: where they are, all else is
         draft.replace(path)
 
@@ -180,15 +181,9 @@ def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
 
 def _draft(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> Path:
     """What will become `path`, on disk already."""
-    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
+    draft = draft_of(path)
     with draft.open("wb") as handle:
         writer(handle, *arrays, **named)
         handle.flush()
         os.fsync(handle.fileno())
     return draft
-
-
-def _replace(path: Path, content: bytes) -> None:
-    draft = path.with_name(f"{path.name}.{os.getpid()}.partial")
-    draft.write_bytes(content)
-    draft.replace(path)

@@ -82,6 +82,13 @@ class Wanted:
             refs = [EpisodeRef(episodes / f"{job.name}.h5", job.episode, job.task) for job in self.jobs]
             convert(refs, self.dataset, options)
 
+    def tidy(self) -> None:
+        """Remove what earlier runs left beside the dataset, which is there; the caller holds the recording's folder."""
+        from mme_vla.data.conversion import drop_work
+
+        if self.dataset is not None:
+            drop_work(self.dataset)
+
     def _official(self, task: str) -> Path:
         assert self.hdf5 is not None
         return self.hdf5 / f"record_dataset_{task}.h5"
