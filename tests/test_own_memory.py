@@ -9,6 +9,9 @@ import torch
 from conftest import REPOSITORY
 
 from mme_vla import build_policy
+from mme_vla.commands import inspect
+from mme_vla.config.composition import compose
+from mme_vla.testing import check_memory
 from mme_vla.testing.small import open_gates, random_batch, unit_stats
 
 EXAMPLE = REPOSITORY / "examples" / "last_frames"
@@ -25,8 +28,29 @@ def policy(monkeypatch):
 
 def test_the_page_shows_the_files_that_are_tested():
     page = (REPOSITORY / "docs" / "add-a-memory.md").read_text()
-    for file in ("last_frames.py", "configs/model/last_frames_context.yaml"):
+    for file in ("last_frames.py", "configs/memory/last_frames.yaml", "configs/model/last_frames_context.yaml"):
         assert (EXAMPLE / file).read_text().strip() in page, file
+
+
+def test_it_passes_the_check_that_the_page_names(policy):
+    check_memory("last_frames", budget=64, spacing=3)
+
+
+def test_its_file_makes_it_a_choice_for_any_integration_and_beside_another(monkeypatch):
+    monkeypatch.chdir(EXAMPLE)
+    trees = [EXAMPLE / "configs"]
+    cfg = compose("train", ["memory=last_frames", "integration=modulator", "memory.spacing=8"], extra_dirs=trees)
+    assert (cfg.plugins, cfg.memory.spacing, cfg.integration.name) == (["last_frames"], 8, "modulator")
+    joined = {"memory": ["last_frames", "framesamp"], "integration": "expert", "plugins": ["last_frames"]}
+    policy = build_policy("pi05", config_dir=trees[0], device="meta", **joined)
+    assert [type(member).__name__ for member in policy.memory.memories] == ["LastFrames", "FrameSamp"]
+
+
+def test_inspect_draws_what_it_remembers(monkeypatch, tmp_path):
+    monkeypatch.chdir(EXAMPLE)
+    words = ["dataset=sample", "memory=last_frames", "episode=0", "step=100", f"output={tmp_path}"]
+    inspect.main(compose("inspect", words, extra_dirs=[EXAMPLE / "configs"]))
+    assert len(list(tmp_path.glob("*_last_frames.png"))) == 1
 
 
 def test_own_memory_gets_a_loss_and_acts(policy):

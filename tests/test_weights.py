@@ -193,7 +193,7 @@ def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tm
 
 def test_a_memory_of_ones_own_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
     policy = build_policy("framesamp_context")
-    monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: None)
+    monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: {})
     with pytest.raises(UserError, match="no released names"):
         released_table(policy)
     assert set(start_from(policy, bases["released"])) == memory_parameters(policy)

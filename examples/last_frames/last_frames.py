@@ -2,12 +2,11 @@
 
 import numpy as np
 
-from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.perceptual import PerceptualMemory
-from mme_vla.registry import MEMORIES
+from mme_vla import History, PerceptualMemory, StorageSpec, register
+from mme_vla.memory.base import whole_frames
 
 
-@MEMORIES.register("last_frames")
+@register("memory", "last_frames")
 class LastFrames(PerceptualMemory):
     """budget / grid² frames back from the current one."""
 
@@ -17,5 +16,4 @@ class LastFrames(PerceptualMemory):
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         frames = np.arange(step, -1, -self.spacing)[: self.frames][::-1]
-        patches = np.arange(self.storage.grid**2)
-        return np.stack(np.meshgrid(frames, patches, indexing="ij"), axis=-1).reshape(-1, 2)
+        return whole_frames(frames, self.storage.grid)

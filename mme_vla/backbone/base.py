@@ -23,7 +23,7 @@ class Injection:
 
     blocks: the prefix in sequence order, the observation's own blocks among them.
     visibility: which block may look at which; rows for these blocks, for those beside the actions and for `action`.
-    hook: see `Hook`. condition: what becomes of the condition [m, c] of the answering expert's norms.
+    hook: see `Hook`. condition: what becomes of the condition [b, c] of the answering expert's norms.
     beside: blocks that run with the actions, before them, in every step.
     """
 

@@ -35,6 +35,7 @@ from mme_vla.config.endings import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
 from mme_vla.config.variant import Sections, decisive, variant_name
+from mme_vla.config.words import join_memories, literal, several_memories
 from mme_vla.errors import UserError
 
 VERSION_BASE = "1.3"
@@ -89,14 +90,14 @@ def compose(
     Raises:
         UserError: a name or key that does not exist, a value of the wrong kind, or a file that cannot be read.
     """
-    directory = (directory or config_dir()).resolve()
+    directory, overrides = (directory or config_dir()).resolve(), several_memories(overrides)
     for folder in (directory, *extra_dirs):
         if not folder.is_dir():
             raise UserError(f"The config folder {str(folder)!r} does not exist.")
     with _own_hydra(directory, extra_dirs) as engine:
         tree = ConfigTree(engine.config_loader, config_name, _parse(overrides))
         try:
-            cfg = hydra.compose(config_name, list(overrides))
+            cfg = join_memories(hydra.compose(config_name, overrides))
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
@@ -131,6 +132,7 @@ def name_variant(cfg: DictConfig, config_name: str, directory: Path, extra_dirs:
 
 
 def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
+    cfg = join_memories(cfg.copy())
     config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
     mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
     theirs = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
@@ -142,7 +144,9 @@ def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> st
 
     def parts() -> Sections | None:
         chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
-        words = (f"{group}={section.name if section else 'none'}" for group, section in chosen.items())
+        words = [f"{group}={section.name if section else 'none'}" for group, section in chosen.items()]
+        if "members" in (chosen.get("memory") or {}):
+            words.append(f"memory.members={literal(OmegaConf.to_container(chosen['memory'].members, resolve=True))}")
         found = composed(tuple(words), trees)
         return None if found is None else found[1]
 
@@ -161,7 +165,7 @@ def _composed_sections(
     """Name and decisive keys of a composition; None where these words do not compose."""
     with _own_hydra(trees[0], trees[1:]):
         try:
-            cfg = hydra.compose(config_name, list(overrides))
+            cfg = join_memories(hydra.compose(config_name, list(overrides)))
             return str(cfg.name), decisive(cfg)
         except COMPOSITION_ERRORS:
             return None
@@ -209,6 +213,7 @@ def cli[T](
         def job(cfg: DictConfig) -> T:
             with print_user_errors():  # here too: Hydra would print a traceback before it gets further
                 _require_values(cfg)
+                join_memories(cfg)
                 if {"name", "memory"} <= set(cfg):
                     cfg.name = _name_under_hydra(_root_=cfg)
                 import_plugins(cfg)
@@ -220,7 +225,7 @@ def cli[T](
                 import_plugins(cfg)
                 return main(cfg)
             tree = directory or config_dir()
-            sys.argv[1:] = plugins.trust_as_override(sys.argv[1:])
+            sys.argv[1:] = several_memories(plugins.trust_as_override(sys.argv[1:]))
             with print_user_errors():
                 _check_command_line(config_name, tree)
                 start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)

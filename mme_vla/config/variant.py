@@ -92,7 +92,9 @@ def composition_digest(config: Mapping[str, Any]) -> str:
 
 
 def _parts(sections: Sections) -> tuple[str, str]:
-    return str(sections.get("memory.name", "")), str(sections.get("integration.name", ""))
+    members = sections.get("memory.members")
+    joined = [str(m.get("name") if isinstance(m, Mapping) else m) for m in members or ()]
+    return "_".join(joined) or str(sections.get("memory.name", "")), str(sections.get("integration.name", ""))
 
 
 def _differences(base: Sections, sections: Sections) -> Sections:

@@ -16,7 +16,8 @@ class Memory(nn.Module):
 
     A subclass sets, before use:
         budget: most memory tokens it may hand over.
-        capacity: length to which its selections are padded (`budget` unless the encoder reads more than it writes).
+        capacity: most stored tokens it may select (`budget` unless the encoder reads more than it writes); selections
+            are padded to it unless `padded_length` says otherwise.
         storage: what has to be stored of each frame.
         pad_left: True puts the padding before the tokens (recurrent memories), False after them.
 

@@ -1,6 +1,5 @@
 """`build_policy`: from a variant's name to a policy, through the same YAML files the commands use."""
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.words import words
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
@@ -37,7 +37,7 @@ def build_policy(
         seed: of the fresh weights.
         config_dir: a folder of your own YAML files, searched beside the library's.
         overrides: a string selects a group's file (`backbone="pi05"`), a mapping sets keys below a section
-            (`memory={"budget": 256}`), anything else sets a value.
+            (`memory={"budget": 256}`), anything else sets a value; `memory=["framesamp", "ttt"]` joins memories.
 
     Returns:
         The policy in eval mode.
@@ -54,7 +54,7 @@ def build_policy(
 
 def policy_words(name: str, overrides: Mapping[str, Any]) -> list[str]:
     """Write what `build_policy` takes as Hydra overrides."""
-    return [f"model={name}", *(word for key, value in overrides.items() for word in _words(key, value))]
+    return [f"model={name}", *(word for key, value in overrides.items() for word in words(key, value))]
 
 
 def build_from_config(
@@ -119,22 +119,3 @@ def build_processor(sections: Mapping[str, Any]) -> Processor:
             f"backbone.vocab_size={backbone['vocab_size']}: choose the processor that goes with the backbone."
         )
     return processor
-
-
-def _words(key: str, value: Any) -> list[str]:
-    """Write a keyword argument as Hydra overrides."""
-    if isinstance(value, Mapping):
-        return [word for inner, v in value.items() for word in _words(f"{key}.{inner}", v)]
-    return [f"{key}={_literal(value)}"]
-
-
-def _literal(value: Any) -> str:
-    """Write a value in Hydra's grammar; what is not a plain word is quoted."""
-    if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
-    if isinstance(value, list | tuple):
-        return f"[{','.join(map(_literal, value))}]"
-    text = str(value)
-    if isinstance(value, int | float) or re.fullmatch(r"[\w./:~+-]+", text):
-        return text
-    return "'" + text.replace("\\", "\\\\").replace("'", "\\'") + "'"

@@ -295,10 +295,10 @@ class MMEPolicy(Policy):
             )
 
     def parts(self) -> Mapping[str, str]:
-        """The backbone's parts; the memory and its integration are the part `memory`."""
+        """The backbone's parts in its order; memory, integration and the latter's experts are the part `memory`."""
         parts = {part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items()}
-        own = [r"memory\.|integration\."] + ([parts["memory"]] if "memory" in parts else [])
-        return {**parts, "memory": "|".join(own)}
+        experts = f"|{parts['memory']}" if "memory" in parts else ""
+        return {**parts, "memory": rf"memory\.|integration\.{experts}"}
 
 
 def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:

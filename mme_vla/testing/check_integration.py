@@ -85,12 +85,15 @@ def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], found:
 def check_sampling(policy: MMEPolicy, batch: Batch, found: MemoryTokens) -> None:
     """What runs once a chunk and what runs in every step add up to the pass that training makes."""
     draws = {k: torch.stack([v, v]) for k, v in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
-    chunk = policy.sample_actions(batch, draws, steps=1, memory=found)
-    assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
-    if "noise" in draws:  # one Euler step from noise is noise − velocity at time 1
-        joint = draws["noise"] - policy.velocity(batch, draws["noise"], torch.ones(2), found)
-        error = float((chunk - joint).abs().max())
-        assert error <= TOLERANCE, f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
+    for steps in (1, 2):  # as many as samples, too: a step must not be taken for a sample
+        chunk = policy.sample_actions(batch, draws, steps=steps, memory=found)
+        assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."
+        if "noise" in draws:  # Euler's way from noise at time 1, each velocity in one joint pass
+            joint = draws["noise"]
+            for time in (1 - i / steps for i in range(steps)):
+                joint = joint - policy.velocity(batch, joint, torch.full((2,), time), found) / steps
+            error = float((chunk - joint).abs().max())
+            assert error <= TOLERANCE, f"sampling (cached prefix) and training (one pass) differ by {error:.2g}."
 
 
 def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -> None:

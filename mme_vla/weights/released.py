@@ -12,10 +12,10 @@ from torch import Tensor
 import mme_vla.weights.names.jax_backbone as backbone_names
 import mme_vla.weights.names.jax_integration as integration_names
 import mme_vla.weights.names.jax_memory as memory_names
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, listed
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors
-from mme_vla.weights.adapter import Adapter, pi05_of
+from mme_vla.weights.adapter import Adapter, memory_parameters, pi05_of
 from mme_vla.weights.name_tables import Derived, NameTable, Unread, prefixed
 
 
@@ -23,39 +23,42 @@ def released_adapter(policy: MMEPolicy) -> Adapter:
     """The released tree of this policy.
 
     Raises:
-        UserError: the memory is not one of the released ones.
+        UserError: memory or integration are not released ones.
     """
     return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
 
 
 def partial_adapter(policy: Any) -> Adapter:
-    """The released tree as far as it has names for this policy: a memory of one's own is left out."""
-    table = _backbone_table(policy) | (_memory_table(policy) or {})
-    return Adapter(table, released_unread(policy), derived=released_derived(policy))
+    """The released tree as far as it has names for this policy: what parts of one's own have beyond it is left out."""
+    table, state = _table(policy), policy.state_dict()
+    known = {name: pieces for name, pieces in table.items() if name in state or policy.part_of(name) != "memory"}
+    return Adapter(known, released_unread(policy), derived=released_derived(policy))
 
 
 def released_table(policy: MMEPolicy) -> NameTable:
     """Every parameter of the policy and the released leaves it is made of.
 
     Raises:
-        UserError: the memory is not one of the released ones.
+        UserError: memory or integration have tensors that no released checkpoint holds.
     """
-    memory = _memory_table(policy)
-    if memory is None:
-        raise UserError(f"{type(policy.memory).__name__} has no released names: only released memories convert.")
-    return _backbone_table(policy) | memory
+    table = _table(policy)
+    unnamed = sorted(memory_parameters(policy) ^ {name for name in table if policy.part_of(name) == "memory"})
+    if unnamed:
+        owners = [part for part in (policy.memory, policy.integration) if part is not None]
+        raise UserError(
+            f"{' with '.join(type(part).__name__ for part in owners)} has no released names for {len(unnamed)} tensors "
+            f"({listed(unnamed)}): only the released memories and integrations convert whole. To begin training from a "
+            "released checkpoint use start_from() (on the command line: init_from=…), which leaves these as they are."
+        )
+    return table
 
 
-def _backbone_table(policy: MMEPolicy) -> NameTable:
+def _table(policy: MMEPolicy) -> NameTable:
     table = prefixed("backbone", backbone_names.released_names(pi05_of(policy)))
-    return table | prefixed("integration", integration_names.released_names(policy.integration))
-
-
-def _memory_table(policy: MMEPolicy) -> NameTable | None:
+    table |= prefixed("integration", integration_names.released_names(policy.integration))
     if policy.memory is None:
-        return {}
-    names = memory_names.released_names(policy.memory)
-    return None if names is None else prefixed("memory", names)
+        return table
+    return table | prefixed("memory", memory_names.released_names(policy.memory))
 
 
 def released_unread(policy: MMEPolicy) -> list[Unread]:

@@ -139,7 +139,8 @@ class Pi05Backbone(Backbone):
         injection = inject(self.observation_blocks(batch, images))
         blocks = [*injection.blocks, *injection.beside, self.action_block(x_t)]
         layout = self.transformer.layout(blocks, injection.visibility)
-        condition = self._condition(time, injection)
+        condition = self.time_condition(time)
+        condition = condition if injection.condition is None else injection.condition(condition)
         answer, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(answer)
 
@@ -167,8 +168,12 @@ class Pi05Backbone(Backbone):
         blocks = [*injection.beside, self.action_block(noise)]
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
         times = flow.euler_times(steps, noise.device)
-        conditions = self.transformer.conditioning(self._condition(times, injection))
-        return flow.euler(noise, steps, lambda x, i: self.denoise(x, conditions.at(i), layout, prefix, injection))
+        condition, rows = self.time_condition(times), 1
+        if injection.condition is not None:  # what memory says differs from sample to sample: every time for each
+            rows = len(noise)
+            condition = torch.cat([injection.condition(one.expand(rows, -1)) for one in condition])
+        conditions = self.transformer.conditioning(condition)
+        return flow.euler(noise, steps, lambda x, i: self.denoise(x, conditions.at(i, rows), layout, prefix, injection))
 
     def prefill(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[KVCache, Injection]:
         """Run what a chunk's steps share: keys and values of the prefix, and what the memory injects."""
@@ -184,10 +189,6 @@ class Pi05Backbone(Backbone):
         blocks = [*injection.beside, self.action_block(x_t)]
         answer, _ = self.transformer(blocks, layout, condition, injection.hook, past=prefix)
         return self.read_velocity(answer)
-
-    def _condition(self, time: Tensor, injection: Injection) -> Tensor:
-        condition = self.time_condition(time)
-        return condition if injection.condition is None else injection.condition(condition)
 
     # Parts
 

@@ -191,11 +191,11 @@ class Conditioning:
     layers: list[LayerModulation]
     final: Modulation
 
-    def at(self, index: int) -> "Conditioning":
-        """Return the modulations of one time, kept broadcastable over the batch."""
+    def at(self, index: int, rows: int = 1) -> "Conditioning":
+        """Return the modulations of one time, which has `rows`: one for the whole batch, or one a sample."""
 
         def pick(m: Modulation) -> Modulation:
-            return Modulation(*(x[index : index + 1] for x in m))
+            return Modulation(*(x[index * rows : (index + 1) * rows] for x in m))
 
         return Conditioning([LayerModulation(pick(a), pick(m)) for a, m in self.layers], pick(self.final))
 

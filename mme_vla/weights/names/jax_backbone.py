@@ -10,11 +10,13 @@ SUFFIX = {"vlm": "", "action": "_1", "memory": "_mem"}
 
 
 def released_names(backbone: Pi05Backbone) -> NameTable:
-    """The whole backbone's table, extra experts included; names are relative to the backbone."""
+    """The backbone's table, a released memory expert included; names are relative to the backbone."""
     table: NameTable = {"embedding.weight": [Piece("PaliGemma/llm/embedder/input_embedding")]}
     table |= prefixed("vision.vit", _vision(backbone.config))
     for i, block in enumerate(backbone.transformer.layers):
         for expert, layer in block.experts.items():  # type: ignore[union-attr, operator]
+            if expert not in SUFFIX:
+                continue  # of an integration of one's own
             names = _expert_layer(backbone.config, layer, SUFFIX[expert], i)
             table |= prefixed(f"transformer.layers.{i}.experts.{expert}", names)
     table |= prefixed("transformer.final_norm.dense", linear("PaliGemma/llm/final_norm_1/Dense_0"))
@@ -29,7 +31,7 @@ def released_unread(backbone: Pi05Backbone) -> list[Unread]:
     config, experts = backbone.config, backbone.transformer.experts
     gaps = []
     for name, expert in experts.items():
-        if name != backbone.transformer.answering:
+        if name in SUFFIX and name != backbone.transformer.answering:
             gaps.append(Unread(f"PaliGemma/llm/final_norm{SUFFIX[name]}/scale", (expert.width,)))
             gaps += _unread_layer(config, expert, SUFFIX[name])
     return gaps

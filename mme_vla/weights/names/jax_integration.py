@@ -12,7 +12,8 @@ def released_names(integration: Integration) -> NameTable:
     table: NameTable = {}
     if isinstance(integration, Modulator):
         for i, layer in enumerate(integration.layers):
-            table |= prefixed(f"layers.{i}", _modulator_layer(layer, i))  # type: ignore[arg-type]
+            if isinstance(layer, ModulatorLayer):
+                table |= prefixed(f"layers.{i}", _modulator_layer(layer, i))
     return table
 
 

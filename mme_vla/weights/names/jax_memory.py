@@ -14,14 +14,14 @@ ENCODER = "mem_encoder/feature_encoder"
 LAYER = "mem_encoder/recur_layer"
 
 
-def released_names(memory: Memory) -> NameTable | None:
-    """The table of a memory, or None where no released checkpoint has one (a memory of one's own)."""
+def released_names(memory: Memory) -> NameTable:
+    """The table of a memory; empty where no released checkpoint has one (a memory of one's own)."""
     if isinstance(memory, PerceptualMemory):
         return _encoder("encoder_static")
     if isinstance(memory, RecurrentMemory) and isinstance(memory.layer, TTTLayer | RMTLayer):
         table = _encoder("encoder_recur") | prefixed("output", linear("mem_encoder/proj"))
         return table | prefixed("layer", layer_names(memory.layer))
-    return None
+    return {}
 
 
 def released_unread(memory: Memory | None) -> list[Unread]:

@@ -1,0 +1,227 @@
+"""Several memories under one budget, side by side: their tokens stand one after the other (beyond the paper)."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError, brief
+from mme_vla.memory.base import Memory
+from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
+from mme_vla.registry import MEMORIES
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+WHOLE = 16  # shares are multiples of it, so that they hold whole frames of the smaller grids
+
+
+@MEMORIES.register("joined")
+class JoinedMemory(Memory):
+    """Each member selects and encodes as if it were alone, within its share of the budget.
+
+    The history keeps what serves all of them: the finest grid, of which coarser ones are pooled when they are read
+    (exact but for the rounding of what is stored), and every frame that anyone keeps.
+
+    Selections lie one after the other in `HistoryTokens`, each padded as its member pads. One member's may vary in
+    length, and comes first, where batches pad the shorter ones; all others are padded to their capacity.
+    """
+
+    def __init__(self, d_vision: int, width: int, members: Sequence[str | Mapping[str, Any]], budget: int = 512):
+        """Build the members.
+
+        Args:
+            d_vision: width of a vision token. width: of a memory token, given by the integration.
+            members: names, or sections with `name` and the memory's own options.
+            budget: most memory tokens of all together. Members that name no budget share evenly what the others leave.
+
+        Raises:
+            UserError: fewer than two members, more budget than there is, or members that want frames stored unlike.
+        """
+        super().__init__()
+        sections = shares(members, budget)
+        built: list[Memory] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
+        self.members = nn.ModuleList(built)
+        self.names = _distinct([section["name"] for section in sections])
+        self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
+        self.budget = sum(member.budget for member in built)
+        self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
+        self.pad_left = any(member.pad_left for member in built)
+        # Indices of the members in the order in which their selections lie.
+        self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
+
+    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
+        """What any member remembers, as the stored tokens it is made of."""
+        chosen = [
+            finer(member.select(seen, step, rng), member.storage.grid, self.storage.grid)
+            for member, seen in zip(self.memories, self._views(history), strict=True)
+        ]
+        return np.unique(np.concatenate(chosen), axis=0)
+
+    def make_scorer(self) -> FrameScorer | None:
+        for member in self.memories:
+            scorer = member.make_scorer()
+            if scorer is not None:
+                return _Spread(scorer, member.storage.grid, self.storage.grid)
+        return None
+
+    def padded_length(self, count: int) -> int:
+        first, *others = (self.memories[i] for i in self._order)
+        return first.padded_length(min(count, first.capacity)) + sum(member.capacity for member in others)
+
+    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        memories, views = self.memories, self._views(history)
+        parts = []
+        for place, i in enumerate(self._order):
+            part = memories[i].recall(views[i], step, rng)
+            parts.append(_padded(part, memories[i]) if place else part)
+        return HistoryTokens(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+
+    def forward(self, history: HistoryTokens) -> MemoryTokens:
+        memories = self.memories
+        fixed = [memories[i].capacity for i in self._order[1:]]
+        lengths = [history.mask.shape[1] - sum(fixed), *fixed]
+        pieces = zip(*(getattr(history, name).split(lengths, 1) for name in _FIELDS), strict=True)
+        found: dict[int, MemoryTokens] = {}
+        for i, piece in zip(self._order, pieces, strict=True):
+            memories[i].reporting = self.reporting
+            found[i] = memories[i](HistoryTokens(*piece))
+        return self._joined([found[i] for i in range(len(memories))])
+
+    def start_stream(self) -> tuple[Any, ...]:
+        return tuple(member.start_stream() for member in self.memories)
+
+    def remember(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+        views = [self._views(history) for history in histories]
+        return self._joined([
+            member.remember([view[i] for view in views], [stream[i] for stream in streams])
+            for i, member in enumerate(self.memories)
+        ])  # fmt: skip
+
+    @property
+    def memories(self) -> list[Memory]:
+        """The members, in their order."""
+        return [member for member in self.members if isinstance(member, Memory)]
+
+    def _views(self, history: History) -> list[History]:
+        return [CoarserHistory(history, member.storage) for member in self.memories]
+
+    def _joined(self, found: Sequence[MemoryTokens]) -> MemoryTokens:
+        metrics = {
+            f"{name}/{key}": value
+            for name, tokens in zip(self.names, found, strict=True)
+            for key, value in tokens.metrics.items()
+        }
+        return MemoryTokens(torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1), metrics)
+
+
+_FIELDS = ("features", "positions", "mask")
+
+
+class CoarserHistory(History):
+    """A history as a memory sees it that wants a coarser grid than is stored."""
+
+    def __init__(self, stored: History, spec: StorageSpec) -> None:
+        super().__init__(spec, stored.exec_start)
+        self._stored = stored
+
+    def __len__(self) -> int:
+        return len(self._stored)
+
+    @property
+    def scores(self) -> FrameScores:
+        scores, grid, fine = self._stored.scores, self.spec.grid, self._stored.spec.grid
+        rows = scores.values.reshape(-1, fine, fine)[:, :: fine // grid, :: fine // grid]
+        return FrameScores(scores.frames, rows.reshape(-1, grid**2))
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        parts = (self._stored.spec.grid // self.spec.grid) ** 2
+        found = self._stored.gather(finer(indices, self.spec.grid, self._stored.spec.grid))
+        if parts == 1:
+            return found
+        cells = found.unflatten(0, (-1, parts)).float()
+        return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(found.dtype)
+
+
+class _Spread:
+    """A member's scorer, its rows spread over the finer grid that is stored."""
+
+    def __init__(self, scorer: FrameScorer, grid: int, fine: int) -> None:
+        self._scorer, self._grid, self._times = scorer, grid, fine // grid
+
+    def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
+        row = self._scorer(frame_index, frame)
+        if row is None:
+            return None
+        return np.kron(row.reshape(self._grid, self._grid), np.ones((self._times, self._times), row.dtype)).reshape(-1)
+
+
+def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
+    """(frame, patch) [n, 2] of a grid as the patches [n·k², 2] of a grid k times as fine; one after the other."""
+    times = fine // grid
+    row, column = np.divmod(indices[:, 1], grid)
+    inside = np.arange(times)
+    rows = (row[:, None] * times + inside)[:, :, None]
+    patches = rows * fine + (column[:, None] * times + inside)[:, None, :]
+    return np.stack([np.repeat(indices[:, 0], times**2), patches.reshape(-1)], axis=1)
+
+
+def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict[str, Any]]:
+    """Every member's section, with a budget: its own, or an even share of what the others leave.
+
+    Raises:
+        UserError: fewer than two members, one that is no memory's section, or more budget than there is.
+    """
+    if isinstance(members, str | Mapping) or len(members) < 2:
+        raise UserError(f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].")
+    sections: list[dict[str, Any]] = [dict(m) if isinstance(m, Mapping) else {"name": m} for m in members]
+    for section in sections:
+        if not isinstance(section.get("name"), str) or section["name"] == "joined":
+            raise UserError(f"memory.members: {brief(section)} is no memory to join; give a name, or {{name: …}}.")
+    taken = sum(section.get("budget") or 0 for section in sections)
+    open_ones = [section for section in sections if section.get("budget") is None]
+    share = (budget - taken) // max(len(open_ones), 1)
+    share -= share % WHOLE if share >= WHOLE else 0
+    if taken > budget or (open_ones and share < 1):
+        asked = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
+        raise UserError(
+            f"memory.budget={budget} is less than what its members ask for ({asked}): lower their budgets, or raise it."
+        )
+    return [{**section, "budget": share} if section in open_ones else section for section in sections]
+
+
+def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
+    """What has to be stored so that every one of these memories finds what it wants.
+
+    Raises:
+        UserError: they pool differently, or more than one scores frames.
+    """
+    (first, one), *_ = specs.items()
+    for name, other in specs.items():
+        if other.pooling != one.pooling:
+            raise UserError(
+                f"{first} stores {one} and {name} {other}: one history pools in one way. Set the same "
+                f"pooling for both, such as {{name: {name}, pooling: {one.pooling}}}."
+            )
+    scorers = {name: spec.scorer for name, spec in specs.items() if spec.scorer}
+    if len(set(scorers.values())) > 1:
+        raise UserError(
+            f"{' and '.join(scorers)} score frames differently ({', '.join(scorers.values())}), and one history keeps "
+            "one set of scores: set the same grid and stride for both, or join only one of them."
+        )
+    grid, every = max(spec.grid for spec in specs.values()), math.gcd(*(spec.keep_every for spec in specs.values()))
+    return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
+
+
+def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:
+    """A selection at its member's capacity."""
+    missing = member.capacity - len(part.mask)
+    ends = (missing, 0) if member.pad_left else (0, missing)
+    pad = nn.functional.pad
+    return HistoryTokens(pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends)), pad(part.mask, ends))
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names, with a number behind those that came before."""
+    return [f"{n}_{names[: i + 1].count(n)}" if n in names[:i] else n for i, n in enumerate(names)]
