@@ -18,6 +18,14 @@ def _folder(variable: str, default: Path, what: str) -> Path:
     return folder
 
 
+@pytest.fixture(autouse=True)
+def _own_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test imports as a plugin is asked of its own worker processes alone, not of the next test's."""
+    from mme_vla.config import plugins
+
+    monkeypatch.setattr(plugins, "_imported", dict(plugins._imported))
+
+
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of docs/parity.md."""
     if os.environ.get("MME_VLA_PARITY_TABLE"):
