@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("mani_skill", reason="the simulator is not installed: pip install 'mme-vla[sim]'")
+pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
 from mme_vla.envs import make_env
 from mme_vla.envs.meshes import CELL, coarsen, read_stl, stl_bytes

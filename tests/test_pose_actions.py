@@ -161,7 +161,7 @@ def test_a_policy_of_motions_is_served_a_motion_at_a_time() -> None:
 
 @pytest.mark.parametrize("name", ["robomme_ee_pose", "robomme_waypoint"])
 def test_recorded_actions_of_a_real_episode_succeed_in_the_environment(h5_folder: Path, name: str) -> None:
-    pytest.importorskip("mani_skill", reason="needs the simulator: pip install 'mme-vla[sim]'")
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
     panda, job = robot(name), Job("PickXtimes", "train", 8)
     with open_episode(EpisodeRef(h5_folder / f"record_dataset_{job.task}.h5", job.episode, job.task)) as episode:
         rows = episode.pose_actions(panda.action.key[0])[episode.exec_start :]
