@@ -8,6 +8,7 @@ logs a traceback, or if a malformed message gets anything but an answer with a r
 itself. Reads memory from /proc (Linux).
 """
 
+import argparse
 import http.client
 import random
 import statistics
@@ -246,4 +247,8 @@ def main(messages: int) -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main(int(sys.argv[1]) if len(sys.argv) > 1 else 100_000))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "messages", nargs="?", type=int, default=100_000, help="of each transport (default: %(default)s)"
+    )
+    raise SystemExit(main(parser.parse_args().messages))

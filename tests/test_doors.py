@@ -170,7 +170,7 @@ def test_a_policy_learns_and_acts_through_a_door(own: type[Integration]) -> None
     frames = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
     episodes = [policy.start_episode("press the button", seed) for seed in (0, 1)]
     for episode, shown in zip(episodes, (frames, frames[::-1][:2]), strict=True):
-        episode.observe({"image": shown, "wrist_image": shown}, np.zeros((len(shown), 8), np.float32))
+        episode.observe({"front": shown, "wrist": shown}, np.zeros((len(shown), 8), np.float32))
     noise = [episode.noise_state for episode in episodes]
     together = policy.act(episodes)
     for episode, state in zip(episodes, noise, strict=True):

@@ -41,7 +41,7 @@ class Case(NamedTuple):
 
 TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.patch_size=1"
 TRAIN = f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
-PLAY = "mme_vla.play task=StopCube episodes=0 max_choices=1 output=played"
+PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
 STEP = "run/checkpoints/step_000001"
 
 # In this order: some read what an earlier one wrote.
@@ -133,7 +133,8 @@ def test_a_command_names_the_extra_that_it_needs(ended: dict[Case, tuple[int, st
 def test_every_command_is_among_the_cases() -> None:
     commands = {command_of(file) for file in (REPOSITORY / "mme_vla").rglob("*.py") if is_command(file)}
     assert "mme_vla.evaluate" in commands
-    assert commands == {case.words.split()[0] for case in SUFFICE}
+    # `python -m mme_vla` runs the same commands by another name.
+    assert commands - {"mme_vla"} == {case.words.split()[0] for case in SUFFICE}
 
 
 def test_each_extra_is_among_the_cases() -> None:

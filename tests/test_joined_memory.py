@@ -132,7 +132,7 @@ def test_a_running_episode_acts_as_a_fresh_look_and_a_saved_policy_as_the_first(
         episode = which.start_episode("press the button", seed=1)
         for piece in pieces:
             shown = frames[piece]
-            episode.observe({"image": shown, "wrist_image": shown}, np.zeros((len(shown), 8), np.float32))
+            episode.observe({"front": shown, "wrist": shown}, np.zeros((len(shown), 8), np.float32))
             which._remember([episode])
         return which.act(episode)
 

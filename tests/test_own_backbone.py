@@ -77,5 +77,5 @@ def test_it_trains_through_the_same_command_and_acts(tmp_path: Path, monkeypatch
     policy = MMEPolicy.from_pretrained(weights.parent, trust_plugins=True)
     episode = policy.start_episode("press the button")
     frames = np.zeros((2, 64, 64, 3), np.uint8)
-    episode.observe({"image": frames, "wrist_image": frames}, np.zeros((2, 8), np.float32))
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((2, 8), np.float32))
     assert policy.act(episode).shape == (20, 8)

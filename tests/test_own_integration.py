@@ -39,7 +39,7 @@ def test_it_is_called_what_it_is_learns_and_acts(policy: MMEPolicy) -> None:
     assert policy.integration.get_parameter("to_condition.weight").grad.abs().sum() > 0  # type: ignore[union-attr]
     episode = policy.start_episode("press the button")
     frames = np.random.default_rng(0).integers(0, 256, (5, 64, 64, 3), dtype=np.uint8)
-    episode.observe({"image": frames, "wrist_image": frames}, np.zeros((5, 8), np.float32))
+    episode.observe({"front": frames, "wrist": frames}, np.zeros((5, 8), np.float32))
     chunk = policy.act(episode)
     assert chunk.shape == (20, 8)
     assert torch.isfinite(torch.from_numpy(chunk)).all()

@@ -163,7 +163,7 @@ def test_all_that_does_not_fit_is_listed_together(pi05: MMEPolicy, tmp_path: Pat
     with pytest.raises(UserError) as caught:
         load_weights(empty_pi05(), saved(tensors, tmp_path / "bad"))
     said = str(caught.value)
-    assert re.search(r"2 missing:\s+action_in_proj.weight\s+time_mlp_in.bias", said)
+    assert re.search(r"2 missing:\s+action_in_proj.weight, time_mlp_in.bias", said)
     assert re.search(r"1 unexpected:\s+surprise", said)
     assert "action_out_proj.bias: (7,) instead of (32,)" in said
 

@@ -327,7 +327,7 @@ def test_metrics_beyond_the_resumed_step_are_cut_off(tmp_path: Path) -> None:
 
 def test_an_absent_wandb_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "wandb", None)
-    with pytest.raises(UserError, match="logger=wandb needs the package wandb"):
+    with pytest.raises(UserError, match="logger=wandb needs the extra `wandb`"):
         check_logger({"logger": {"name": "wandb"}})
     with pytest.raises(UserError, match=r"Unknown logger 'tensorbord'.*tensorboard"):
         open_loggers(tmp_path, {"logger": {"name": "tensorbord"}}, 0)

@@ -114,7 +114,9 @@ def _width() -> int:
 
 
 def _wrapped(text: str, indent: str = "") -> list[str]:
-    return textwrap.wrap(text, _width(), initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False)
+    return textwrap.wrap(
+        text, _width(), initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False, break_long_words=False
+    )
 
 
 def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
@@ -122,7 +124,9 @@ def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
     first = min(max((len(left) for left, _ in rows), default=0), 34)
     lines = []
     for left, right in rows:
-        rest = textwrap.wrap(right, max(_width() - first - 4, 30), break_on_hyphens=False) or [""]
+        rest = textwrap.wrap(right, max(_width() - first - 4, 30), break_on_hyphens=False, break_long_words=False) or [
+            ""
+        ]
         if len(left) > first:
             lines.append(f"  {left}")
         else:

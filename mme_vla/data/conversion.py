@@ -109,6 +109,11 @@ def _work_folder(output: Path) -> Path:
     return output.with_name(output.name + ".partial")
 
 
+def planned_options(options: ConvertOptions) -> dict[str, Any]:
+    """The options as a plan holds them; the poses stand beside them there, as plans from before had none."""
+    return {key: value for key, value in asdict(options).items() if key != "poses"}
+
+
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
     """What decides the result. Reading whole files takes a small part of what converting them takes."""
     files = list(dict.fromkeys(ref.file for ref in episodes))
@@ -121,8 +126,9 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
         {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
         for ref in episodes
     ]
-    settings = {key: value for key, value in asdict(options).items() if key != "poses"}  # as plans from before had it
-    return {"options": settings, "episodes": origins} | ({"poses": list(options.poses)} if options.poses else {})
+    return {"options": planned_options(options), "episodes": origins} | (
+        {"poses": list(options.poses)} if options.poses else {}
+    )
 
 
 def _convert(

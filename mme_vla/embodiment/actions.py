@@ -3,13 +3,13 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Self
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Self
 
 from mme_vla.embodiment import fields
 from mme_vla.errors import UserError, brief
+
+if TYPE_CHECKING:
+    from torch import Tensor  # `--help` reads robots without PyTorch
 
 _KEYS = (
     "key", "space", "width", "names", "units", "relative", "angles", "binary", "horizon", "execute", "frames",
@@ -79,7 +79,7 @@ class ActionSpace:
         plain = {name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")}
         return {**plain, **listed, "angles": {str(place): centre for place, centre in self.angles.items()}}
 
-    def to_relative(self, actions: Tensor, state: Tensor) -> Tensor:
+    def to_relative(self, actions: "Tensor", state: "Tensor") -> "Tensor":
         """Express a chunk as it is predicted: relative to one state, the same reference for all its steps.
 
         Args:
@@ -93,10 +93,10 @@ class ActionSpace:
             places = list(self.relative)
             out[..., places] -= state[..., None, places].to(actions)
         for place, centre in self.angles.items():
-            out[..., place] = torch.remainder(out[..., place] - centre + math.pi, 2 * math.pi) - math.pi + centre
+            out[..., place] = (out[..., place] - centre + math.pi).remainder(2 * math.pi) - math.pi + centre
         return out
 
-    def to_absolute(self, predicted: Tensor, state: Tensor) -> Tensor:
+    def to_absolute(self, predicted: "Tensor", state: "Tensor") -> "Tensor":
         """Turn what is predicted into commands: the inverse of `to_relative`, up to whole turns of angles."""
         out = predicted.clone()
         if self.relative:
@@ -104,5 +104,5 @@ class ActionSpace:
             out[..., places] += state[..., None, places].to(predicted)
         if self.binary:
             places = list(self.binary)
-            out[..., places] = torch.where(out[..., places] < 0, -1.0, 1.0).to(out)
+            out[..., places] = 1.0 - 2.0 * (out[..., places] < 0).to(out)
         return out

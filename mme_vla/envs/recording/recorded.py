@@ -1,7 +1,7 @@
 """What a recording is to leave behind: a LeRobot dataset, official files, or both; and what of it is there already."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -110,7 +110,7 @@ class Wanted:
         return True
 
     def _is_dataset(self, options: "ConvertOptions") -> bool:
-        from mme_vla.data.conversion import SIDE_FILE
+        from mme_vla.data.conversion import SIDE_FILE, planned_options
 
         assert self.dataset is not None
         if not (self.dataset / SIDE_FILE).is_file():
@@ -118,7 +118,7 @@ class Wanted:
         side = read_json(self.dataset / SIDE_FILE, "the facts of a recorded dataset")
         found = side.get("episodes", [])
         return (
-            side.get("plan", {}).get("options") == asdict(options)
+            side.get("plan", {}).get("options") == planned_options(options)
             and [(e.get("task"), e.get("source_episode")) for e in found] == [(j.task, j.episode) for j in self.jobs]
             and all(job.made(e.get("seed"), e.get("difficulty")) for job, e in zip(self.jobs, found, strict=True))
         )
