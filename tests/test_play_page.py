@@ -117,7 +117,7 @@ def test_a_choice_that_cannot_be_made_is_answered_and_changes_nothing(tmp_path):
             ({**asked, "decision": 1}, 409, "decided already"),
             ({**asked, "session": "other"}, 409, "decided already"),
             (b"{", 400, "not valid JSON"),
-            (b"[]", 400, "no JSON object"),
+            (b"[]", 400, "must hold an object"),
             (b"\xff\xfe", 400, "not valid JSON"),
             (b" " * 5000, 400, "longer than 4096 bytes"),
         ):

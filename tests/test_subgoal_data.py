@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla.commands import subgoal_build as command
+from mme_vla.commands import subgoal_build
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
@@ -237,7 +237,7 @@ def test_settings_that_cannot_work_are_named(tmp_path):
         ("seed=-1", "seed=-1"),
     ):
         with pytest.raises(UserError, match=said):
-            command.main(compose("subgoal_build", ["input=sample", f"output={tmp_path / 'out'}", word]))
+            subgoal_build.main(compose("subgoal_build", ["input=sample", f"output={tmp_path / 'out'}", word]))
     for tasks in (tmp_path / "missing.json", tmp_path, listed):
         with pytest.raises(UserError, match="tasks="):
             open_input("sample", tasks)
