@@ -187,8 +187,8 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
 
 
 def _read_tasks(path: Path) -> dict[str, str]:
-    given: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}')
-    if not all(isinstance(task, str) for task in given.values()):
+    given: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}', kind=(dict, list))
+    if not isinstance(given, dict) or not all(isinstance(task, str) for task in given.values()):
         raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
     return given
 
