@@ -88,7 +88,8 @@ def test_memory_and_backbone_do_not_know_each_other() -> None:
 
 def test_the_core_does_without_transformers() -> None:
     for file in PACKAGE.rglob("*.py"):
-        if file.relative_to(PACKAGE).parts[0] == "subgoal":  # language models that predict subgoals
+        # Language models that predict subgoals; SAM2's encoder of a prior method.
+        if file.relative_to(PACKAGE).parts[0] == "subgoal" or file.parent.name == "sam2act":
             continue
         assert "import transformers" not in file.read_text() and "from transformers" not in file.read_text(), file
 
