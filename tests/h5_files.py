@@ -30,10 +30,12 @@ def write_file(
     numbers: Sequence[int] = (),
     size: int = 16,
     poses: bool = False,
+    depth: bool = False,
 ) -> list[Recorded]:
     """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for the last steps.
 
     With `poses` they hold the tool's poses too, and a waypoint every fourth step: the first one after three.
+    With `depth` both cameras look down from one metre above the table at what stands 20 cm high.
     """
     rng = np.random.default_rng(len(path.stem))
     videos, numbers = videos or [0] * len(lengths), numbers or range(len(lengths))
@@ -54,6 +56,8 @@ def write_file(
                 step["obs/joint_state"] = joints[t].astype(np.float32)
                 step["obs/gripper_state"] = np.array([0.04, 0.03], np.float32)
                 step["action/joint_action"] = actions[t]
+                if depth:
+                    _add_depth(episode, step, size)
                 if poses:
                     since = t - video if t >= video else t
                     step["action/eef_action"] = pose_at(t)
@@ -67,3 +71,15 @@ def write_file(
             state = np.concatenate([joints, np.full((length, 1), 0.04)], axis=1).astype(np.float32)
             recorded.append(Recorded(frames[0], frames[1], state, actions))
     return recorded
+
+
+def _add_depth(episode: h5py.Group, step: h5py.Group, size: int) -> None:
+    """Two cameras one metre above the table that look straight down, with the view of a square half a metre wide."""
+    down = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
+    for camera in ("front", "wrist"):
+        step[f"obs/{camera}_depth"] = np.full((size, size, 1), 800, np.int16)
+        step[f"obs/{camera}_camera_extrinsic"] = down
+        if f"setup/{camera}_camera_intrinsic" not in episode:
+            focal, centre = 2.0 * size, size / 2
+            intrinsic = np.array([[focal, 0, centre], [0, focal, centre], [0, 0, 1]], np.float32)
+            episode[f"setup/{camera}_camera_intrinsic"] = intrinsic

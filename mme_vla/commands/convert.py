@@ -17,6 +17,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.episodes is not None:
         episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
     output = Path(cfg.output)
-    written = convert(episodes, output, ConvertOptions(images=cfg.images, fps=cfg.fps, **cfg.video))
+    options = ConvertOptions(images=cfg.images, fps=cfg.fps, keyframes=cfg.keyframes, **cfg.video)
+    written = convert(episodes, output, options)
     already = len(episodes) - written
     print(f"{output}: {len(episodes)} episodes ({written} written now, {already} already there).")

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
+from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
-_PARTS, _MERGED = "episodes", "merged"
+_PARTS, _MERGED, _KEYFRAMES = "episodes", "merged", "keyframes.npz"
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class ConvertOptions:
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
     poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
+    keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
     """
 
     images: str = "video"
@@ -42,6 +44,7 @@ class ConvertOptions:
     pix_fmt: str = "yuv444p"
     gop: int = 8
     poses: tuple[str, ...] = ()
+    keyframes: bool = False
 
     def __post_init__(self) -> None:
         if self.images not in ("video", "png"):
@@ -110,8 +113,8 @@ def _work_folder(output: Path) -> Path:
 
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
-    """The options as a plan holds them; the poses stand beside them there, as plans from before had none."""
-    return {key: value for key, value in asdict(options).items() if key != "poses"}
+    """The options as a plan holds them; poses and keyframes stand beside them there, as plans from before had none."""
+    return {key: value for key, value in asdict(options).items() if key not in ("poses", "keyframes")}
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
@@ -128,7 +131,7 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
     ]
     return {"options": planned_options(options), "episodes": origins} | (
         {"poses": list(options.poses)} if options.poses else {}
-    )
+    ) | ({"keyframes": True} if options.keyframes else {})
 
 
 def _convert(
@@ -185,6 +188,8 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
     shutil.rmtree(draft, ignore_errors=True)
     with open_episode(ref) as episode:
         _write_dataset(episode, draft, options)
+        if options.keyframes:
+            write_keyframes(episode, draft / _KEYFRAMES)
         side = {
             "task": ref.task,
             "source_file": ref.file.name,
@@ -265,6 +270,10 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
         aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
+    for i, part in enumerate(parts):
+        if (part / _KEYFRAMES).is_file():
+            file_of(merged, i).parent.mkdir(exist_ok=True)
+            shutil.copy(part / _KEYFRAMES, file_of(merged, i))
     episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]
     (merged / SIDE_FILE).write_text(json.dumps({"plan": plan, "episodes": episodes}, indent=1))
     write_sums(merged)  # LeRobot's format has none: damage would be read as data

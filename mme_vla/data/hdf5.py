@@ -221,6 +221,39 @@ class RawEpisode:
                 rows[part][unknown] = rows[part][~unknown][0]
         return rows
 
+    def shot(self, step: int, camera: str) -> dict[str, np.ndarray]:
+        """What a camera (`front`, `wrist`) recorded at a step, and where it stood.
+
+        Returns:
+            `colours` [H, W, 3] uint8; `depth` [H, W] float32 in millimetres; `intrinsic` [3, 3] and the world-to-camera
+            `extrinsic` [3, 4] float64.
+
+        Raises:
+            UserError: the episode holds no depth or no poses of cameras, or something else in their place.
+        """
+        colours = self._picture(step, f"obs/{camera}_rgb")
+        parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
+                 "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
+        missing = [name for name in parts.values() if name not in self._group]
+        if missing:
+            raise UserError(f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
+        found = {name: np.asarray(self._value(place)) for name, place in parts.items()}
+        found["depth"] = found["depth"].reshape(found["depth"].shape[:2])
+        shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
+        for name, shape in shapes.items():
+            numbers = found[name].dtype.kind in "fiu" and np.isfinite(found[name]).all()
+            if found[name].shape != shape or not numbers:
+                raise UserError(
+                    f"{self.ref.file} {self.ref.group}/{parts[name]} holds {found[name].dtype} "
+                    f"{list(found[name].shape)}; expected {list(shape)} finite numbers. {_REMEDY}"
+                )
+        kinds = {"depth": np.float32, "intrinsic": np.float64, "extrinsic": np.float64}
+        return {"colours": colours, **{name: found[name].astype(kind) for name, kind in kinds.items()}}
+
+    def commanded_open(self, step: int) -> bool:
+        """Whether the gripper's command at a step is to be open."""
+        return bool(self._numbers(step, "action/joint_action", 8)[7] > 0)
+
     def front(self, step: int) -> np.ndarray:
         """The front picture of one step, [H, W, 3] uint8."""
         return self._picture(step, "obs/front_rgb")

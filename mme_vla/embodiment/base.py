@@ -21,11 +21,21 @@ class Camera:
 
     name: the same from the simulator or the robot to the policy. key: its column in the dataset; None for the usual
     names. augment: in training, `all` (crop, rotation, colour), `colour`, or `none`.
+    depth: whether the policy also reads how far each pixel is, and where the camera stands.
     """
 
     name: str
     key: str | None = None
     augment: str = "all"
+    depth: bool = False
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """What is delivered beside the pictures: depth [H, W, 1] int16 in millimetres, and the camera's pose [3, 4].
+
+        The pose is from the world to the camera, in OpenCV's axes.
+        """
+        return (f"{self.name}_depth", f"{self.name}_camera_extrinsic") if self.depth else ()
 
 
 @dataclass(frozen=True)
@@ -56,6 +66,11 @@ class Embodiment:
     @property
     def camera_names(self) -> tuple[str, ...]:
         return tuple(camera.name for camera in self.cameras)
+
+    @property
+    def readings(self) -> tuple[str, ...]:
+        """What all cameras deliver beside their pictures, by the benchmark's names."""
+        return tuple(name for camera in self.cameras for name in camera.readings)
 
     @property
     def augmentations(self) -> tuple[str, ...]:
@@ -97,7 +112,7 @@ class Embodiment:
         """The section that `from_dict` reads, fit for JSON."""
         return {
             "name": self.name,
-            "cameras": {camera.name: {"key": camera.key, "augment": camera.augment} for camera in self.cameras},
+            "cameras": {camera.name: _described(camera) for camera in self.cameras},
             "memory_camera": self.memory_camera,
             "state": {"key": list(self.state.key), "width": self.state.width},
             "action": self.action.to_dict(),
@@ -128,19 +143,26 @@ class Embodiment:
             )
 
 
+def _described(camera: Camera) -> dict[str, Any]:
+    depth = {"depth": True} if camera.depth else {}  # which cameras of earlier versions did not say
+    return {"key": camera.key, "augment": camera.augment, **depth}
+
+
 def _cameras(given: Any) -> tuple[Camera, ...]:
     if not isinstance(given, Mapping) or not given:
         raise UserError(f"embodiment.cameras must name at least one camera with its settings, got {brief(given)}.")
     cameras = []
     for name, settings in given.items():
         where = f"embodiment.cameras.{name}"
-        found = fields.section(settings or {}, where, ("key", "augment"))
+        found = fields.section(settings or {}, where, ("key", "augment", "depth"))
         augment, key = found.get("augment", "all"), found.get("key")
         if augment not in AUGMENTATIONS:
             raise UserError(f"{where}.augment={brief(augment)}. {did_you_mean(str(augment), AUGMENTATIONS)}")
         if key is not None and not isinstance(key, str):
             raise UserError(f"{where}.key must be a column of the dataset, got {brief(key)}.")
+        if not isinstance(depth := found.get("depth", False), bool):
+            raise UserError(f"{where}.depth must be true or false, got {brief(depth)}.")
         if name == "state":
             raise UserError(f"{where}: the state goes under this name in messages; call the camera something else.")
-        cameras.append(Camera(str(name), key, augment))
+        cameras.append(Camera(str(name), key, augment, depth))
     return tuple(cameras)

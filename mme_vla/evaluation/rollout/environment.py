@@ -5,7 +5,7 @@ policy reads, and its report says where the time went.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ REPORTED = (
 _BLIND = np.zeros((256, 256, 3), np.uint8)
 
 Observation = dict[str, Any]
-"""Every camera by its name: lists of uint8 [H, W, 3]; `state`: float32 [t, s]."""
+"""Every camera by its name: lists of uint8 [H, W, 3]; the robot's `readings` likewise; `state`: float32 [t, s]."""
 
 
 class RenderClock:
@@ -89,7 +89,7 @@ class ChunkEnv:
         """All frames of the conditioning video, the current one last, and the report."""
         with self._simulation():
             observation, info = self._env.reset()
-        frames = _Frames(self._robot.camera_names)
+        frames = _Frames(self._robot)
         count = frames.add(observation)
         self._draw(frames, count, demo=count - 1)
         return frames.observation(), self._report(info)
@@ -104,7 +104,7 @@ class ChunkEnv:
             The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
             actions, and `steps`, that of frames.
         """
-        frames, executed, seen = _Frames(self._robot.camera_names), 0, 0
+        frames, executed, seen = _Frames(self._robot), 0, 0
         terminated = truncated = False
         info: dict[str, Any] = {}
         for action in np.asarray(command["actions"]):
@@ -173,9 +173,10 @@ def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
 class _Frames:
     """Collects frames in the policy's form; the benchmark's own cameras too, for the video."""
 
-    def __init__(self, cameras: Sequence[str]) -> None:
-        self._cameras = cameras
-        self._pictures: dict[str, list[np.ndarray]] = {name: [] for name in (*cameras, *CAMERAS)}
+    def __init__(self, robot: Embodiment) -> None:
+        self._cameras = robot.camera_names
+        self._pictures: dict[str, list[np.ndarray]] = {name: [] for name in (*self._cameras, *CAMERAS)}
+        self._readings: dict[str, list[np.ndarray]] = {name: [] for name in robot.readings}
         self._states: list[np.ndarray] = []
 
     def add(self, observation: dict[str, list[Any]]) -> int:
@@ -187,6 +188,13 @@ class _Frames:
             if not blind and name in self._cameras and f"{name}_rgb_list" not in observation:
                 raise UserError(f"The environment has no camera {name!r}; it shows {', '.join(sorted(observation))}.")
             pictures += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
+        for name, readings in self._readings.items():
+            if f"{name}_list" not in observation:
+                given = ", ".join(sorted(observation))
+                raise UserError(
+                    f"The policy reads {name!r}, which this environment does not deliver: only {given}."
+                )
+            readings += observation[f"{name}_list"]
         return len(joints)
 
     def newest(self, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -195,7 +203,7 @@ class _Frames:
 
     def observation(self) -> Observation:
         state = np.stack(self._states) if self._states else np.zeros((0, ROBOMME_JOINT.state.width), np.float32)
-        return {**{name: self._pictures[name] for name in self._cameras}, "state": state}
+        return {**{name: self._pictures[name] for name in self._cameras}, **self._readings, "state": state}
 
 
 def make_rollout_env(

@@ -108,6 +108,7 @@ def _run(
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
     if base is make_env:
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
+        options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
     workers = settings.worker_count(len(jobs))

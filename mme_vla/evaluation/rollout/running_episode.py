@@ -96,7 +96,9 @@ class RunningEpisode:
         """Take one piece of the waiting frames into memory."""
         begun = time.perf_counter()
         part = slice(self._at, self._at + self._piece)
-        views = {name: np.stack(self._frames[name][part]) for name in self._robot.camera_names}
+        views = {
+            name: np.stack(self._frames[name][part]) for name in (*self._robot.camera_names, *self._robot.readings)
+        }
         led = self._led
         if led is not None:  # one action a frame; or some motions, all told with the first of their frames
             led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]

@@ -45,6 +45,11 @@ class SAM2ActNetwork(nn.Module):
         positions = released_positions(self.coarse.transformer.positions, len(look.pictures))
         return self._remember_and_decode(look, tokens, positions, remembered)
 
+    def coarse_alone(self, look: Look) -> Tensor:
+        """Heatmap logits [b, 3, 1, s, s] of the coarse look of episodes that remember nothing."""
+        logits: Tensor = self.coarse.decoder(self.coarse.transformer(look), *look.maps[:2])
+        return logits.unflatten(0, (-1, VIEWS))
+
     def coarse_sequences(self, look: Look, length: int) -> Tensor:
         """Heatmap logits [b, 3, 1, s, s] of sequences of keyframes, each with a bank of its own that begins empty.
 
@@ -78,3 +83,10 @@ class SAM2ActNetwork(nn.Module):
         tokens = self.fine.transformer(look)
         logits: Tensor = self.fine.decoder(tokens, *look.maps[:2])
         return logits.unflatten(0, (-1, VIEWS)), tokens
+
+    def heads(self, tokens: Tensor, waypoints: Tensor, rotation: Tensor | None = None) -> dict[str, Tensor]:
+        """What to do at waypoints [b, 3] of the closer look's cube: see `Heads.forward`."""
+        heads = self.fine.heads
+        assert heads is not None
+        found: dict[str, Tensor] = heads(heads.features(tokens, waypoints), rotation)
+        return found

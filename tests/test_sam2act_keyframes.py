@@ -1,0 +1,164 @@
+"""Keyframes with depth beside a dataset, the chains they form, and the clouds they become."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from h5_files import pose_at, write_file
+
+from mme_vla.backbone.sam2act.geometry import Cube
+from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.data.keyframe_dataset import KeyframeDataset, KeyframeSample
+from mme_vla.data.keyframes import EpisodeKeyframes, file_of, motions_of, write_keyframes
+from mme_vla.errors import UserError
+from mme_vla.policy.sam2act.scene import Shot, cloud_of, cloud_pictures
+
+LENGTHS, VIDEOS = [32, 14], [12, 0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two recorded episodes and the dataset made of them."""
+    folder = tmp_path_factory.mktemp("keyframes")
+    write_file(folder / "record_dataset_Alpha.h5", LENGTHS, VIDEOS, poses=True, depth=True)
+    options = ConvertOptions(images="png", keyframes=True)
+    convert(list_episodes(find_files([folder])), folder / "out", options)
+    return folder
+
+
+class Plain:
+    """Hands samples on as they are."""
+
+    def keyframe_item(self, sample: KeyframeSample) -> dict[str, Any]:
+        return {"sample": sample}
+
+
+def test_the_motions_of_video_and_execution_follow_each_other(folder: Path) -> None:
+    with open_episode(list_episodes(find_files([folder]))[0]) as episode:
+        motions = motions_of(episode)
+    assert motions.decisions[0] == 0
+    assert VIDEOS[0] in motions.decisions
+    assert (np.diff(motions.decisions) > 0).all()
+    first_of_execution = motions.targets[motions.decisions.tolist().index(VIDEOS[0])]
+    assert np.allclose(first_of_execution, pose_at(100 + (VIDEOS[0] + 3) // 4), atol=1e-6)
+
+
+def test_every_chain_leads_from_its_entry_to_the_last_motion(folder: Path) -> None:
+    kept = EpisodeKeyframes(file_of(folder / "out", 0))
+    decisions = kept.motions.decisions.tolist()
+    assert [chain[0].frame for chain in kept.chains] == list(range(0, LENGTHS[0], 10))
+    for chain in kept.chains:
+        assert [link.place for link in chain] == list(range(len(chain)))
+        assert [link.frame for link in chain[1:]] == decisions[-len(chain) + 1 :][: len(chain) - 1]
+        assert chain[-1].motion == len(decisions) - 1
+        entry = chain[0]
+        assert decisions[entry.motion] <= entry.frame
+        assert entry.motion == len(decisions) - 1 or entry.frame < decisions[entry.motion + 1]
+
+
+def test_what_is_kept_is_what_was_recorded(folder: Path) -> None:
+    ref = list_episodes(find_files([folder]))[0]
+    kept = EpisodeKeyframes(file_of(folder / "out", 0))
+    with open_episode(ref) as episode:
+        for frame, shots in zip([0, 12], kept.shots([0, 12]), strict=True):
+            for shot, camera in zip(shots, ("front", "wrist"), strict=True):
+                recorded = Shot(**episode.shot(frame, camera)).shrunk(128)
+                assert np.array_equal(shot.colours, recorded.colours)
+                assert np.array_equal(shot.depth, recorded.depth)
+                assert np.array_equal(shot.intrinsic, recorded.intrinsic)
+                assert np.array_equal(shot.extrinsic, recorded.extrinsic)
+        assert kept.commanded_open([0, 12]).tolist() == [episode.commanded_open(0), episode.commanded_open(12)]
+
+
+def test_recordings_without_depth_are_refused_by_name(tmp_path: Path) -> None:
+    write_file(tmp_path / "record_dataset_Alpha.h5", [8], poses=True)
+    refs = list_episodes(find_files([tmp_path]))
+    with open_episode(refs[0]) as episode, pytest.raises(UserError, match=r"front_depth.*record it with depth"):
+        write_keyframes(episode, tmp_path / "kept.npz")
+
+
+def test_a_conversion_without_keyframes_is_another_plan_and_has_none(folder: Path, tmp_path: Path) -> None:
+    refs = list_episodes(find_files([folder]))
+    convert(refs, tmp_path / "out", ConvertOptions(images="png"))
+    assert not file_of(tmp_path / "out", 0).exists()
+    with pytest.raises(UserError, match="is not the result of this conversion"):
+        convert(refs, tmp_path / "out", ConvertOptions(images="png", keyframes=True))
+    with pytest.raises(UserError, match="keyframes=true"):
+        EpisodeKeyframes(file_of(tmp_path / "out", 0))
+
+
+def test_damaged_keyframes_are_named(folder: Path, tmp_path: Path) -> None:
+    whole = file_of(folder / "out", 0).read_bytes()
+    for damaged in (whole[: len(whole) // 2], b"nothing of the kind"):
+        (tmp_path / "kept.npz").write_bytes(damaged)
+        with pytest.raises(UserError, match="is damaged"):
+            EpisodeKeyframes(tmp_path / "kept.npz").motions  # noqa: B018
+
+
+def source_of(folder: Path) -> EpisodeSource:
+    return EpisodeSource(folder / "out")
+
+
+def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> None:
+    source = source_of(folder)
+    data = KeyframeDataset([source], Plain(), 1)
+    chains = [chain for e in range(len(LENGTHS)) for chain in EpisodeKeyframes(file_of(source.root, e)).chains]
+    assert len(data) == sum(map(len, chains))
+    assert data.total_frames == sum(LENGTHS)
+    item = data[0]
+    assert item["place"] == (0, 0, 0)
+    assert item["sample"].goal == "do task 0"
+    assert item["sample"].targets.shape == (1, 7)
+
+
+def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(folder: Path) -> None:
+    data = KeyframeDataset([source_of(folder)], Plain(), 3, seed=5)
+    again = KeyframeDataset([source_of(folder)], Plain(), 3, seed=5)
+    begins: dict[int, set[int]] = {}
+    for epoch in range(12):
+        data.set_epoch(epoch)
+        again.set_epoch(epoch)
+        for index in range(len(data)):
+            *_, links = data.window(index)
+            assert links == again.window(index)[-1]
+            assert len(links) == 3
+            begins.setdefault(index, set()).add(links[0].place)
+    for index, found in begins.items():
+        length = len(data._items[index][3])
+        assert found == set(range(max(length - 3, 1)))
+
+
+def test_chains_that_are_too_short_for_any_sample_are_said(folder: Path) -> None:
+    with pytest.raises(UserError, match="No chain of keyframes in the data has 100 of them; the longest has"):
+        KeyframeDataset([source_of(folder)], Plain(), 100)
+
+
+def test_depth_becomes_a_table_at_its_height(folder: Path) -> None:
+    shots = EpisodeKeyframes(file_of(folder / "out", 0)).shots([0])[0]
+    points, colours = cloud_of(shots, 128)
+    assert points.shape == colours.shape == (2 * 128**2, 3)
+    assert np.allclose(points[:, 2], 0.2, atol=1e-6)
+    # 0.8 m away a picture of 90° / 2 of slope ½ is 0.4 m wide.
+    assert np.allclose([points[:, 0].min(), points[:, 0].max()], [-0.2, 0.2], atol=0.01)
+
+
+def test_colours_are_averaged_and_intrinsics_follow() -> None:
+    colours = np.zeros((4, 4, 3), np.uint8)
+    colours[::2] = 200
+    shot = Shot(colours, np.arange(16.0).reshape(4, 4), np.array([[8.0, 0, 2], [0, 8, 2], [0, 0, 1]]), np.eye(4)[:3])
+    small = shot.shrunk(2)
+    assert (small.colours == 100).all()
+    assert small.depth.tolist() == [[2.5, 4.5], [10.5, 12.5]]
+    assert small.intrinsic.tolist() == [[4, 0, 1], [0, 4, 1], [0, 0, 1]]
+
+
+def test_a_cloud_outside_of_the_cube_shows_nothing() -> None:
+    cube = Cube.of((-1, -1, -1, 1, 1, 1))
+    far = torch.full((1, 5, 3), 2.0)
+    seen = cloud_pictures(far, torch.ones(1, 5, 3), cube, 14)
+    assert not seen[0, :, :6].any()
+    assert (seen[0, :, 6] == -1).all()
