@@ -24,7 +24,7 @@ def baselines_folder(method: str) -> Path:
 
 
 def rule_uniform(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
-    """The float32 numbers in [−1, 1) that the cases' READMEs call u(name, shape, seed): integers mixed by splitmix64."""
+    """The float32 numbers in [−1, 1) that the cases' READMEs call u(name, shape, seed): splitmix64 of whole numbers."""
     count = int(np.prod(shape, dtype=np.int64))
     with np.errstate(over="ignore"):
         z = np.arange(count, dtype=np.uint64) + (np.uint64(zlib.crc32(f"{seed}/{name}".encode())) << np.uint64(32))

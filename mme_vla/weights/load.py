@@ -160,10 +160,10 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     if policy.processor is None or not file.is_file():
         return
     theirs = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
-    ours = policy.processor.tokenizer
-    if theirs is not None and theirs != ours.fingerprint:
+    processor, ours = policy.processor, policy.processor.words_fingerprint
+    if theirs is not None and ours is not None and theirs != ours:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {ours.spec!r} ({ours.fingerprint}): "
+            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {processor.words_from!r} ({ours}): "
             "its ids would mean other words. Set processor.tokenizer to that one."
         )
 
