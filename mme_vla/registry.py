@@ -97,11 +97,19 @@ INTEGRATIONS: Registry[Any] = Registry("integration")
 BACKBONES: Registry[Any] = Registry("backbone")
 POLICIES: Registry[Any] = Registry(
     "policy",
-    {"mme": "mme_vla.policy.mme", "diffusion_policy": "mme_vla.policy.diffusion.policy"},
+    {
+        "mme": "mme_vla.policy.mme",
+        "diffusion_policy": "mme_vla.policy.diffusion.policy",
+        "sam2act_plus": "mme_vla.policy.sam2act.policy",
+    },
 )
 PROCESSORS: Registry[Any] = Registry(
     "processor",
-    {"pi05": "mme_vla.processing.processor", "diffusion_policy": "mme_vla.policy.diffusion.processing"},
+    {
+        "pi05": "mme_vla.processing.processor",
+        "diffusion_policy": "mme_vla.policy.diffusion.processing",
+        "sam2act_plus": "mme_vla.policy.sam2act.processing",
+    },
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")

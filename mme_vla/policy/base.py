@@ -165,6 +165,10 @@ class Policy(Saved):
 
     # Parts
 
+    frozen: str | None = None
+    """Pattern of the parameters that never learn, whatever fine-tuning asks for."""
+    keyframes: int = 1
+    """Keyframes of a training sample, where samples are such."""
     adapted: Sequence[str] = ()
     """Linear layers that LoRA wraps unless told otherwise, by the end of their name."""
     heads: Sequence[str] = ()

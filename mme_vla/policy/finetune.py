@@ -24,6 +24,7 @@ class Tunable(Protocol):
     adapted: Sequence[str]
     heads: Sequence[str]
     unadaptable: str | None
+    frozen: str | None
 
     def parts(self) -> Mapping[str, str]: ...
 
@@ -83,7 +84,8 @@ def apply_finetuning(
             learns = part in ("action", "memory")
         else:
             learns = ".lora_" in name or any(name.startswith(f"{module}.") for module in in_full) or part in train
-        parameter.requires_grad_(learns and not (part == "vision" and freeze_vision))
+        fixed = policy.frozen is not None and re.match(policy.frozen, name) is not None
+        parameter.requires_grad_(learns and not fixed and not (part == "vision" and freeze_vision))
     counts = dict.fromkeys(policy.parts(), 0)
     for name, parameter in policy.named_parameters():
         counts[policy.part_of(name)] += parameter.numel() if parameter.requires_grad else 0

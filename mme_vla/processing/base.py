@@ -69,6 +69,8 @@ class PolicyProcessor:
     prompt_name: str = "plain"
     """How the goal becomes words, for messages."""
     counted: Counted = Counted()
+    samples: str = "steps"
+    """What a training sample is: `steps` of an execution, or `keyframes` with depth."""
     _stats: NormStats | None = None
 
     @classmethod

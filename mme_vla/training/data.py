@@ -8,6 +8,7 @@ from typing import Any
 from mme_vla.data.cache.ensure import ensure_cache
 from mme_vla.data.cache.store import COMMAND
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.keyframe_dataset import KeyframeDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes
 from mme_vla.data.statistics import compute_norm_stats
@@ -23,8 +24,8 @@ from mme_vla.processing.subgoal_text import SubgoalText
 class SplitData:
     """The training steps and the held-out ones (None where the split holds nothing out)."""
 
-    train: TrainingDataset
-    val: TrainingDataset | None
+    train: TrainingDataset | KeyframeDataset
+    val: TrainingDataset | KeyframeDataset | None
     content: list[str]
     """A fingerprint of each dataset's content."""
 
@@ -79,7 +80,9 @@ def prepare_data(
             for source in sources
         ]
 
-    def side(episodes: list[Any], jitter: bool) -> TrainingDataset:
+    def side(episodes: list[Any], jitter: bool) -> TrainingDataset | KeyframeDataset:
+        if processor.samples == "keyframes":
+            return KeyframeDataset(sources, processor, policy.keyframes, episodes=episodes, seed=seed)
         return TrainingDataset(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
             mask_padding=data["mask_padding"], jitter=jitter, subgoal=subgoal, seed=seed,

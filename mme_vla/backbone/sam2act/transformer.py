@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.backbone.sam2act.views import VIEWS
@@ -107,6 +108,8 @@ class MultiViewTransformer(nn.Module):
         self.wide = nn.Linear(sizes.token, sizes.width)
         self.narrow = nn.Linear(sizes.width, sizes.token)
         self.layers = nn.ModuleList(Layer(sizes.width, sizes.heads) for _ in range(sizes.depth))
+        self.recomputed = False
+        """Whether layers keep no activations in training."""
 
     def forward(self, look: Look) -> Tensor:
         """Tokens [b·3, token, g, g], view by view."""
@@ -123,9 +126,16 @@ class MultiViewTransformer(nn.Module):
         alone = len(self.layers) // 2
         views = views.reshape(batch * VIEWS, grid**2, -1)
         for layer in self.layers[:alone]:
-            views = layer(views)
+            views = self._run(layer, views)
         x = torch.cat([language, views.reshape(batch, VIEWS * grid**2, -1)], 1)
         for layer in self.layers[alone:]:
-            x = layer(x)
+            x = self._run(layer, x)
         tokens = self.narrow(x[:, words:]).reshape(batch * VIEWS, grid**2, -1)
         return tokens.transpose(1, 2).unflatten(-1, (grid, grid))
+
+    def _run(self, layer: nn.Module, x: Tensor) -> Tensor:
+        if self.recomputed and torch.is_grad_enabled():
+            kept: Tensor = checkpoint(layer, x, use_reentrant=False)
+            return kept
+        out: Tensor = layer(x)
+        return out

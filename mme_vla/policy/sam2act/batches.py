@@ -12,7 +12,7 @@ class KeyframeBatch(TensorStruct):
     """Sequences of k keyframes; k is 1 where single transitions are learnt.
 
     points: [b, k, n, 3], metres in the world, bounds not applied yet. colours: [b, k, n, 3] uint8.
-    state: [b, k, p]. language: [b, l] int64 token ids; language_mask: [b, l].
+    state: [b, k, p]. language: [b, l, w] the goal's tokens.
     target: [b, k, 3], metres. rotation: [b, k, 4], quaternions (x, y, z, w). gripper, collision: [b, k] int64.
     """
 
@@ -20,7 +20,6 @@ class KeyframeBatch(TensorStruct):
     colours: Tensor
     state: Tensor
     language: Tensor
-    language_mask: Tensor
     target: Tensor
     rotation: Tensor
     gripper: Tensor

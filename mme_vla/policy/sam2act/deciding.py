@@ -26,6 +26,10 @@ class Seen:
     state: Tensor
     language: Tensor
 
+    def to(self, device: torch.device) -> "Seen":
+        """The same on a device."""
+        return Seen(*(x.to(device) for x in (self.points, self.colours, self.state, self.language)))
+
 
 @dataclass(frozen=True)
 class Waypoint:

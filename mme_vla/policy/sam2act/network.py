@@ -35,6 +35,10 @@ class SAM2ActNetwork(nn.Module):
         self.coarse = Branch(sizes)
         self.fine = Branch(sizes, with_heads=True)
 
+    def recompute(self, wanted: bool) -> None:
+        """Compute the transformer layers' activations again in the backward pass, or keep them."""
+        self.coarse.transformer.recomputed = self.fine.transformer.recomputed = wanted
+
     def look(self, pictures: Tensor, state: Tensor, language: Tensor) -> Look:
         """What a branch reads: virtual pictures [b, 3, 10, s, s], the state [b, p], the goal's tokens [b, l, w]."""
         return Look(pictures, self.encoder(pictures[:, :, COLOURS].flatten(0, 1)), state, language)

@@ -1,6 +1,6 @@
 """What the cameras show, as one cloud of coloured points; and what the network sees of a cloud."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,24 +53,6 @@ def cloud_of(shots: Sequence[Shot], side: int) -> tuple[np.ndarray, np.ndarray]:
     """Points [n, 3] float32 and colours [n, 3] uint8 of several cameras at `side` × `side` pixels each."""
     points, colours = zip(*(shot.shrunk(side).points() for shot in shots), strict=True)
     return np.concatenate(points), np.concatenate(colours)
-
-
-def shots_of(views: Mapping[str, np.ndarray], cameras: Sequence[str], intrinsic: np.ndarray, index: int) -> list[Shot]:
-    """The cameras' shots of one of the frames that an environment delivers.
-
-    Args:
-        views: of every camera its pictures [t, h, w, 3], `<camera>_depth` [t, h, w, 1] and
-            `<camera>_camera_extrinsic` [t, 3, 4]. intrinsic: [3, 3], of all cameras.
-    """
-    return [
-        Shot(
-            views[name][index],
-            np.asarray(views[f"{name}_depth"][index]).reshape(views[name][index].shape[:2]),
-            intrinsic,
-            views[f"{name}_camera_extrinsic"][index],
-        )
-        for name in cameras
-    ]
 
 
 def cloud_pictures(points: Tensor, colours: Tensor, cube: Cube, side: int) -> Tensor:

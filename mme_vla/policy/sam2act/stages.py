@@ -13,14 +13,24 @@ STAGES = {
 """Stage → pattern of the parameters that learn in it, as the authors froze the others."""
 
 
+def check_stage(stage: str) -> str:
+    """Return the stage's name.
+
+    Raises:
+        UserError: there is no such stage.
+    """
+    if stage not in STAGES:
+        raise UserError(f"Unknown training stage {brief(stage)} of SAM2Act+. {did_you_mean(str(stage), STAGES)}")
+    return stage
+
+
 def select_trained(network: nn.Module, stage: str) -> list[nn.Parameter]:
     """Freeze what a stage does not train, and return what it does.
 
     Raises:
         UserError: there is no such stage.
     """
-    if stage not in STAGES:
-        raise UserError(f"Unknown training stage {brief(stage)} of SAM2Act+. {did_you_mean(stage, STAGES)}")
+    check_stage(stage)
     trained = []
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(re.match(STAGES[stage], name) is not None)

@@ -1,0 +1,112 @@
+"""A running episode of SAM2Act+: a bank of keyframes, and the cloud that is seen now."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+from mme_vla.errors import UserError
+from mme_vla.memory.sam2act.bank import BankState
+from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.sam2act.deciding import Seen
+from mme_vla.policy.sam2act.processing import SAM2ActProcessor
+from mme_vla.policy.sam2act.scene import Shot
+
+
+class Watcher(Host, Protocol):
+    """What this episode asks of its policy besides."""
+
+    def require_processor(self) -> SAM2ActProcessor: ...
+
+    def watch(self, seen: Seen, remembered: BankState) -> BankState: ...
+
+
+class KeyframeEpisode(Episode):
+    """Goal, bank and current shots of one episode.
+
+    A keyframe is a frame at which a waypoint is asked for: the last one of those that arrive together. Of the
+    conditioning video some frames, evenly spread, are taken into the bank once the first execution frame is there.
+    """
+
+    _policy: Watcher
+
+    def __init__(self, policy: Watcher, goal: str, seed: int = 0) -> None:
+        super().__init__(policy, goal, seed)
+        self.remembered = BankState()
+        """What was kept of all keyframes before the current one."""
+        self.waypoints = 0
+        """Waypoints that were executed."""
+        self._after: BankState | None = None
+        self._now: tuple[list[Shot], float] | None = None
+        self._video: list[tuple[list[Shot], float]] = []
+
+    def observe(
+        self,
+        frames: Mapping[str, np.ndarray],
+        states: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+    ) -> None:
+        """Take frames in order, with what the cameras read beside their pictures; see `Episode.observe`.
+
+        Args:
+            frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and `<name>_camera_extrinsic`
+                [t, 3, 4], from the world to the camera.
+
+        Raises:
+            UserError: also where depth or poses are missing or of another form.
+        """
+        self._check_readings(frames)
+        super().observe(frames, states, is_demo, actions)
+        demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
+        processor = self._policy.require_processor()
+        fingers = np.asarray(states, np.float32)[:, -1]
+        self._video += [(processor.shots(frames, i), float(fingers[i])) for i in np.flatnonzero(demo)]
+        if len(demo) and not demo[-1]:
+            self._remember_video()
+            if self._after is not None:
+                self.remembered, self._after = self._after, None
+                self.waypoints += 1
+            self._now = (processor.shots(frames, len(demo) - 1), float(fingers[-1]))
+
+    def seen(self) -> Seen:
+        """What the network is shown now.
+
+        Raises:
+            UserError: no execution frame was seen yet.
+        """
+        if self._now is None:
+            raise UserError("The episode has seen no execution frame yet: call observe() with the current one first.")
+        return self._seen_as(*self._now, self.waypoints)
+
+    def decided(self, remembered: BankState) -> None:
+        """Note what is remembered once the frame that was decided at lies behind: when the next ones are observed."""
+        self._after = remembered
+
+    def _remember_video(self) -> None:
+        most = self._policy.require_processor().video_frames
+        count = min(len(self._video), most)
+        for place, index in enumerate(np.linspace(0, len(self._video) - 1, count).round().astype(int)):
+            seen = self._seen_as(*self._video[index], place)
+            self.remembered = self._policy.watch(seen, self.remembered)
+        self._video = []
+
+    def _seen_as(self, shots: list[Shot], finger: float, place: int) -> Seen:
+        processor = self._policy.require_processor()
+        points, colours = processor.cloud(shots)
+        return Seen(points, colours, processor.state(finger, place), processor.prompt(self.goal))
+
+    def _check_readings(self, frames: Mapping[str, np.ndarray]) -> None:
+        for camera in self._robot.cameras:
+            if camera.name not in frames:
+                continue  # which `Episode.observe` tells
+            pictures = np.asarray(frames[camera.name])
+            depth, pose = camera.readings
+            for name, shape in ((depth, (*pictures.shape[:3], 1)), (pose, (len(pictures), 3, 4))):
+                if name not in frames:
+                    raise UserError(
+                        f"observe() needs {name!r} beside the camera {camera.name!r}; got {sorted(frames)}."
+                    )
+                found = np.asarray(frames[name])
+                if found.shape not in (shape, shape[:3]) or found.dtype.kind not in "fiu":
+                    raise UserError(f"{name} must be {list(shape)} numbers; got {found.dtype} {list(found.shape)}.")
