@@ -126,7 +126,7 @@ def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> Pol
     if not named:
         words.insert(0, f"model={said or 'pi05'}")
     if not any(word.startswith("backbone=") for word in words):
-        words.append("backbone=pi05")
+        words.append(f"backbone={compose('policy', words).full_size}")
     from mme_vla.policy.build import build_from_config
 
     return build_from_config(compose("policy", words), device="meta")

@@ -18,8 +18,8 @@ from mme_vla.embodiment.robomme import embodiment_of
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-FREE = ("memory.budget", "processor.tokenizer")
-"""Keys in them that do not: a budget has a field of its own in records, the tokenizer goes with the backbone."""
+FREE = ("memory.budget", "processor.tokenizer", "processor.text")
+"""Keys in them that do not: a budget has a field of its own in records, what reads words goes with the backbone."""
 POLICY, USUAL_POLICY = "policy.name", "mme"
 LONGEST = 32
 """Letters that differences may take in a name; more are a digest."""

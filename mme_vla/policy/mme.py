@@ -1,6 +1,5 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Self
@@ -20,6 +19,7 @@ from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
+from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, POLICIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens
@@ -239,27 +239,21 @@ class MMEPolicy(Policy):
         with self.autocast():
             return self.memory.remember([e.required_history() for e in episodes], [e.stream for e in episodes])
 
-    @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        storage, encoded = self.require_memory().storage, []
-        for start in range(0, len(frames), batch_size):
-            images = self.require_processor().memory_images(frames[start : start + batch_size], device=self.device)
+        storage, width = self.require_memory().storage, self.backbone.vision_width
+
+        def pooled(some: np.ndarray | Tensor) -> Tensor:
+            images = self.require_processor().memory_images(some, device=self.device)
             with self.autocast():
-                tokens = self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
-            encoded.append(tokens.to(self.history_dtype))
-        if not encoded:
-            width = self.backbone.vision_width
-            return torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
-        return torch.cat(encoded)
+                return self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
+
+        empty = torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
+        return encode_frames(frames, pooled, empty, batch_size)
 
     def vision_fingerprint(self) -> str:
         """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        digest = hashlib.sha256(str(self.compute_dtype).encode())
-        for name, tensor in sorted(self.backbone.vision.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return tower_fingerprint(self.backbone.vision, self.compute_dtype)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""

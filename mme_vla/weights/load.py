@@ -16,6 +16,7 @@ from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
+from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
@@ -25,6 +26,7 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "lerobot": port_adapter,
     "openpi": port_adapter,
     "released": released_adapter,
+    "diffusion_policy": diffusion_adapter,
 }
 
 # What a memory adds to π0.5, as our names and the released leaves tell.

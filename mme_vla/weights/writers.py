@@ -14,6 +14,7 @@ from mme_vla.policy.mme import mme_of
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
+from mme_vla.weights.diffusion_policy import diffusion_adapter, write_diffusion_policy
 from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
@@ -35,6 +36,8 @@ def check_target(policy: Policy, fmt: str) -> None:
         raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
+    if fmt == "diffusion_policy":
+        diffusion_adapter(policy)
 
 
 def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -101,6 +104,7 @@ WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]
     "lerobot": write_lerobot,
     "openpi": write_openpi,
     "released": write_released,
+    "diffusion_policy": write_diffusion_policy,
 }
 
 
