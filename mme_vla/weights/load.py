@@ -20,6 +20,7 @@ from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
+from mme_vla.weights.sam2act import sam2act_adapter
 from mme_vla.weights.source import Source, open_source
 
 ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
@@ -27,6 +28,7 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "openpi": port_adapter,
     "released": released_adapter,
     "diffusion_policy": diffusion_adapter,
+    "sam2act_plus": sam2act_adapter,
 }
 
 # What a memory adds to π0.5, as our names and the released leaves tell.

@@ -14,6 +14,7 @@ from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files
 from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
 from mme_vla.weights.orbax import find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
+from mme_vla.weights.sam2act import is_sam2act, plain_sam2act_names
 from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
 
 FORMATS = {
@@ -22,6 +23,7 @@ FORMATS = {
     "openpi": "openpi's PyTorch π0.5 (safetensors)",
     "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
     "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
+    "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
 }
 
 @dataclass(frozen=True)
@@ -35,7 +37,10 @@ class OwnNames:
     plain: Callable[[Mapping[str, Tensor], str], dict[str, Tensor]]
 
 
-OWN_NAMES = {"diffusion_policy": OwnNames(is_diffusion_policy, plain_names)}
+OWN_NAMES = {
+    "diffusion_policy": OwnNames(is_diffusion_policy, plain_names),
+    "sam2act_plus": OwnNames(is_sam2act, plain_sam2act_names),
+}
 """Formats in files of `torch.save`; each is called as the model it holds."""
 
 VARIANTS = {

@@ -9,7 +9,7 @@ from torch import Tensor
 from mme_vla.errors import UserError, brief, listed
 
 SUFFIXES = (".pth", ".pt")
-MODEL = ("model", "state_dict", "model_state_dict")
+MODEL = ("model", "state_dict", "model_state_dict", "model_state")
 """Where files keep their tensors, if they hold more than these."""
 
 

@@ -19,6 +19,7 @@ from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
+from mme_vla.weights.sam2act import sam2act_adapter, write_sam2act
 from mme_vla.weights.source import VARIANTS
 
 VIEWS = {"front": "base_0_rgb", "wrist": "left_wrist_0_rgb"}  # π0.5's names of RoboMME's cameras
@@ -38,6 +39,8 @@ def check_target(policy: Policy, fmt: str) -> None:
         released_table(mme_of(policy, "The released layout"))
     if fmt == "diffusion_policy":
         diffusion_adapter(policy)
+    if fmt == "sam2act_plus":
+        sam2act_adapter(policy)
 
 
 def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -105,6 +108,7 @@ WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]
     "openpi": write_openpi,
     "released": write_released,
     "diffusion_policy": write_diffusion_policy,
+    "sam2act_plus": write_sam2act,
 }
 
 

@@ -47,11 +47,11 @@ class Heads(nn.Module):
         self.norm = nn.BatchNorm1d(width)
         self.x, self.y, self.z = (_mlp(width, sizes.head, sizes.rotation_bins) for _ in range(3))
         self.rates: Tensor
-        self.register_buffer("rates", _rates(width), persistent=False)
+        self.register_buffer("rates", code_rates(width), persistent=False)
 
     def compute_rates(self, device: torch.device) -> None:
         """Give the codes' rates their values, where the module was built on meta."""
-        self.rates = _rates(2 * len(self.rates)).to(device)
+        self.rates = code_rates(2 * len(self.rates)).to(device)
 
     def features(self, tokens: Tensor, waypoints: Tensor) -> Tensor:
         """What the heads read [b, f] of tokens [b·3, token, g, g] at waypoints [b, 3] of the closer look's cube."""
@@ -100,5 +100,6 @@ def _mlp(width: int, inner: int, out: int) -> nn.Sequential:
     )
 
 
-def _rates(width: int) -> Tensor:
+def code_rates(width: int) -> Tensor:
+    """Rates [width/2] of the sines and cosines that tell a bin."""
     return torch.exp(torch.arange(0, width, 2) * (-math.log(10_000) / width))

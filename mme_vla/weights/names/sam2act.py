@@ -4,7 +4,7 @@ import itertools
 import re
 from collections.abc import Callable, Iterable, Mapping
 
-from mme_vla.backbone.sam2act.branch import Heads
+from mme_vla.backbone.sam2act.branch import code_rates
 from mme_vla.weights.name_tables import Derived, NameTable, Piece, Unread
 
 _Rule = tuple[str, str | Callable[[re.Match[str]], str]]
@@ -100,9 +100,9 @@ def released_copies(names: Iterable[str]) -> dict[str, str]:
     return {f"{branch}.{name}": name for name in names if name.startswith(PICTURES) for branch in BRANCHES}
 
 
-def released_constants(heads: Heads) -> list[Derived]:
-    """The rates of the rotation bins' codes, which checkpoints hold."""
-    return [Derived(RATES, lambda: heads.rates[None])]
+def released_constants(width: int) -> list[Derived]:
+    """The rates of the rotation bins' codes, which checkpoints hold, for features of a width."""
+    return [Derived(RATES, lambda: code_rates(width)[None])]
 
 
 def released_unread(width: int = 256) -> list[Unread]:
