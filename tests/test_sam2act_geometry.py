@@ -89,16 +89,16 @@ def test_the_loss_of_heatmaps(golden: dict[str, np.ndarray]) -> None:
 
 def test_rotations_are_the_bins_of_the_original(golden: dict[str, np.ndarray]) -> None:
     count = 72
-    bins = rotations.to_bins(golden["rotation/quaternions_xyzw"], count)
-    assert np.array_equal(bins, golden["rotation/bins"])
+    bins = rotations.to_bins(tensor(golden["rotation/quaternions_xyzw"]), count)
+    assert np.array_equal(bins.numpy(), golden["rotation/bins"])
     assert relative_error(rotations.from_bins(bins, count), golden["rotation/back_xyzw"]) < TOLERANCE
 
 
 def test_rotations_go_to_bins_and_back_within_half_a_bin() -> None:
-    quaternions = np.random.default_rng(0).standard_normal((200, 4))
-    quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
+    drawn = torch.randn(200, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    quaternions = torch.nn.functional.normalize(drawn, dim=1)
     back = rotations.from_bins(rotations.to_bins(quaternions, 360), 360)
-    turn = 2 * np.degrees(np.arccos(np.abs((quaternions * back).sum(1)).clip(0, 1)))
+    turn = 2 * torch.rad2deg(torch.acos((quaternions * back).sum(1).abs().clamp(max=1)))
     assert turn.max() < 2  # three angles, each off by half a degree at most
 
 

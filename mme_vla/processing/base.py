@@ -167,6 +167,10 @@ class PolicyProcessor:
         """One training step without a batch axis, for `collate`."""
         raise NotImplementedError
 
+    def keyframe_item(self, sample: Any) -> dict[str, Any]:
+        """The same of a run of keyframes with depth (`mme_vla.data.keyframe_dataset`), where samples are such."""
+        raise NotImplementedError
+
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
         """Items as the batch that the policy reads: an object with `to`.
 

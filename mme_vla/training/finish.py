@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from mme_vla.data.dataset import TrainingDataset
 from mme_vla.files import write_atomically
 from mme_vla.training.console import ProgressLine
 from mme_vla.training.data import SplitData
@@ -21,8 +22,11 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
     """
     folder, settings, policy = trainer.run_info.folder, trainer.settings, trainer.policy
     summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
-    if settings.open_loop_chunks:
-        samples = data.train if data.val is None else data.val
+    samples = data.train if data.val is None else data.val
+    if settings.open_loop_chunks and not isinstance(samples, TrainingDataset):
+        line.say("no open-loop check: it compares chunks step by step, and these samples are keyframes")
+    elif settings.open_loop_chunks:
+        assert isinstance(samples, TrainingDataset)
         with trainer.ema.applied():
             policy.eval()
             result = open_loop(policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None)

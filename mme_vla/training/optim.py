@@ -21,8 +21,8 @@ def learning_rate(step: int, peak: float, warmup: int) -> float:
 def scheduled_rate(step: int, settings: TrainSettings) -> float:
     """Rate of update `step`, from 0, of a recipe.
 
-    Linear to `lr` at step `warmup`, from lr/(warmup + 1) or from 0; then constant, or half a cosine that is 0 at
-    `schedule_steps`, or `gamma` times less from each of the `milestones` on.
+    Linear to `lr` at step `warmup`, from lr/(warmup + 1) or from 0; then constant, or half a cosine that is `lr` times
+    `schedule_end` at `schedule_steps`, or `gamma` times less from each of the `milestones` on.
     """
     peak, warmup = settings.lr, settings.warmup
     if step < warmup:
@@ -30,22 +30,31 @@ def scheduled_rate(step: int, settings: TrainSettings) -> float:
     if settings.schedule == "cosine":
         total = settings.schedule_steps or settings.steps
         done = min((step - warmup) / max(total - warmup, 1), 1.0)
-        return peak * 0.5 * (1 + math.cos(math.pi * done))
+        least = settings.schedule_end
+        return peak * (least + (1 - least) * 0.5 * (1 + math.cos(math.pi * done)))
     if settings.schedule == "steps":
         return peak * settings.gamma ** sum(step >= milestone for milestone in settings.milestones)
     return peak
 
 
-def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) -> torch.optim.AdamW:
-    """AdamW over all trainable parameters; fused, which every device that trains supports.
+def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) -> torch.optim.Optimizer:
+    """AdamW over all trainable parameters, fused, which every device that trains supports; or timm's LAMB.
 
-    Those of fewer than `decay_min_dim` dimensions (biases, norms) are a group of their own, without weight decay.
+    LAMB scales each tensor's update down to that tensor's norm, never up. Parameters of fewer than `decay_min_dim`
+    dimensions (biases, norms) are a group of their own, without weight decay.
     """
     found, least = list(parameters), settings.decay_min_dim
     decayed: dict[str, Any] = {"params": [p for p in found if p.ndim >= least]}
     others: dict[str, Any] = {"params": [p for p in found if p.ndim < least], "weight_decay": 0.0}
+    groups = [group for group in (decayed, others) if group["params"]]
+    if settings.optimizer == "lamb":
+        from mme_vla.training.lamb import ClippedLamb
+
+        return ClippedLamb(
+            groups, lr=settings.lr, betas=settings.betas, eps=settings.eps, weight_decay=settings.weight_decay
+        )
     return torch.optim.AdamW(
-        [group for group in (decayed, others) if group["params"]],
+        groups,
         lr=settings.lr,
         betas=settings.betas,
         eps=settings.eps,

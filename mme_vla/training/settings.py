@@ -7,6 +7,7 @@ from typing import Any, Self
 from mme_vla.errors import UserError, did_you_mean
 
 SCHEDULES = ("constant", "cosine", "steps")
+OPTIMIZERS = ("adamw", "lamb")
 
 
 @dataclass(frozen=True)
@@ -34,9 +35,11 @@ class TrainSettings:
     weight_decay: float = 1e-10
     clip_norm: float = 1.0
     ema: float = 0.999
+    optimizer: str = "adamw"
     warmup_from_zero: bool = False
     schedule: str = "constant"
     schedule_steps: int | None = None
+    schedule_end: float = 0.0
     milestones: tuple[int, ...] = ()
     gamma: float = 0.1
     decay_min_dim: int = 0
@@ -74,6 +77,8 @@ class TrainSettings:
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "accumulate", "log_every", "val_every", "save_every"):
             _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
+        _check("optimizer", self.optimizer, self.optimizer in OPTIMIZERS, " or ".join(OPTIMIZERS))
+        _check("schedule_end", self.schedule_end, 0 <= self.schedule_end <= 1, "from 0 to 1")
         _check("schedule", self.schedule, self.schedule in SCHEDULES, " or ".join(SCHEDULES))
         if self.schedule_steps is not None:
             fits = self.schedule_steps >= max(self.warmup, 1)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,30 +30,16 @@ class Seen:
         return Seen(*(x.to(device) for x in (self.points, self.colours, self.state, self.language)))
 
 
-@dataclass(frozen=True)
-class Waypoint:
-    """Where the tool is to go.
-
-    point: [3], metres. angles: [3] extrinsic x-y-z in degrees. open, collide: of the gripper after it; whether the
-    way there may touch things, which the benchmark's planner does not ask.
-    """
-
-    point: np.ndarray
-    angles: np.ndarray
-    open: bool
-    collide: bool
-
-    def action(self) -> np.ndarray:
-        """The benchmark's waypoint [7] float32: position, roll-pitch-yaw in radians, gripper −1 or 1."""
-        grip = 1.0 if self.open else -1.0
-        return np.concatenate([self.point, np.radians(self.angles), [grip]]).astype(np.float32)
-
-
 @torch.no_grad()
 def decide(
     network: SAM2ActNetwork, seen: Seen, remembered: BankState, cube: Cube, finder: PointFinder
-) -> tuple[Waypoint, BankState]:
-    """The next waypoint of one episode, and what it remembers after this keyframe."""
+) -> tuple[Tensor, BankState]:
+    """The next waypoint of one episode, and what it remembers after this keyframe.
+
+    Returns:
+        The benchmark's waypoint [7]: position in metres, extrinsic roll-pitch-yaw in radians, gripper −1 (closed) or 1.
+        Whether the way there may touch things, which the network tells too, the benchmark's planner does not ask.
+    """
     points, colours, state, language = (x[None] for x in (seen.points, seen.colours, seen.state, seen.language))
     side, zoom = network.sizes.side, ZOOM
     look = network.look(cloud_pictures(points, colours, cube, side), state, language)
@@ -64,14 +49,10 @@ def decide(
     logits, tokens = network.fine_step(closer)
     point = finder.find(logits)
     found = network.heads(tokens, point)
-    bins = torch.stack([found[axis].argmax(-1) for axis in "xyz"], -1)[0].cpu().numpy()
-    waypoint = Waypoint(
-        point=cube.back(zoom_back(point, first, zoom))[0].cpu().numpy(),
-        angles=angles_of_bins(bins, network.sizes.rotation_bins),
-        open=bool(found["gripper"][0].argmax()),
-        collide=bool(found["collision"][0].argmax()),
-    )
-    return waypoint, remembered
+    bins = torch.stack([found[axis].argmax(-1) for axis in "xyz"], -1)
+    angles = torch.deg2rad(angles_of_bins(bins, network.sizes.rotation_bins)).float()
+    grip = 2.0 * found["gripper"].argmax(-1, keepdim=True) - 1
+    return torch.cat([cube.back(zoom_back(point, first, zoom)), angles, grip], -1)[0].float(), remembered
 
 
 @torch.no_grad()

@@ -77,7 +77,8 @@ class KeyframeEpisode(Episode):
         """
         if self._now is None:
             raise UserError("The episode has seen no execution frame yet: call observe() with the current one first.")
-        return self._seen_as(*self._now, self.waypoints)
+        shots, finger = self._now
+        return self._seen_as(shots, finger, self.waypoints)
 
     def decided(self, remembered: BankState) -> None:
         """Note what is remembered once the frame that was decided at lies behind: when the next ones are observed."""
@@ -87,8 +88,8 @@ class KeyframeEpisode(Episode):
         most = self._policy.require_processor().video_frames
         count = min(len(self._video), most)
         for place, index in enumerate(np.linspace(0, len(self._video) - 1, count).round().astype(int)):
-            seen = self._seen_as(*self._video[index], place)
-            self.remembered = self._policy.watch(seen, self.remembered)
+            shots, finger = self._video[index]
+            self.remembered = self._policy.watch(self._seen_as(shots, finger, place), self.remembered)
         self._video = []
 
     def _seen_as(self, shots: list[Shot], finger: float, place: int) -> Seen:

@@ -4,14 +4,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Draws
 from mme_vla.backbone.sam2act.geometry import ZOOM, Cube, shift_and_turn
 from mme_vla.backbone.sam2act.heatmaps import heatmap_loss
-from mme_vla.backbone.sam2act.rotations import quaternions_of, to_bins
+from mme_vla.backbone.sam2act.rotations import to_bins
 from mme_vla.policy.sam2act.batches import KeyframeBatch
 from mme_vla.policy.sam2act.network import SAM2ActNetwork
 from mme_vla.policy.sam2act.scene import closer_pictures, cloud_pictures
@@ -70,7 +69,7 @@ def augmented(
         state=batch.state.flatten(0, 1),
         language=language.repeat_interleave(keyframes, 0),
         target=cube.place(target),
-        bins=torch.from_numpy(to_bins(rotation.double().cpu().numpy(), bins)).to(points.device),
+        bins=to_bins(rotation, bins),
         gripper=batch.gripper.flatten(),
         collision=batch.collision.flatten(),
     )
@@ -114,8 +113,3 @@ def _turned(rotation: Tensor, angle: Tensor) -> Tensor:
     x, y, z, w = rotation.unbind(-1)
     sin, cos = (angle / 2).sin(), (angle / 2).cos()
     return torch.stack([cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z], -1)
-
-
-def quaternion_of_action(action: np.ndarray) -> np.ndarray:
-    """The rotation [..., 4] (x, y, z, w) of recorded waypoints [..., 7]."""
-    return quaternions_of(np.degrees(np.asarray(action, np.float64)[..., 3:6]))

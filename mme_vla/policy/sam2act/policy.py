@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws, map_draws
+from mme_vla.backbone.sam2act.geometry import Cube
 from mme_vla.backbone.sam2act.heatmaps import PointFinder
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.embodiment.robomme import embodiment_of
@@ -110,6 +111,11 @@ class SAM2ActPolicy(Policy):
         assert heads is not None
         heads.compute_rates(self.device)
 
+    @property
+    def cube(self) -> Cube:
+        """The part of the world that is looked at: its processor's, else its configuration's."""
+        return Cube.of(self.config["processor"]["bounds"]) if self.processor is None else self.processor.cube
+
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
         kind = self.device.type if self.device.type != "meta" else "cpu"
@@ -127,7 +133,7 @@ class SAM2ActPolicy(Policy):
         """The stage's loss, and its parts to log (detached)."""
         given = self.loss_draws(len(batch.points), torch.default_generator) if draws is None else draws
         drawn = map_draws(given, lambda value: value.to(self.device))
-        cube, sizes = self.require_processor().cube, self.backbone.sizes
+        cube, sizes = self.cube, self.backbone.sizes
         moved = drawn if self.training and self.augment else None
         scenes = augmented(batch, batch.language, moved, cube, sizes.rotation_bins)
         with self.autocast():
@@ -166,13 +172,12 @@ class SAM2ActPolicy(Policy):
     def watch(self, seen: Seen, remembered: BankState) -> BankState:
         """What an episode remembers after a frame at which nothing is decided."""
         with self.autocast():
-            return watch(self.backbone, seen.to(self.device), remembered, self.require_processor().cube)
+            return watch(self.backbone, seen.to(self.device), remembered, self.cube)
 
     def _decide(self, seen: Seen, remembered: BankState) -> tuple[Tensor, BankState]:
-        cube = self.require_processor().cube
+        cube = self.cube
         with self.autocast():
-            waypoint, after = decide(self.backbone, seen.to(self.device), remembered, cube, self._finder)
-        return torch.from_numpy(waypoint.action()), after
+            return decide(self.backbone, seen.to(self.device), remembered, cube, self._finder)
 
     @cached_property
     def _finder(self) -> PointFinder:
@@ -227,7 +232,7 @@ class SAM2ActPolicy(Policy):
         """A batch of one without content, as the stage trains on it."""
         sizes, k = self.backbone.sizes, self.keyframes
         points = len(self.embodiment.cameras) * 128**2
-        whole = {"dtype": torch.int64, "device": device}
+        whole = torch.zeros(1, k, dtype=torch.int64, device=device)
         return KeyframeBatch(
             points=torch.zeros(1, k, points, 3, device=device),
             colours=torch.zeros(1, k, points, 3, dtype=torch.uint8, device=device),
@@ -235,8 +240,8 @@ class SAM2ActPolicy(Policy):
             language=torch.zeros(1, sizes.words, sizes.language, device=device),
             target=torch.zeros(1, k, 3, device=device),
             rotation=torch.tensor([0.0, 0, 0, 1], device=device).expand(1, k, 4),
-            gripper=torch.zeros(1, k, **whole),  # type: ignore[arg-type]
-            collision=torch.zeros(1, k, **whole),  # type: ignore[arg-type]
+            gripper=whole,
+            collision=whole.clone(),
         )
 
     def see_empty_frame(self) -> None:

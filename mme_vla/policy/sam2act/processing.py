@@ -198,14 +198,14 @@ class SAM2ActProcessor(PolicyProcessor):
         clouds = [cloud_of(shots, self.side) for shots in sample.shots]
         targets = np.asarray(sample.targets, np.float32)
         states = [self.commanded_state(bool(o), int(p)) for o, p in zip(sample.open, sample.places, strict=True)]
-        rotation = quaternions_of(np.degrees(targets[:, 3:6].astype(np.float64)))
+        rotation = quaternions_of(torch.rad2deg(torch.from_numpy(targets[:, 3:6]).double()))
         return {
             "points": torch.from_numpy(np.stack([points for points, _ in clouds])),
             "colours": torch.from_numpy(np.stack([colours for _, colours in clouds])),
             "state": torch.stack(states),
             "language": self.prompt(sample.goal),
             "target": torch.from_numpy(targets[:, :3]),
-            "rotation": torch.from_numpy(rotation.astype(np.float32)),
+            "rotation": rotation.float(),
             "gripper": torch.from_numpy((targets[:, 6] > 0).astype(np.int64)),
             # The recorder's plans may touch things: no way of theirs is told to keep away.
             "collision": torch.ones(len(targets), dtype=torch.int64),

@@ -12,6 +12,8 @@ from mme_vla.backbone.sam2act.render import EMPTY, virtual_pictures
 from mme_vla.backbone.sam2act.views import VIEWS, constant_channels
 
 MILLIMETRES = 1000.0
+CHANNELS = 10
+"""Of a virtual picture."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ def closer_pictures(points: Tensor, colours: Tensor, cube: Cube, centre: Tensor,
 
 
 def _pictures(points: Tensor, colours: Tensor, shown: Tensor, side: int) -> Tensor:
+    if points.is_meta:  # shapes alone: there is nothing to draw
+        return points.new_empty(len(points), VIEWS, CHANNELS, side, side)
     seen = [
         virtual_pictures(cloud[kept], paint[kept], side) if kept.any() else _nothing(side, cloud.device)
         for cloud, paint, kept in zip(points, colours, shown, strict=True)
