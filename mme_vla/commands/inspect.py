@@ -168,7 +168,7 @@ def draw_memory(
     console: "Console",
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
-    from mme_vla.data.memory_picture import contact_sheet
+    from mme_vla.data.memory_picture import memory_sheet
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
@@ -186,7 +186,7 @@ def draw_memory(
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
     title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
     start = int(source.exec_starts[episode])
-    contact_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
+    memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path
 
 

@@ -11,7 +11,7 @@ from mme_vla.play import questions as prompts
 from mme_vla.play.game import ChoiceSession
 from mme_vla.play.players import PLAYERS, NoChoiceError, Player
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.finetuning.media import Clip, sample_video
+from mme_vla.subgoal.clips import Clip, sample_video
 from mme_vla.subgoal.models.api import Api, ApiFailure, Settings
 from mme_vla.subgoal.models.qwen3vl import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.words.parsing import MalformedAnswer

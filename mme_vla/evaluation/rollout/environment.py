@@ -155,8 +155,8 @@ class ChunkEnv:
 
     def _draw(self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None) -> None:
         if self._video is not None:
-            for index, (front, wrist) in enumerate(frames.newest(count)):
-                self._video.add(front, wrist, caption, demo=index < demo)
+            for index, views in enumerate(frames.newest(count)):
+                self._video.add(views, caption, demo=index < demo)
 
     def _finish_video(self, report: dict[str, Any]) -> dict[str, Any]:
         if self._video is None:
@@ -189,9 +189,9 @@ class _Frames:
             pictures += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         return len(joints)
 
-    def newest(self, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        front, wrist = (self._pictures[name][len(self._states) - count :] for name in CAMERAS)
-        return zip(front, wrist, strict=True)
+    def newest(self, count: int) -> Iterator[tuple[np.ndarray, ...]]:
+        """The last frames, each as its pictures: the robot's cameras in its order, then the benchmark's others."""
+        return zip(*(pictures[len(self._states) - count :] for pictures in self._pictures.values()), strict=True)
 
     def observation(self) -> Observation:
         state = np.stack(self._states) if self._states else np.zeros((0, ROBOMME_JOINT.state.width), np.float32)
