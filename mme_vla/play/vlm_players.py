@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.play import questions as prompts
 from mme_vla.play.game import ChoiceSession
@@ -141,7 +142,7 @@ class GeminiPlayer(ModelPlayer):
     """
 
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
-        asked = Settings(**settings)
+        asked = read_section(Settings, settings, "player")
         super().__init__(asked.model, tries)
         self.api = Api(asked, self.usage, client)
         self._turns: list[tuple[str, list[Any]]] = []

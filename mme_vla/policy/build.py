@@ -11,7 +11,7 @@ from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.words import words
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy, shape_of
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.prompt import PROMPTS
 
@@ -107,15 +107,21 @@ def build_processor(sections: Mapping[str, Any]) -> Processor:
     """Build the processor of a composed configuration, at its backbone's sizes.
 
     Raises:
-        UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
+        UserError: no processor, a tokenizer that cannot be had, or one that has more entries than the backbone.
     """
-    backbone = sections["backbone"]
-    sizes = {"image_size": backbone["vision"]["image_size"], "action_dim": backbone["action_dim"]}
+    name, backbone = sections["backbone"].get("name"), shape_of(sections["backbone"])
+    if not sections.get("processor"):
+        raise UserError(
+            f"No processor goes with the backbone {name!r}: under `defaults` of its file write "
+            "`/processor@_global_.processor: tiny`, or the name of a configs/processor file of your own."
+        )
+    sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
     robot = embodiment_of(sections).to_dict()
     processor = Processor.from_config({**sections["processor"], **sizes, "embodiment": robot})
-    if processor.tokenizer.vocab_size > backbone["vocab_size"]:
+    room = backbone.vocab_size
+    if room is not None and processor.tokenizer.vocab_size > room:
         raise UserError(
             f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-            f"backbone.vocab_size={backbone['vocab_size']}: choose the processor that goes with the backbone."
+            f"backbone.vocab_size={room}: choose the processor that goes with the backbone."
         )
     return processor

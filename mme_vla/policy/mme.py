@@ -14,6 +14,7 @@ import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.integration.base import Integration
@@ -26,6 +27,38 @@ from mme_vla.types import Batch, HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
     from mme_vla.processing.processor import Processor
+
+
+def build_memory(section: Mapping[str, Any], backbone: Backbone, width: int) -> Memory:
+    """The memory of a configuration for this backbone's vision tokens; its own tokens are `width` wide.
+
+    Raises:
+        UserError: an unknown memory or option, or a grid to which the backbone's cannot be pooled.
+    """
+    memory: Memory = MEMORIES.build(section, d_vision=backbone.vision_width, width=width)
+    memory.check_grid(backbone.grid)
+    return memory
+
+
+def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
+    """The class that the section `backbone` names, and its sizes.
+
+    Raises:
+        UserError: an unknown backbone or size.
+    """
+    kind: type[Backbone] = BACKBONES[str(section.get("name"))]
+    return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
+
+
+def shape_of(section: Mapping[str, Any]) -> Backbone:
+    """The backbone of a section without weights (on the device `meta`), to be asked for its sizes.
+
+    Raises:
+        UserError: an unknown backbone or size.
+    """
+    kind, sizes = read_backbone(section)
+    with torch.device("meta"):
+        return kind(sizes)
 
 
 class MMEPolicy(Policy):
@@ -76,9 +109,7 @@ class MMEPolicy(Policy):
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
         """
-        section = dict(config["backbone"])
-        backbone_cls: type[Backbone] = BACKBONES[section.pop("name")]
-        sizes = backbone_cls.Config.from_dict(section)
+        backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # a robot that does not fit is told before anything is built
         chosen = config.get("integration")
         integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
@@ -96,8 +127,7 @@ class MMEPolicy(Policy):
             backbone.draw_experts(list(experts))
         memory: Memory | None = None
         if config.get("memory"):
-            widths = {"d_vision": backbone.vision_width, "width": integration.memory_width}
-            memory = MEMORIES.build(config["memory"], **widths)
+            memory = build_memory(config["memory"], backbone, integration.memory_width)
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
