@@ -147,15 +147,13 @@ def build_memory(cfg: DictConfig) -> "Memory":
     """The memory the configuration names, of any width: it is only asked to select.
 
     Raises:
-        UserError: an unknown memory or option.
+        UserError: an unknown backbone, memory or option.
     """
-    from omegaconf import OmegaConf
+    from mme_vla.policy import mme
 
-    import mme_vla.memory  # noqa: F401  (registers what ships)
-    from mme_vla.registry import MEMORIES
-
-    options: Any = OmegaConf.to_container(cfg.memory, resolve=True)
-    return MEMORIES.build(options, d_vision=cfg.backbone.vlm.width, width=cfg.backbone.action.width)
+    chosen: Any = OmegaConf.to_container(cfg, resolve=True)
+    backbone = mme.shape_of(chosen["backbone"])
+    return mme.build_memory(chosen["memory"], backbone, backbone.token_width)
 
 
 def draw_memory(
