@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.embodiment.robomme import CAMERAS, benchmark_state
+from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_state
 from mme_vla.envs.make import make_env
 from mme_vla.envs.task_names import STICK_TASKS
 from mme_vla.errors import UserError
@@ -24,7 +24,7 @@ REPORTED = (
     "status", "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "error_message", "exception_type",
 )  # fmt: skip
 """What is passed on of the environment's info."""
-_BLIND = np.zeros((256, 256, 3), np.uint8)
+_BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
 """Every camera by its name: lists of uint8 [H, W, 3]; `state`: float32 [t, s]."""
