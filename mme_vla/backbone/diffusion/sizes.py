@@ -82,4 +82,3 @@ class DiffusionSizes:
         """Height and width that the network sees."""
         height, width = self.picture
         return int(self.crop * height), int(self.crop * width)
-
