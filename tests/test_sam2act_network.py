@@ -24,9 +24,7 @@ from mme_vla.weights.name_tables import read
 from mme_vla.weights.names.sam2act import RATES, released_names
 
 MODULE, NETWORK, GRADIENT = 1e-4, 5e-4, 2e-3
-TINY_ENCODER = EncoderSizes(
-    width=8, heads=1, blocks_1=1, blocks_2=1, blocks_3=2, blocks_4=1, window_3=4, window_4=2, global_blocks=1, lora=2
-)
+TINY_ENCODER = EncoderSizes(width=8, heads=1, blocks=(1, 1, 2, 1), windows=(8, 4, 4, 2), global_blocks=(3,), lora=2)
 
 
 def fill(module: nn.Module, theirs: dict[str, Tensor], place: str, stages: int) -> None:

@@ -5,6 +5,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.config.composition import cli
+from mme_vla.config.sections import read_section
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 
@@ -17,7 +18,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.episodes is not None:
         episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
     output = Path(cfg.output)
-    options = ConvertOptions(images=cfg.images, fps=cfg.fps, keyframes=cfg.keyframes, **cfg.video)
-    written = convert(episodes, output, options)
+    chosen = {"images": cfg.images, "fps": cfg.fps, "keyframes": cfg.keyframes}
+    written = convert(episodes, output, read_section(ConvertOptions, cfg.video, "video", **chosen))
     already = len(episodes) - written
     print(f"{output}: {len(episodes)} episodes ({written} written now, {already} already there).")

@@ -25,8 +25,9 @@ class Policy(Saved):
 
     A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
     `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
-    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so that training resumes and
-    episodes repeat bit for bit whatever they are batched with; only the policy knows what they mean.
+    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so
+    that training resumes and episodes repeat bit for bit whatever they are batched with; only the policy knows what
+    they mean.
     """
 
     memory: Memory | None
@@ -76,9 +77,7 @@ class Policy(Saved):
         """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
         return {}
 
-    def sample_actions(
-        self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
-    ) -> Tensor:
+    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
         """A normalised chunk [b, h, a].
 
         Args:

@@ -26,6 +26,7 @@ FORMATS = {
     "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
 }
 
+
 @dataclass(frozen=True)
 class OwnNames:
     """A format of one method, told by its tensors' names.

@@ -1,35 +1,9 @@
 """Sizes as rows of a table: `pi05` is the real model, `tiny` a first-class citizen that trains on a laptop's CPU."""
 
-from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
-from typing import Any, Self
+from dataclasses import dataclass, field
+from typing import Any
 
-from mme_vla.errors import UserError, brief, did_you_mean
-
-
-class _Config:
-    """Builds itself from a plain mapping and refuses keys it does not know."""
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        known = {f.name: f for f in fields(cls)}  # type: ignore[arg-type]
-        unknown = [key for key in values if key not in known]
-        if unknown:
-            raise UserError(f"{cls.__name__} has no key {brief(unknown[0])}. {did_you_mean(brief(unknown[0]), known)}")
-        built: dict[str, Any] = {}
-        for key, value in values.items():
-            kind = known[key].type
-            nested = isinstance(kind, type) and is_dataclass(kind)
-            if isinstance(value, bool) or not isinstance(value, (Mapping, kind) if nested else kind):  # type: ignore[arg-type]
-                wanted = "a section" if nested else "a whole number" if kind is int else "text"
-                raise UserError(f"{cls.__name__}.{key} must be {wanted}, not {brief(value)}.")
-            built[key] = kind.from_dict(value) if nested and isinstance(value, Mapping) else value  # type: ignore[union-attr]
-        needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
-        for name in needed:
-            if name not in built:
-                raise UserError(f"{cls.__name__} needs the key {name!r}.")
-        return cls(**built)
-
+from mme_vla.errors import UserError, brief
 
 LARGEST, DEEPEST = 2**24, 2**10
 """Bounds of every size and of layers: far above any network here, and a damaged file's number ends in words."""
@@ -44,7 +18,7 @@ def _check_positive(config: Any, prefix: str) -> None:
 
 
 @dataclass(frozen=True)
-class VisionConfig(_Config):
+class VisionConfig:
     """SigLIP; its output width is the VLM's. `image_size` must be a multiple of `patch_size`."""
 
     image_size: int = 224
@@ -61,7 +35,7 @@ class VisionConfig(_Config):
 
 
 @dataclass(frozen=True)
-class ExpertConfig(_Config):
+class ExpertConfig:
     """One Gemma expert's own sizes; depth, heads and head width are shared by all (paper, section 4.1)."""
 
     width: int
@@ -72,7 +46,7 @@ class ExpertConfig(_Config):
 
 
 @dataclass(frozen=True)
-class BackboneConfig(_Config):
+class BackboneConfig:
     """π0.5: a vision tower, a VLM expert and an action expert under joint attention."""
 
     vision: VisionConfig = field(default_factory=VisionConfig)

@@ -76,11 +76,11 @@ def _vision_model(sizes: EncoderSizes, side: int) -> Any:
         "num_attention_heads": sizes.heads,
         "image_size": [side, side],
         "window_positional_embedding_background_size": [sizes.background, sizes.background],
-        "blocks_per_stage": sizes.blocks,
+        "blocks_per_stage": list(sizes.blocks),
         "embed_dim_per_stage": sizes.widths,
         "num_attention_heads_per_stage": [sizes.heads * 2**stage for stage in range(LEVELS)],
-        "window_size_per_stage": sizes.windows,
-        "global_attention_blocks": sizes.global_places,
+        "window_size_per_stage": list(sizes.windows),
+        "global_attention_blocks": list(sizes.global_blocks),
     }
     fine = side // 4
     whole: dict[str, Any] = {

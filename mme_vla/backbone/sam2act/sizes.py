@@ -1,68 +1,52 @@
 """Sizes of SAM2Act+: the defaults are the released model's."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any, Self
 
 from mme_vla.backbone.sam2act.views import VIEWS
-from mme_vla.backbone.sizes import Sizes, check_positive
-from mme_vla.errors import UserError
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, brief
 
 LEVELS = 4
 """Stages of the encoder, each half as fine as the one before."""
+LARGEST = 2**16
 
 
 @dataclass(frozen=True)
-class EncoderSizes(Sizes):
+class EncoderSizes:
     """SAM2's picture encoder (Hiera and its neck); Hiera-B+ by default.
 
-    width, heads: of the first stage; both double from stage to stage. blocks_1 … blocks_4, window_1 … window_4: blocks
-    and attention windows of the stages. The last `global_blocks` blocks of the third stage that look at the whole
-    picture stand `global_step` apart, the last of them before the fourth stage's first.
+    width, heads: of the first stage; both double from stage to stage. blocks, windows: number of blocks and side of the
+    attention windows, of each stage. global_blocks: blocks, counted through all stages, that look at the whole picture.
     background: side of the table of positions. neck: width of the maps it answers with. lora: rank of the adapters.
     """
 
     width: int = 112
     heads: int = 2
-    blocks_1: int = 2
-    blocks_2: int = 3
-    blocks_3: int = 16
-    blocks_4: int = 3
-    window_1: int = 8
-    window_2: int = 4
-    window_3: int = 14
-    window_4: int = 7
-    global_blocks: int = 3
-    global_step: int = 4
+    blocks: tuple[int, ...] = (2, 3, 16, 3)
+    windows: tuple[int, ...] = (8, 4, 14, 7)
+    global_blocks: tuple[int, ...] = (12, 16, 20)
     background: int = 14
     neck: int = 256
     lora: int = 16
 
     def __post_init__(self) -> None:
-        check_positive(self, "backbone.encoder.")
-
-    @property
-    def blocks(self) -> list[int]:
-        """Blocks of each stage."""
-        return [self.blocks_1, self.blocks_2, self.blocks_3, self.blocks_4]
-
-    @property
-    def windows(self) -> list[int]:
-        """Side of each stage's attention windows."""
-        return [self.window_1, self.window_2, self.window_3, self.window_4]
+        _check_sizes(self, "backbone.encoder")
+        for name in ("blocks", "windows"):
+            if len(getattr(self, name)) != LEVELS:
+                raise UserError(f"backbone.encoder.{name} must have {LEVELS} numbers, one a stage.")
+        if any(place >= sum(self.blocks) for place in self.global_blocks):
+            raise UserError(f"backbone.encoder.global_blocks={list(self.global_blocks)}: there are {sum(self.blocks)}.")
 
     @property
     def widths(self) -> list[int]:
         """Width of each stage."""
         return [self.width * 2**stage for stage in range(LEVELS)]
 
-    @property
-    def global_places(self) -> list[int]:
-        """Numbers of the blocks that look at the whole picture."""
-        last = sum(self.blocks[:3]) - 1
-        return [last - self.global_step * i for i in reversed(range(self.global_blocks))]
-
 
 @dataclass(frozen=True)
-class SAM2ActSizes(Sizes):
+class SAM2ActSizes:
     """The network: both looks have the same sizes.
 
     grid, patch: patches of a virtual picture, and their side in pixels; a picture has grid · patch of them.
@@ -93,8 +77,17 @@ class SAM2ActSizes(Sizes):
     mask_stages: int = 4
     remembered: int = 9
 
+    @classmethod
+    def from_dict(cls, section: Mapping[str, Any]) -> Self:
+        """Read the section `backbone` of a configuration, but for its `name`.
+
+        Raises:
+            UserError: an unknown key, or a value of another kind.
+        """
+        return read_section(cls, {key: value for key, value in section.items() if key != "name"}, "backbone")
+
     def __post_init__(self) -> None:
-        check_positive(self, "backbone.")
+        _check_sizes(self, "backbone")
         if self.width % self.heads:
             raise UserError(f"backbone.width={self.width} must be a multiple of backbone.heads={self.heads}.")
         if self.depth % 2:
@@ -118,3 +111,10 @@ class SAM2ActSizes(Sizes):
     def feature(self) -> int:
         """Width of what the heads read."""
         return 2 * VIEWS * self.token
+
+
+def _check_sizes(sizes: Any, where: str) -> None:
+    for name, value in vars(sizes).items():
+        for number in value if isinstance(value, tuple) else [value]:
+            if isinstance(number, int) and not 1 <= number <= LARGEST:
+                raise UserError(f"{where}.{name}={brief(value)}: sizes are whole numbers from 1 to {LARGEST}.")

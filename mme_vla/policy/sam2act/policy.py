@@ -92,8 +92,7 @@ class SAM2ActPolicy(Policy):
         Raises:
             UserError: an unknown name or option, a robot of another action space, or a package that is missing.
         """
-        section = {key: value for key, value in config["backbone"].items() if key != "name"}
-        sizes, robot = SAM2ActSizes.from_dict(section), embodiment_of(config)
+        sizes, robot = SAM2ActSizes.from_dict(config["backbone"]), embodiment_of(config)
         if robot.action.width != WIDTH or robot.action.frames is not None or robot.action.horizon != 1:
             raise UserError(
                 f"SAM2Act+ answers with one planned motion of {WIDTH} numbers; the robot {robot.name!r} is asked for "
