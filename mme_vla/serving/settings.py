@@ -89,6 +89,11 @@ class ServeSettings:
                 f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
                 f"many motions of {robot.name!r} they took: it cannot be served."
             )
+        if robot.readings:
+            raise UserError(
+                f"This policy reads {', '.join(robot.readings)}, which no request holds: it cannot be served. Evaluate it "
+                "with python -m mme_vla.evaluate."
+            )
         if self.action_space not in (None, robot.action.space):
             raise UserError(
                 f"action_space={self.action_space}: this policy answers with {robot.action.space}, "
