@@ -79,7 +79,7 @@ def _loaded(policy: Policy | str | Path) -> tuple[Policy, str | None]:
     if isinstance(policy, Policy):
         return policy, None
     from mme_vla.policy.mme import MMEPolicy
-    from mme_vla.training.checkpoint import resolve_checkpoint
+    from mme_vla.policy.run_folders import resolve_checkpoint
 
     where = Path(policy).expanduser()
     source = str(resolve_checkpoint(where)) if where.exists() else str(policy)
