@@ -232,7 +232,7 @@ class DiffusionPolicy(Policy):
         memory = None
         if self.memory is not None:
             with torch.no_grad(), self.autocast():
-                memory = self.memory.remember([e.required_history() for e in episodes], [e.stream for e in episodes])
+                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
         return self.sample_actions(batch, draws, steps, memory)
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
