@@ -28,7 +28,7 @@ from mme_vla.testing.small import moving_frames, unit_stats
 
 SHORT = [
     "logger=none", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=2",
-    "train.open_loop_chunks=1", "train.save_every=1", "train.log_every=1",
+    "train.open_loop_chunks=1", "train.log_every=1", "backbone.diffusion_steps=4",
 ]  # fmt: skip
 
 
@@ -161,8 +161,9 @@ def test_a_batch_is_cropped_at_one_place_and_the_centre_when_acting(policy: Diff
 
 
 def test_rollouts_execute_half_a_chunk(policy: DiffusionPolicy) -> None:
-    (record,) = roll(policy, JOBS[:1], InlineEnvs(max_steps=9))
-    assert record.outcome in ("success", "fail", "timeout") and record.steps <= 9
+    (record,) = roll(policy, JOBS[:1], InlineEnvs(max_steps=20))
+    assert policy.embodiment.action.execute == policy.horizon // 2 == 8
+    assert record.steps > 8 and record.extra["chunks"] == -(-record.steps // 8)
 
 
 def test_it_is_served_as_it_acts(policy: DiffusionPolicy) -> None:
@@ -181,12 +182,10 @@ def test_importing_the_library_imports_none_of_its_packages() -> None:
 
 
 @pytest.mark.parametrize("module", ["diffusers", "torchvision.models"])
-def test_a_missing_package_is_named_with_its_extra(
-    policy: DiffusionPolicy, module: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named_with_its_extra(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UserError, match="extra `baselines`"):
-        build_policy("diffusion_policy").sample_actions(policy.full_batch())
+        build_policy("diffusion_policy")
 
 
 @pytest.mark.parametrize(

@@ -68,7 +68,8 @@ class DiffusionSizes:
         for f in fields(self):
             value = getattr(self, f.name)
             if f.type is int and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST):
-                raise UserError(f"backbone.{f.name}={brief(value)} must be a whole number from 1 to {LARGEST}.")
+                where = "processor" if f.name == "window" else "backbone"  # which the backbone follows
+                raise UserError(f"{where}.{f.name}={brief(value)} must be a whole number from 1 to {LARGEST}.")
         if not isinstance(self.crop, int | float) or not 0 < self.crop <= 1:
             raise UserError(f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
         if not isinstance(self.memory_tower, VisionConfig):
