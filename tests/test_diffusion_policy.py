@@ -3,20 +3,23 @@
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 pytest.importorskip("diffusers")
 
+from rich.console import Console
 from rollout_stand_ins import JOBS, InlineEnvs, roll
 from serving_fakes import Served, acted_directly, challenge, course
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, load_weights
+from mme_vla.commands.inspect import show_checkpoint
 from mme_vla.commands.train import train
 from mme_vla.commands.weights import convert
 from mme_vla.config.composition import compose
@@ -32,6 +35,10 @@ SHORT = [
 ]  # fmt: skip
 
 
+RECIPE = ["train.schedule=cosine", "train.schedule_steps=3", "train.warmup_from_zero=true", "train.warmup=1",
+          "train.decay_min_dim=2", "train.ema_warmup=true", "train.weight_decay=1e-2"]  # fmt: skip
+
+
 def ready(name: str = "diffusion_policy", **overrides: Any) -> DiffusionPolicy:
     policy = build_policy(name, **overrides)
     assert isinstance(policy, DiffusionPolicy)
@@ -44,8 +51,15 @@ def policy() -> DiffusionPolicy:
     return ready()
 
 
-def run(folder: Path, *words: str) -> Path:
-    cfg = compose("train", ["model=diffusion_policy", *SHORT, *words])
+@cache
+def composed() -> DictConfig:
+    return compose("train", ["model=diffusion_policy", *SHORT, *RECIPE])
+
+
+def run(folder: Path, steps: int, resume: Path | None = None) -> Path:
+    """Train so many updates with the authors' recipe in small; the last checkpoint."""
+    cfg = composed().copy()
+    cfg.train.steps, cfg.resume = steps, None if resume is None else str(resume)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     return train(cfg, config, folder, begun=time.perf_counter())
 
@@ -54,20 +68,19 @@ def views(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     return {"front": moving_frames(count, seed=seed), "wrist": moving_frames(count, seed=seed + 1)}
 
 
-RECIPE = ["train.schedule=cosine", "train.warmup_from_zero=true", "train.warmup=1", "train.decay_min_dim=2",
-          "train.ema_warmup=true", "train.weight_decay=1e-2"]  # fmt: skip
-
-
 def test_it_trains_on_the_sample_and_resumes_to_the_bit(tmp_path: Path) -> None:
-    whole = run(tmp_path / "whole", "train.steps=3", "train.schedule_steps=3", *RECIPE)
-    run(tmp_path / "parts", "train.steps=2", "train.schedule_steps=3", *RECIPE)
-    words = ["train.steps=3", "train.schedule_steps=3", *RECIPE, f"resume={tmp_path / 'parts'}"]
-    resumed = load_tensors(run(tmp_path / "unused", *words))
+    whole = run(tmp_path / "whole", 3)
+    run(tmp_path / "parts", 2)
+    resumed = load_tensors(run(tmp_path / "unused", 3, resume=tmp_path / "parts"))
     for name, tensor in load_tensors(whole).items():
         assert torch.equal(tensor, resumed[name]), name
     again = Policy.from_pretrained(whole)
     assert isinstance(again, DiffusionPolicy) and again.require_processor().stats is not None
     assert again.embodiment.action.execute == 8
+    console = Console(record=True, width=200)
+    show_checkpoint(whole, console)
+    shown = console.export_text()
+    assert all(word in shown for word in ("encoder", "text", "action", "hashed", "11,305,900"))
     with pytest.raises(UserError, match=r"holds a 'diffusion_policy' policy.*Policy.from_pretrained"):
         MMEPolicy.from_pretrained(whole)
 
