@@ -88,6 +88,7 @@ class DiffusionPolicy(Policy):
         Raises:
             UserError: an unknown name or option, sizes that do not fit together, or a package that is missing.
         """
+        ddpm.require_diffusers()
         sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
         integration = _pooled(config.get("integration"), sizes)
         if (integration is None) != (not config.get("memory")):
@@ -268,6 +269,7 @@ class DiffusionPolicy(Policy):
             "window": (processor.window, sizes.window),
             "text_dim": (processor.text.width, sizes.text_dim),
             "horizon": (processor.horizon, sizes.horizon),
+            "memory_size": (processor.memory_size, sizes.memory_tower.image_size),
         }
         for name, (found, expected) in pairs.items():
             if found != expected:
