@@ -91,8 +91,8 @@ class ServeSettings:
             )
         if robot.readings:
             raise UserError(
-                f"This policy reads {', '.join(robot.readings)}, which no request holds: it cannot be served. Evaluate it "
-                "with python -m mme_vla.evaluate."
+                f"This policy reads {', '.join(robot.readings)}, which no request holds: it cannot be served. "
+                "Evaluate it with python -m mme_vla.evaluate."
             )
         if self.action_space not in (None, robot.action.space):
             raise UserError(
