@@ -100,7 +100,7 @@ POLICIES: Registry[Any] = Registry(
     {
         "mme": "mme_vla.policy.mme",
         "diffusion_policy": "mme_vla.policy.diffusion.policy",
-        "sam2act_plus": "mme_vla.policy.sam2act.policy",
+        "sam2act_plus": "mme_vla.policy.sam2act.waypoint_policy",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
@@ -108,7 +108,7 @@ PROCESSORS: Registry[Any] = Registry(
     {
         "pi05": "mme_vla.processing.processor",
         "diffusion_policy": "mme_vla.policy.diffusion.processing",
-        "sam2act_plus": "mme_vla.policy.sam2act.processing",
+        "sam2act_plus": "mme_vla.policy.sam2act.cloud_processing",
     },
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")

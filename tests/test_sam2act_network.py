@@ -10,16 +10,16 @@ from sam2act_golden import drawn, drawn_weight, load, meta, relative_error
 from torch import Tensor, nn
 
 from mme_vla.backbone.sam2act.convex import ConvexUp
-from mme_vla.backbone.sam2act.encoder import AdaptedProjection
 from mme_vla.backbone.sam2act.heatmaps import PointFinder, heatmap_loss
+from mme_vla.backbone.sam2act.picture_encoder import AdaptedProjection
 from mme_vla.backbone.sam2act.render import constant_channels
 from mme_vla.backbone.sam2act.sizes import EncoderSizes, SAM2ActSizes
 from mme_vla.backbone.sam2act.transformer import Look
 from mme_vla.backbone.sam2act.views import VIEWS
-from mme_vla.memory.sam2act.attention import MemoryAttention
-from mme_vla.memory.sam2act.bank import BankState, KeyframeBank
-from mme_vla.memory.sam2act.encoder import MemoryEncoder, sine_positions
-from mme_vla.policy.sam2act.network import SAM2ActNetwork
+from mme_vla.memory.sam2act.keyframe_bank import BankState, KeyframeBank
+from mme_vla.memory.sam2act.keyframe_encoder import MemoryEncoder, sine_positions
+from mme_vla.memory.sam2act.memory_attention import MemoryAttention
+from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
 from mme_vla.weights.name_tables import read
 from mme_vla.weights.names.sam2act import RATES, released_names
 

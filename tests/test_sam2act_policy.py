@@ -21,7 +21,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.sam2act.batches import KeyframeBatch
-from mme_vla.policy.sam2act.policy import SAM2ActPolicy
+from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.training.logging import read_metrics
 

@@ -10,9 +10,9 @@ from torch import nn
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.errors import UserError
 from mme_vla.policy.build import build_policy
-from mme_vla.policy.sam2act.network import SAM2ActNetwork
-from mme_vla.policy.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.sam2act.stages import STAGES, select_trained
+from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
+from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
 from mme_vla.weights.load import load_weights
 from mme_vla.weights.names.sam2act import (
     PICTURES,
@@ -21,7 +21,7 @@ from mme_vla.weights.names.sam2act import (
     released_names,
     released_unread,
 )
-from mme_vla.weights.sam2act import WEIGHTS, sam2act_adapter, write_sam2act
+from mme_vla.weights.sam2act_files import WEIGHTS, sam2act_adapter, write_sam2act
 from mme_vla.weights.source import detect_format
 
 FULL = {

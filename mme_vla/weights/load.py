@@ -20,7 +20,7 @@ from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
-from mme_vla.weights.sam2act import sam2act_adapter
+from mme_vla.weights.sam2act_files import sam2act_adapter
 from mme_vla.weights.source import Source, open_source
 
 ADAPTERS: dict[str, Callable[[Any], Adapter]] = {

@@ -14,7 +14,7 @@ from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files
 from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
 from mme_vla.weights.orbax import find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
-from mme_vla.weights.sam2act import is_sam2act, plain_sam2act_names
+from mme_vla.weights.sam2act_files import is_sam2act, plain_sam2act_names
 from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
 
 FORMATS = {

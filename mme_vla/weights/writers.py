@@ -19,7 +19,7 @@ from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
-from mme_vla.weights.sam2act import sam2act_adapter, write_sam2act
+from mme_vla.weights.sam2act_files import sam2act_adapter, write_sam2act
 from mme_vla.weights.source import VARIANTS
 
 VIEWS = {"front": "base_0_rgb", "wrist": "left_wrist_0_rgb"}  # π0.5's names of RoboMME's cameras

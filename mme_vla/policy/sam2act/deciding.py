@@ -8,9 +8,9 @@ from torch import Tensor
 from mme_vla.backbone.sam2act.geometry import ZOOM, Cube, zoom_back
 from mme_vla.backbone.sam2act.heatmaps import PointFinder
 from mme_vla.backbone.sam2act.rotations import angles_of_bins
-from mme_vla.memory.sam2act.bank import BankState
-from mme_vla.policy.sam2act.network import SAM2ActNetwork
+from mme_vla.memory.sam2act.keyframe_bank import BankState
 from mme_vla.policy.sam2act.scene import closer_pictures, cloud_pictures
+from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
 
 
 @dataclass(frozen=True)

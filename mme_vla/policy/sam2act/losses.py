@@ -12,8 +12,8 @@ from mme_vla.backbone.sam2act.geometry import ZOOM, Cube, shift_and_turn
 from mme_vla.backbone.sam2act.heatmaps import heatmap_loss
 from mme_vla.backbone.sam2act.rotations import to_bins
 from mme_vla.policy.sam2act.batches import KeyframeBatch
-from mme_vla.policy.sam2act.network import SAM2ActNetwork
 from mme_vla.policy.sam2act.scene import closer_pictures, cloud_pictures
+from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
 
 SHIFT, TURN = 0.125, math.pi / 4
 """Augmentation as released: shifts to this part of the cube's sides, turns to this angle."""

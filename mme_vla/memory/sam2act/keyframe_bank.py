@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mme_vla.memory.sam2act.attention import MemoryAttention
-from mme_vla.memory.sam2act.encoder import MemoryEncoder, sine_positions
+from mme_vla.memory.sam2act.keyframe_encoder import MemoryEncoder, sine_positions
+from mme_vla.memory.sam2act.memory_attention import MemoryAttention
 
 _SHARPNESS, _SHIFT = 20.0, 10.0  # a heatmap's logits become a mask of −10 to 10, as in SAM2
 
@@ -86,5 +86,5 @@ def released_positions(table: Tensor, batch: int) -> Tensor:
     """
     rows, width = table.shape[1:]
     places = rows // 3
-    mixed = table.expand(batch, -1, -1).reshape(places, 3 * batch, width)
+    mixed = table.repeat(batch, 1, 1).reshape(places, 3 * batch, width)
     return mixed.transpose(0, 1)

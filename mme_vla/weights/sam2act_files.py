@@ -8,7 +8,7 @@ from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
-from mme_vla.policy.sam2act.policy import SAM2ActPolicy
+from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
 from mme_vla.policy.tensor_files import cast
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.weights.adapter import Adapter

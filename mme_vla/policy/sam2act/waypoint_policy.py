@@ -13,16 +13,16 @@ from mme_vla.backbone.sam2act.heatmaps import PointFinder
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.sam2act.bank import BankState
+from mme_vla.memory.sam2act.keyframe_bank import BankState
 from mme_vla.policy.base import Policy
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.sam2act.batches import KeyframeBatch
+from mme_vla.policy.sam2act.cloud_processing import NAME, SAM2ActProcessor
 from mme_vla.policy.sam2act.deciding import Seen, decide, watch
-from mme_vla.policy.sam2act.episode import KeyframeEpisode
+from mme_vla.policy.sam2act.keyframe_episode import KeyframeEpisode
 from mme_vla.policy.sam2act.losses import augmentation_draws, augmented, first_loss, memory_loss
-from mme_vla.policy.sam2act.network import SAM2ActNetwork
-from mme_vla.policy.sam2act.processing import NAME, SAM2ActProcessor
 from mme_vla.policy.sam2act.stages import STAGES, check_stage
+from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import POLICIES
 

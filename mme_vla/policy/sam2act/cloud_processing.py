@@ -16,8 +16,8 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.files import check_sums, inside
 from mme_vla.policy.sam2act.batches import KeyframeBatch
+from mme_vla.policy.sam2act.goal_tokens import HASHED, goal_tokens
 from mme_vla.policy.sam2act.scene import Shot, cloud_of
-from mme_vla.policy.sam2act.words import HASHED, goal_tokens
 from mme_vla.processing.base import STATS_FILE, PolicyProcessor, read_settings
 from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.registry import PROCESSORS

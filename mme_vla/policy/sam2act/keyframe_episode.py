@@ -6,10 +6,10 @@ from typing import Protocol
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.memory.sam2act.bank import BankState
+from mme_vla.memory.sam2act.keyframe_bank import BankState
 from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.sam2act.cloud_processing import SAM2ActProcessor
 from mme_vla.policy.sam2act.deciding import Seen
-from mme_vla.policy.sam2act.processing import SAM2ActProcessor
 from mme_vla.policy.sam2act.scene import Shot
 
 

@@ -6,11 +6,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.sam2act.branch import Branch
-from mme_vla.backbone.sam2act.encoder import PictureEncoder
+from mme_vla.backbone.sam2act.picture_encoder import PictureEncoder
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.backbone.sam2act.transformer import Look
 from mme_vla.backbone.sam2act.views import VIEWS
-from mme_vla.memory.sam2act.bank import BankState, KeyframeBank, released_positions
+from mme_vla.memory.sam2act.keyframe_bank import BankState, KeyframeBank, released_positions
 
 COLOURS = slice(3, 6)
 """The channels of a virtual picture that the encoder sees."""
