@@ -11,7 +11,7 @@ from mme_vla.errors import UserError, brief, listed
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
 DRAWN = "_drawn"
-"""Ends the name of a camera's column that says which frames it was drawn at, where not at all."""
+"""After a camera's name: the column that says which frames it was drawn at, where not at all."""
 _USUAL = {"state": ("observation.state",), "action": ("action", "actions")}
 
 
@@ -65,7 +65,7 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     _check_width(root, "state", state, features, robot.state.width, robot)
     _check_width(root, "action", action, features, robot.action.width, robot)
     tables = ["episode_index", *state, *action, *(name for name in OPTIONAL if name in features)]
-    tables += [f"{column}{DRAWN}" for column in cameras.values() if f"{column}{DRAWN}" in features]
+    tables += [f"{name}{DRAWN}" for name in cameras if f"{name}{DRAWN}" in features]
     tables += [column for column in cameras.values() if features[column]["dtype"] == "image"]
     return Columns(cameras, state, action, tuple(dict.fromkeys(tables)))
 

@@ -18,11 +18,11 @@ import numpy as np
 from mme_vla.data.columns import DRAWN
 from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, any_chosen_frames, open_episode, pose_columns
 from mme_vla.data.progress import progress
+from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
-VIEWS = {"front": "image", "wrist": "wrist_image"}
 _PARTS, _MERGED = "episodes", "merged"
 
 
@@ -71,7 +71,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
         **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
-        **({f"{VIEWS[c]}{DRAWN}": {"dtype": "bool", "shape": (1,), "names": None} for c in VIEWS if options.partly}),
+        **{f"{c}{DRAWN}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
     }
 
 
@@ -241,7 +241,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 **{name: rows[step] for name, rows in tool.items()},
                 **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
                 **frame.subgoals,
-                **{f"{VIEWS[c]}{DRAWN}": np.array([c in frame.drawn]) for c in VIEWS if options.partly},
+                **{f"{c}{DRAWN}": np.array([c in frame.drawn]) for c in CAMERAS if options.partly},
                 "task": goal,
             }
         )

@@ -95,9 +95,7 @@ class EpisodeSource:
             for name, width in vectors.items():
                 check_vectors(self.root, self._table, name, width)
         self._drawn = {
-            name: self._column(f"{column}{DRAWN}").astype(bool)
-            for name, column in self.columns.items()
-            if f"{column}{DRAWN}" in columns
+            name: self._column(f"{name}{DRAWN}").astype(bool) for name in self.columns if f"{name}{DRAWN}" in columns
         }
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
