@@ -46,7 +46,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     failures: dict[int, str] = {}
     draft = folder / f"{job.name}.writing"
     for seed in range(job.seed, job.seed + job.retries):
-        scene = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
+        scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
         drawing, blind = None, None
         try:
             if job.frames is not None:
@@ -152,6 +152,8 @@ def plan(cfg: "DictConfig") -> list[Job]:
 
 
 def _chosen_frames(cfg: "DictConfig") -> FrameChoice | None:
+    given: Any
+    memory: Any
     given, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
     if given == "all":
         if memory is not None:

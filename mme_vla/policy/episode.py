@@ -64,11 +64,15 @@ class Episode:
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
+        drawn: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames in order, each once, the current one last; the conditioning video comes first.
 
         Args:
             frames: of every camera by its name (`front` and `wrist`), each [t, H, W, 3] uint8.
+            drawn: of every camera the places, ascending, among the t frames that `frames` shows, where not all were
+                drawn. `act` needs the last one of every camera; of the others a memory needs what its `frames_read`
+                names.
             states: [t, s].
             is_demo: whether the frames belong to the conditioning video; one bool, or [t].
             actions: [t, w] absolute actions that led to these frames. By default they are the first t of the last
@@ -83,7 +87,7 @@ class Episode:
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count, width = len(states) if states.ndim else 0, self._robot.state.width
-        even = all(len(view) == count for view in views.values())
+        even = all(len(view) == (count if drawn is None else len(drawn[name])) for name, view in views.items())
         if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in views.items())
             raise UserError(
@@ -95,8 +99,10 @@ class Episode:
         processor = self._policy.require_processor()
         check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
         demo, executed = self._checked_course(count, demo, actions)
-        images = processor.images([view[-1] for view in views.values()])
-        self._take(views[self._robot.memory_camera], demo, executed)
+        current = drawn is None or all(count - 1 in drawn[name] for name in views)
+        images = processor.images([view[-1] for view in views.values()]) if current else None
+        camera = self._robot.memory_camera
+        self._take(views[camera], demo, executed, None if drawn is None else np.asarray(drawn[camera], np.int64))
         self._images, self._state = images, torch.from_numpy(states[-1].copy())
 
     def remember(
@@ -151,11 +157,14 @@ class Episode:
             raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
         return demo, self._executed_now(int((~demo).sum()), actions)
 
-    def _take(self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
+    def _take(
+        self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray, drawn: np.ndarray | None = None
+    ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            wanted = self.history.wanted(len(frames))
-            self.history.append(frames, self._policy.encode_frames(frames[wanted]))
+            wanted = self.history.wanted(len(demo), drawn)
+            places = wanted if drawn is None else np.searchsorted(drawn, wanted)
+            self.history.append(frames, self._policy.encode_frames(frames[places]), drawn, len(demo))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().prompt_format.past_actions
@@ -163,7 +172,7 @@ class Episode:
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
-        self.frames_seen += len(frames)
+        self.frames_seen += len(demo)
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -183,9 +192,16 @@ class Episode:
 
     @property
     def images(self) -> Tensor:
-        """The current views [v, 3, s, s] uint8."""
+        """The current views [v, 3, s, s] uint8.
+
+        Raises:
+            UserError: no frame was seen yet, or the current one was not drawn.
+        """
         self._require_observation()
-        assert self._images is not None
+        if self._images is None:
+            raise UserError(
+                "The current frame was not drawn: observe() a picture of every camera before act()."
+            )
         return self._images
 
     @property

@@ -46,7 +46,7 @@ class FrameChoice:
         if self.at != DECISIONS and not isinstance(self.at, int):
             spans(self.at, "frames", f"all, {GRAMMAR}")
         if self.memory is not None:
-            self._memory()
+            _build(self.memory)
 
     def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
         """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
@@ -54,7 +54,7 @@ class FrameChoice:
         shown = self._shown(steps, video)
         frames = {camera: frozenset(shown) for camera in CAMERAS}
         if self.memory is not None:
-            read = self._memory().frames_read(np.array(shown, np.int64), video)
+            read = _build(self.memory).frames_read(np.array(shown, np.int64), video)
             frames[MEMORY_CAMERA] |= frozenset(read.tolist())
         return Drawing(frames, now=())
 
@@ -72,8 +72,9 @@ class FrameChoice:
             return found
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
 
-    def _memory(self) -> "Memory":
-        import mme_vla.memory  # noqa: F401  (registers what ships)
 
-        memory: Memory = MEMORIES.build(self.memory, d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
-        return memory
+def _build(section: Mapping[str, Any]) -> "Memory":
+    import mme_vla.memory  # noqa: F401  (registers what ships)
+
+    memory: Memory = MEMORIES.build(section, d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
+    return memory
