@@ -56,6 +56,10 @@ def test_a_choice_says_what_each_camera_shows(choice: FrameChoice, front: list[i
     drawing = choice.drawing(STEPS)
     shown = {name: [k for k in range(len(STEPS)) if name in drawing.cameras(k, False)] for name in ("front", "wrist")}
     assert shown == {"front": front, "wrist": wrist}
+    known = choice.beforehand()
+    assert (known is None) == (choice.memory is not None or not isinstance(choice.at, list))
+    for k in range(len(STEPS) if known is not None else 0):
+        assert known.cameras(k, False) == drawing.cameras(k, False)
 
 
 @pytest.mark.parametrize(

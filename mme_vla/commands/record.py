@@ -30,8 +30,8 @@ FAILED = "the demonstration did not end in success"
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
-    Where only some frames are drawn, the demonstration is made twice: once without a look, which says what these frames
-    are, and again with pictures of them.
+    Where which frames are drawn depends on the demonstration, it is made twice: once without a look, which says what
+    these frames are, and again with pictures of them.
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
@@ -47,9 +47,10 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     draft = folder / f"{job.name}.writing"
     for seed in range(job.seed, job.seed + job.retries):
         scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
-        drawing, blind = None, None
+        blind: Recording | None = None
         try:
-            if job.frames is not None:
+            drawing = None if job.frames is None else job.frames.beforehand()
+            if job.frames is not None and drawing is None:
                 blind = _unseen(job.task, scene)
                 if not blind.success:
                     failures[seed] = blind.error or FAILED

@@ -48,6 +48,13 @@ class FrameChoice:
         if self.memory is not None:
             _build(self.memory)
 
+    def beforehand(self) -> Drawing | None:
+        """What is drawn, where no demonstration has to be seen for it: numbers that no memory adds to; else None."""
+        if isinstance(self.at, int) or self.at == DECISIONS or self.memory is not None:
+            return None
+        numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
+        return Drawing(dict.fromkeys(CAMERAS, numbers), now=())
+
     def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
         """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
         video = sum(step.info["is_video_demo"] for step in steps)
