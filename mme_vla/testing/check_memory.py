@@ -97,14 +97,14 @@ def check_selection(memory: Memory, frames: int) -> None:
         assert (np.diff(chosen[:, 0]) >= 0).all(), f"at step {step} the selection is not in time order."
         kept = set(memory.storage.kept_frames(step + 1).tolist())
         assert set(chosen[:, 0].tolist()) <= kept, "select chose frames that the StorageSpec does not keep."
-        read = memory.frames_read([step], episode.exec_start)
-        assert set(chosen[:, 0].tolist()) <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
-        sparse = memory.select(episode.sparse(read, step + 1), step)
-        assert np.array_equal(chosen, sparse), f"at step {step} select differs where only frames_read was drawn."
         again = memory.select(whole, step)
         assert np.array_equal(chosen, again), "without rng, select must make the same choice every time."
         short = memory.select(episode.cached(step + 1), step)
         assert np.array_equal(chosen, short), f"what comes after step {step} changed what select chose there."
+        read = memory.frames_read([step], episode.exec_start)
+        assert set(chosen[:, 0].tolist()) <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
+        sparse = memory.select(episode.sparse(read, step + 1), step)
+        assert np.array_equal(chosen, sparse), f"at step {step} select differs where only frames_read was drawn."
     for piece in (1, 16, 23):
         history = episode.online(piece)
         offline = memory.select(whole, frames - 1)
