@@ -199,9 +199,7 @@ class Episode:
         """
         self._require_observation()
         if self._images is None:
-            raise UserError(
-                "The current frame was not drawn: observe() a picture of every camera before act()."
-            )
+            raise UserError("The current frame was not drawn: observe() a picture of every camera before act().")
         return self._images
 
     @property
