@@ -236,6 +236,13 @@ class DiffusionPolicy(Policy):
                 memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
         return self.sample_actions(batch, draws, steps, memory)
 
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
+        processor = self.require_processor()
+        if processor.window > 1 and processor.consecutive:
+            return None
+        return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
+
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
         storage = self.require_memory().storage
