@@ -1,7 +1,7 @@
 """`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or with a memory."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ class DiffusionPolicy(Policy):
     processor: DiffusionProcessor | None
     adapted = ("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3")
     heads = ("final_conv",)
-    PARTS: Mapping[str, str] = {
+    PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"backbone\.vision\.",
         "memory": r"memory\.|integration\.",
         "encoder": r"backbone\.(image_encoder|image_pool)\.",
