@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
+from mme_vla.data.columns import DRAWN
+from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, any_chosen_frames, open_episode, pose_columns
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries
-from mme_vla.embodiment.robomme import ARM_JOINTS, POSE
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
@@ -37,6 +38,8 @@ class ConvertOptions:
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
     poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
     keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
+    partly: say in two more columns which frames were drawn; `convert` does where an episode was recorded at a choice of
+        frames. The pictures of the others repeat an earlier one, and readers refuse them.
     """
 
     images: str = "video"
@@ -47,6 +50,7 @@ class ConvertOptions:
     gop: int = 8
     poses: tuple[str, ...] = ()
     keyframes: bool = False
+    partly: bool = False
 
     def __post_init__(self) -> None:
         if self.images not in ("video", "png"):
@@ -71,6 +75,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
         **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
+        **{f"{c}{DRAWN}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
     }
 
 
@@ -86,7 +91,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     """
     if not episodes:
         raise UserError("There is no episode to convert.")
-    options = replace(options or ConvertOptions(), poses=pose_columns(episodes))
+    options = replace(options or ConvertOptions(), poses=pose_columns(episodes), partly=any_chosen_frames(episodes))
     plan = _plan(episodes, options)
     partial = _work_folder(output)
     if _finished(output, plan) and not partial.exists():
@@ -116,7 +121,7 @@ def _work_folder(output: Path) -> Path:
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
     """The options as a plan holds them; poses and keyframes stand beside them there, as plans from before had none."""
-    return {key: value for key, value in asdict(options).items() if key not in ("poses", "keyframes")}
+    return {key: value for key, value in asdict(options).items() if key not in ("poses", "partly", "keyframes")}
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
@@ -131,9 +136,11 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
         {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
         for ref in episodes
     ]
-    return {"options": planned_options(options), "episodes": origins} | (
-        {"poses": list(options.poses)} if options.poses else {}
-    ) | ({"keyframes": True} if options.keyframes else {})
+    return (
+        {"options": planned_options(options), "episodes": origins}
+        | ({"poses": list(options.poses)} if options.poses else {})
+        | ({"keyframes": True} if options.keyframes else {})
+    )
 
 
 def _convert(
@@ -203,6 +210,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
             "goals": episode.goals,
             "length": episode.length,
             "exec_start_idx": episode.exec_start,
+            **({"frames": episode.frames} if episode.frames is not None else {}),
         }
     (draft / SIDE_FILE).write_text(json.dumps(side))
     draft.rename(part)
@@ -243,6 +251,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 **{name: rows[step] for name, rows in tool.items()},
                 **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
                 **frame.subgoals,
+                **{f"{c}{DRAWN}": np.array([c in frame.drawn]) for c in CAMERAS if options.partly},
                 "task": goal,
             }
         )

@@ -46,16 +46,20 @@ class KeyframeEpisode(Episode):
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
+        drawn: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames in order, with what the cameras read beside their pictures; see `Episode.observe`.
 
         Args:
             frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and `<name>_camera_extrinsic`
                 [t, 3, 4], from the world to the camera.
+            drawn: of no use here: every frame comes with its picture.
 
         Raises:
             UserError: also where depth or poses are missing or of another form.
         """
+        if drawn is not None:
+            raise UserError("observe() of this policy needs a picture of every frame: leave `drawn` out.")
         self._check_readings(frames)
         super().observe(frames, states, is_demo, actions)
         demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
