@@ -271,7 +271,7 @@ class RawEpisode:
         Raises:
             UserError: the episode holds no depth or no poses of cameras, or something else in their place.
         """
-        colours = self._picture(step, f"obs/{camera}_rgb")
+        colours = self._picture(step, camera)
         parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
                  "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
         missing = [name for name in parts.values() if name not in self._group]
