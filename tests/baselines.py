@@ -1,0 +1,47 @@
+"""Golden cases of the prior methods' original code: where they lie, and their weights by rule."""
+
+import os
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+SHARED = Path(__file__).resolve().parent.parent.parent / "shared" / "parity_baselines"
+
+
+def baselines_folder(method: str) -> Path:
+    """The folder of one method's golden cases; skips the test where there is none.
+
+    `MME_VLA_PARITY_BASELINES` names the folder above it, `../shared/parity_baselines` by default.
+    """
+    folder = Path(os.environ.get("MME_VLA_PARITY_BASELINES", SHARED)) / method
+    if not folder.is_dir():
+        pytest.skip(f"no golden cases of {method} at {folder} (set MME_VLA_PARITY_BASELINES)")
+    return folder
+
+
+def rule_uniform(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
+    """The float32 numbers in [−1, 1) that the cases' READMEs call u(name, shape, seed): splitmix64 of whole numbers."""
+    count = int(np.prod(shape, dtype=np.int64))
+    with np.errstate(over="ignore"):
+        z = np.arange(count, dtype=np.uint64) + (np.uint64(zlib.crc32(f"{seed}/{name}".encode())) << np.uint64(32))
+        z += np.uint64(0x9E3779B97F4A7C15)
+        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        z ^= z >> np.uint64(31)
+    values = (z >> np.uint64(40)).astype(np.float32) / np.float32(2**23) - np.float32(1)
+    return torch.from_numpy(values.reshape(shape))
+
+
+def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
+    """A parameter by rule: small biases, norm weights about one, matrices of unit gain for their fan-in."""
+    uniform = rule_uniform(name, shape, seed)
+    if name.endswith("bias"):
+        return 0.1 * uniform
+    if len(shape) < 2:
+        return 1 + 0.2 * uniform
+    fan = int(np.prod(shape[1:], dtype=np.int64))
+    return torch.tensor(np.float32(np.sqrt(3 / fan))) * uniform
