@@ -1,6 +1,8 @@
 """OpenVLA-OFT: the original's stages, loss, gradients, predictions and first updates, at the golden models' size."""
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,6 +16,7 @@ from mme_vla.backbone.layers.attention import additive_mask
 from mme_vla.backbone.openvla.backbone import OpenVlaBackbone, TokenSequence, absolute_error
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig, TowerConfig
+from mme_vla.processing.clipped_quantiles import ClippedQuantiles
 from mme_vla.weights.names.openvla import VLA, openvla_name
 
 TOLERANCE = 3e-5  # of the largest entry
@@ -123,8 +126,10 @@ def test_openvla_oft_loss_and_gradients(stages: Stages) -> None:
 @torch.no_grad()
 def test_openvla_oft_prediction_from_the_prompt_alone(stages: Stages) -> None:
     """One sample at a time in the original; here all in one batch."""
-    golden = stages.golden
-    observation = stages.backbone.blocks_of(stages.batch, fused(stages.backbone, golden))
+    golden, stats = stages.golden, stages.about["norm_stats"]["proprio"]
+    quantiles = ClippedQuantiles.of(SimpleNamespace(**{name: stats[name] for name in ("q01", "q99", "min", "max")}))
+    asked = replace(stages.batch, proprio=quantiles.normalize(golden["in/raw_proprio"].double()).float())
+    observation = stages.backbone.blocks_of(asked, fused(stages.backbone, golden))
     blocks = stages.policy.integration.inject(observation, stages.memory).blocks
     near(stages.backbone.answer_to(blocks), golden["out/predict_normalised"])
 
@@ -181,7 +186,7 @@ def test_openvla_oft_first_updates(folder: Path) -> None:
         assert rate == pytest.approx(update["lr"])
         optimizer.param_groups[0]["lr"] = rate
         errors = absolute_error(backbone.answer_to(backbone.blocks_of(data, fused(backbone, golden))), data.actions)
-        assert float(errors.mean()) == pytest.approx(update["loss_value"], rel=TOLERANCE)
+        assert errors.mean().item() == pytest.approx(update["loss_value"], rel=TOLERANCE)
         optimizer.zero_grad()
         errors.mean().backward()
         norm = torch.stack([p.grad.norm() for p in trained if p.grad is not None]).norm()
