@@ -102,7 +102,7 @@ def add_adapters(
     init: str = "uniform",
     targets: Sequence[str] | None = None,
 ) -> None:
-    """Wrap linear layers and convolutions with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
+    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
 
     Raises:
         UserError: peft is not installed, the policy has adapters already, a size that is not positive, or a target that
@@ -123,7 +123,11 @@ def add_adapters(
     except ImportError:
         raise missing_extra("LoRA", "vlm") from None
     config = LoraConfig(
-        r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=chosen, init_lora_weights=INITS[init]  # type: ignore[arg-type]
+        r=rank,
+        lora_alpha=alpha,
+        lora_dropout=dropout,
+        target_modules=chosen,
+        init_lora_weights=INITS[init],  # type: ignore[arg-type]
     )
     inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}

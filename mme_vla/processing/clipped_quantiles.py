@@ -37,13 +37,13 @@ class ClippedQuantiles:
         return cls(low, high, every, ends[0] == ends[1])
 
     def normalize(self, x: Tensor) -> Tensor:
-        """y = clip(2 (x − q01) / (q99 − q01 + ε) − 1, ±1) of x [..., d]; 0 where nothing ever moved."""
+        """Scale x [..., d]: clip(2 (x − q01) / (q99 − q01 + ε) − 1, ±1), and 0 where nothing ever moved."""
         low, span, scaled, still = self._on(x)
         y = (2 * (x - low) / span - 1).clamp(-1, 1)
         return torch.where(scaled, torch.where(still, torch.zeros_like(y), y), x)
 
     def unnormalize(self, y: Tensor) -> Tensor:
-        """x = ½ (y + 1) (q99 − q01 + ε) + q01 of y [..., d]; nothing is clipped."""
+        """Scale y [..., d] back: ½ (y + 1) (q99 − q01 + ε) + q01; nothing is clipped."""
         low, span, scaled, _ = self._on(y)
         return torch.where(scaled, (y + 1) / 2 * span + low, y)
 

@@ -87,7 +87,7 @@ class Angles(nn.Module):
         self.head_dim = head_dim
 
     def forward(self, x: Tensor, position_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """cos and sin [b, n, h] at positions [b, n], in x's dtype: what transformers' layers ask for."""
+        """Angles' cos and sin [b, n, h] at positions [b, n], in x's dtype: what transformers' layers ask for."""
         turn = rotation(position_ids, self.head_dim)
         return turn.cos.squeeze(2).to(x.dtype), turn.sin.squeeze(2).to(x.dtype)
 
