@@ -1,14 +1,14 @@
 """`OpenVlaProcessor`: pictures, words, states and actions as OpenVLA-OFT takes them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 from mme_vla.processing.base import Counted, Sample
 from mme_vla.processing.clipped_quantiles import ClippedQuantiles
 from mme_vla.processing.openvla_pictures import jpeg_round_trip, lanczos
@@ -20,24 +20,31 @@ from mme_vla.types import Batch
 
 @PROCESSORS.register("openvla")
 class OpenVlaProcessor(Processor):
-    """Lanczos-3 pictures, Llama's words, clipped quantiles of raw numbers, and the state for the network.
-
-    Args:
-        jpeg: write every picture as JPEG and read it again before it is resized, as the original's data were.
-        others: as `Processor`.
-    """
+    """Lanczos-3 pictures, Llama's words, clipped quantiles of raw numbers, and the state for the network."""
 
     counted = Counted(horizon=1, every=True, extremes=True)
     full_chunks_only = True
+    jpeg: bool = False
+    """Write every picture as JPEG and read it again before it is resized, as the original's data were."""
 
-    def __init__(self, *args: Any, jpeg: bool = False, **others: Any) -> None:
-        super().__init__(*args, **others)
-        self.jpeg = jpeg
-        if self.embodiment.action.width != self.action_dim:
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """As `Processor.from_config`, with `jpeg` beside the other settings.
+
+        Raises:
+            UserError: also where the network's actions are wider than the robot's.
+        """
+        jpeg = config.get("jpeg", False)
+        if not isinstance(jpeg, bool):
+            raise UserError(f"processor.jpeg must be true or false, not {brief(jpeg)}.")
+        built = super().from_config({key: value for key, value in config.items() if key not in ("name", "jpeg")})
+        if built.embodiment.action.width != built.action_dim:
             raise UserError(
-                f"backbone.action_dim={self.action_dim}: this network's actions are as wide as the robot's, "
-                f"{self.embodiment.action.width}."
+                f"backbone.action_dim={built.action_dim}: this network's actions are as wide as the robot's, "
+                f"{built.embodiment.action.width}."
             )
+        built.jpeg = jpeg
+        return built
 
     # Pictures
 
