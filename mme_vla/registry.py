@@ -1,5 +1,6 @@
 """Name → class tables. A decorator registers; a Hydra config names the key."""
 
+import importlib
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -17,9 +18,16 @@ class Registry[T]:
     True
     """
 
-    def __init__(self, kind: str) -> None:
+    def __init__(self, kind: str, shipped: Mapping[str, str] | None = None) -> None:
+        """Make a table.
+
+        Args:
+            kind: what its entries are, for messages.
+            shipped: name → module that registers it, imported when the name is first asked for.
+        """
         self.kind = kind
         self._entries: dict[str, T] = {}
+        self._shipped = dict(shipped or {})
 
     def register(self, name: str) -> Callable[[Any], Any]:
         """Return a decorator that files a class or function under `name`.
@@ -39,8 +47,10 @@ class Registry[T]:
         return decorate
 
     def __getitem__(self, name: str) -> T:
-        if not isinstance(name, str) or name not in self._entries:
-            raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self._entries)}")
+        if not isinstance(name, str) or name not in self:
+            raise UserError(f"Unknown {self.kind} {brief(name)}. {did_you_mean(brief(name), self)}")
+        if name not in self._entries:
+            importlib.import_module(self._shipped[name])
         return self._entries[name]
 
     def build(self, section: Mapping[str, Any], *args: Any, **fixed: Any) -> Any:
@@ -57,7 +67,7 @@ class Registry[T]:
         """
         options = {key: value for key, value in section.items() if key != "name"}
         if not isinstance(section.get("name"), str):
-            raise UserError(f"The section of the {self.kind} needs a name. {did_you_mean('', self._entries)}")
+            raise UserError(f"The section of the {self.kind} needs a name. {did_you_mean('', self)}")
         entry: Any = self[section["name"]]
         what = f"{self.kind} {section['name']!r}"
         if twice := sorted(set(options) & set(fixed)):
@@ -76,21 +86,29 @@ class Registry[T]:
         return entry(*args, **fixed, **options)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        return name in self._entries or name in self._shipped
 
     def __iter__(self) -> Iterator[str]:
-        return iter(sorted(self._entries))
+        return iter(sorted({*self._entries, *self._shipped}))
 
 
 MEMORIES: Registry[Any] = Registry("memory")
 INTEGRATIONS: Registry[Any] = Registry("integration")
 BACKBONES: Registry[Any] = Registry("backbone")
+POLICIES: Registry[Any] = Registry(
+    "policy",
+    {"mme": "mme_vla.policy.mme", "diffusion_policy": "mme_vla.policy.diffusion.policy"},
+)
+PROCESSORS: Registry[Any] = Registry(
+    "processor",
+    {"pi05": "mme_vla.processing.processor", "diffusion_policy": "mme_vla.policy.diffusion.processing"},
+)
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")
 PLAYERS: Registry[Any] = Registry("player")
 REGISTRIES = {
-    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "subgoal": SUBGOALS, "task": TASKS,
-    "player": PLAYERS,
+    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "policy": POLICIES,
+    "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
 }  # fmt: skip
 
 
@@ -98,7 +116,7 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     """Return a decorator that files a part of one's own under `name`, for YAML files and command lines to call it by.
 
     Args:
-        kind: `memory`, `integration`, `backbone`, `subgoal` (a predictor), `task` or `player`.
+        kind: `memory`, `integration`, `backbone`, `policy`, `processor`, `subgoal` (a predictor), `task` or `player`.
 
     Raises:
         UserError: an unknown kind, or the name is taken.

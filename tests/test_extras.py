@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+from h5_files import write_file
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -48,8 +49,8 @@ STEP = "run/checkpoints/step_000001"
 SUFFICE = [
     Case((), f"{TRAIN} output=run", "checkpoint"),
     Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
-    Case((), "mme_vla.data.cache --help", "rebuild"),
-    Case((), "mme_vla.data.convert --help", "input"),
+    Case((), f"mme_vla.data.cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
+    Case((), "mme_vla.data.convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
     Case((), f"mme_vla.weights.convert {STEP} lerobot --to lerobot", ""),
     Case((), "mme_vla.subgoal.build input=sample output=rows sets=[simple]", "simple"),
     Case((), "mme_vla.results --demo --brief", "Made-up records"),
@@ -66,6 +67,7 @@ SUFFICE = [
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
     Case(("sim",), "mme_vla.envs.record --help", "episodes"),
     Case(("sim",), "mme_vla.envs.show --help", "task"),
+    Case(("sim",), f"{PLAY} player=random", "records:"),
     Case(("sim", "play"), f"{PLAY} --help", "player"),
 ]  # fmt: skip
 
@@ -95,11 +97,10 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> dict[Case, tuple[int, str
     there = [case for case in [*SUFFICE, *NEED] if all(is_installed(extra) for extra in case.extras)]
     asked = [[case.words.split(), hidden(case.extras), case.wait] for case in there]
     folder = tmp_path_factory.mktemp("extras")
+    write_file(folder / "record_dataset_Alpha.h5", [9, 7])
     path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
     variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(())), "HF_HUB_OFFLINE": "1",
-                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
-                 # What one command has compiled, the next need not.
-                 "PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "compiled")}  # fmt: skip
+                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none"}  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(FOLDER / "commands.py")], input=json.dumps(asked), env=variables,
         cwd=folder, capture_output=True, text=True, timeout=550,

@@ -48,6 +48,7 @@ class Backbone(nn.Module):
         depth: layers of that stream. head_dim: width of one attention head.
         grid: side of a view's token grid.
         horizon, action_dim: of the chunk [h, a] it answers with.
+        sample_steps: of an iterative head, unless told otherwise.
         image_size: side of the square pictures it reads.
         hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition` and `beside`.
 
@@ -64,6 +65,7 @@ class Backbone(nn.Module):
     grid: int
     horizon: int
     action_dim: int
+    sample_steps: int = 1
     image_size: int
     hosts: frozenset[str] = frozenset({"blocks"})
 

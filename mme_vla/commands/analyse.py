@@ -213,7 +213,7 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
     """The policy to look at, the episodes to show it, and its name."""
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.policy.build import build_policy
-    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.policy.mme import MMEPolicy, mme_of
     from mme_vla.training.checkpoint import resolve_checkpoint
 
     if (args.checkpoint is None) == (args.model is None):
@@ -225,7 +225,8 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
         name = safe_name(str(policy.config.get("name") or args.checkpoint.name), "the policy's name")
         return policy, EpisodeSource(args.dataset, robot=policy.embodiment), name
     print(f"{args.model} with fresh weights: what it shows is where a model starts, not what one learns.")
-    return build_policy(args.model, backbone=args.backbone, device=args.device), EpisodeSource(args.dataset), args.model
+    policy = mme_of(build_policy(args.model, backbone=args.backbone, device=args.device), "This analysis")
+    return policy, EpisodeSource(args.dataset), args.model
 
 
 def _paper(table: str, model: str) -> dict[str, str]:
@@ -292,5 +293,5 @@ def _parser() -> argparse.ArgumentParser:
     made = command(cost, "CSV")
     made.add_argument("--models", nargs="+", metavar="NAME", help="default: all")
     made.add_argument("--budgets", nargs="*", type=int, help=f"memory budgets; none named: {BUDGETS}")
-    made.add_argument("--backbone", default="pi05", help="size (default: %(default)s)")
+    made.add_argument("--backbone", help="size (default: each model's full size)")
     return parser

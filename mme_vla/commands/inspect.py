@@ -53,11 +53,11 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
 
     With `trust_plugins` the modules that the checkpoint names are imported.
     """
-    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.policy.base import Policy
     from mme_vla.training.checkpoint import STATE, read_state, resolve_checkpoint
 
     folder = resolve_checkpoint(folder)
-    policy = MMEPolicy.from_pretrained(folder, trust_plugins=trust_plugins)
+    policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)
     table = _table(str(folder), "part", "tensors", "parameters", "dtype")
     for part, tensors in _parts(policy).items():
         dtypes = ", ".join(sorted({str(t.dtype).removeprefix("torch.") for t in tensors}))
@@ -68,7 +68,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _plain(section))
-    settings.add_row("tokenizer", policy.require_processor().tokenizer.spec)
+    settings.add_row("tokenizer", policy.require_processor().words_from)
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")

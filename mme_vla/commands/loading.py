@@ -12,7 +12,7 @@ from mme_vla.errors import UserError
 if TYPE_CHECKING:
     import torch
 
-    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.policy.base import Policy
 
 # What a checkpoint brings along, so that it cannot be set beside one.
 _MODEL_KEYS = (
@@ -32,7 +32,7 @@ _MODEL_KEYS = (
 class LoadedPolicy(NamedTuple):
     """A policy on its device. source: the checkpoint folder or repository it is from; None with fresh weights."""
 
-    policy: "MMEPolicy"
+    policy: "Policy"
     name: str
     source: str | None
 
@@ -50,7 +50,7 @@ def load_policy(
         UserError: neither a checkpoint nor a model is named, or both (or a part of one), or there is no such device.
     """
     from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.mme import MMEPolicy
+    from mme_vla.policy.base import Policy
     from mme_vla.training.checkpoint import LATEST, resolve_checkpoint
 
     device = find_device(cfg.device) if device is None else device
@@ -60,7 +60,7 @@ def load_policy(
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
         source = Path(str(cfg.checkpoint)).expanduser()
         where = str(resolve_checkpoint(source)) if source.exists() or source.name == LATEST else str(cfg.checkpoint)
-        policy = MMEPolicy.from_pretrained(
+        policy = Policy.from_pretrained(
             where, device=device, dtype=cfg.dtype, revision=cfg.revision, trust_plugins=cfg.trust_plugins
         )
         name = str(policy.config.get("name", "policy"))

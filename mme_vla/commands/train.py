@@ -86,7 +86,6 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
 def _train(
     cfg: DictConfig, config: dict[str, Any], run: "Run", settings: "TrainSettings", accelerator: Any, begun: float
 ) -> "Trainer":
-    from mme_vla.data.dataset import collate
     from mme_vla.policy.build import build_from_config
     from mme_vla.policy.finetune import apply_finetuning
     from mme_vla.policy.tensor_files import assign_tensors, load_tensors, take_memory
@@ -121,7 +120,7 @@ def _train(
         check_content(run.checkpoint, data.content)
     config["data"]["content"] = data.content
     check_disk(run.folder, policy, settings.keep)
-    validation = None
+    validation, collate = None, policy.require_processor().collate
     if data.val is not None and settings.val_samples:
         batch_size = settings.batch_size // (settings.accumulate * accelerator.num_processes)
         validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)

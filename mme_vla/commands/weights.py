@@ -14,7 +14,8 @@ import torch
 from mme_vla.config.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
+from mme_vla.policy.kinds import policy_class
 from mme_vla.policy.saving import CONFIG
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
 from mme_vla.weights.foreign_statistics import read_stats
@@ -102,10 +103,10 @@ def convert(
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> MMEPolicy:
+def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> Policy:
     """The policy a source belongs to, on meta, with its processor if that can be had."""
     from mme_vla.config.composition import compose
-    from mme_vla.processing.processor import Processor
+    from mme_vla.processing.base import load_processor
 
     if found.format == "ours":
         if overrides:
@@ -114,8 +115,8 @@ def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> MME
         if "backbone" not in config:
             raise UserError(f"{found.folder} holds our weights but no config.json that describes them.")
         import_trusted(config, str(found.folder), trust_plugins)
-        policy = MMEPolicy.from_saved(config, str(found.folder / CONFIG))
-        policy.processor = Processor.load(found.folder)
+        policy: Policy = policy_class(config).from_saved(config, str(found.folder / CONFIG))
+        policy.processor = load_processor(found.folder)
         policy.check_processor(str(found.folder))
         return policy
     words, said = list(overrides), found.model
@@ -125,7 +126,7 @@ def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> MME
     if not named:
         words.insert(0, f"model={said or 'pi05'}")
     if not any(word.startswith("backbone=") for word in words):
-        words.append("backbone=pi05")
+        words.append(f"backbone={compose('policy', words).full_size}")
     from mme_vla.policy.build import build_from_config
 
     return build_from_config(compose("policy", words), device="meta")

@@ -34,7 +34,7 @@ from mme_vla.config import plugins
 from mme_vla.config.endings import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
-from mme_vla.config.variant import Sections, decisive, variant_name
+from mme_vla.config.variant import POLICY, Sections, decisive, variant_name
 from mme_vla.config.words import join_memories, literal, several_memories
 from mme_vla.errors import UserError
 
@@ -132,7 +132,7 @@ def name_variant(cfg: DictConfig, config_name: str, directory: Path, extra_dirs:
 
 
 def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    cfg = join_memories(cfg.copy())
+    cfg, given = join_memories(cfg.copy()), str(cfg.name)
     config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
     mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
     theirs = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
@@ -145,6 +145,8 @@ def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> st
     def parts() -> Sections | None:
         chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
         words = [f"{group}={section.name if section else 'none'}" for group, section in chosen.items()]
+        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
+            words.insert(0, f"model={given}")
         if "members" in (chosen.get("memory") or {}):
             words.append(f"memory.members={literal(OmegaConf.to_container(chosen['memory'].members, resolve=True))}")
         found = composed(tuple(words), trees)

@@ -18,8 +18,9 @@ from mme_vla.embodiment.robomme import embodiment_of
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-FREE = ("memory.budget", "processor.tokenizer")
-"""Keys in them that do not: a budget has a field of its own in records, the tokenizer goes with the backbone."""
+FREE = ("memory.budget", "processor.tokenizer", "processor.text")
+"""Keys in them that do not: a budget has a field of its own in records, what reads words goes with the backbone."""
+POLICY, USUAL_POLICY = "policy.name", "mme"
 LONGEST = 32
 """Letters that differences may take in a name; more are a digest."""
 
@@ -37,6 +38,8 @@ def decisive(cfg: DictConfig) -> Sections:
             value = cfg[key]
             plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
             found |= _flat({key: plain})
+    if "policy" in cfg:
+        found |= _of_policy(cfg.policy)
     return {key: value for key, value in found.items() if value is not None and key not in FREE}
 
 
@@ -64,11 +67,11 @@ def variant_name(
     for name, theirs in known:
         if theirs == sections:
             return name
-    alike = [found for found in known if _parts(found[1]) == _parts(sections)]
+    alike = [found for found in known if _kind(found[1]) == _kind(sections)]
     if alike:
         name, base = min(alike, key=lambda found: (found[0] != given, len(_differences(found[1], sections))))
         return f"{name}-{_suffix(_differences(base, sections))}"
-    name = "_".join(part for part in _parts(sections) if part) or "memoryless"
+    name = "_".join(part for part in (sections.get(POLICY, ""), *_parts(sections)) if part) or "memoryless"
     plain = parts()
     if plain == sections:
         return name
@@ -83,7 +86,7 @@ def composition_digest(config: Mapping[str, Any]) -> str:
             which precision it computes do not count; nor do keys that are not set, so that a later option with an
             empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
     """
-    kept = _flat({key: config.get(key) for key in (*DECISIVE, "backbone")})
+    kept = _flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | _of_policy(config.get("policy") or {})
     kept = {key: value for key, value in kept.items() if value is not None and key != "processor.tokenizer"}
     robot = embodiment_of(config)
     if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
@@ -95,6 +98,16 @@ def _parts(sections: Sections) -> tuple[str, str]:
     members = sections.get("memory.members")
     joined = [str(m.get("name") if isinstance(m, Mapping) else m) for m in members or ()]
     return "_".join(joined) or str(sections.get("memory.name", "")), str(sections.get("integration.name", ""))
+
+
+def _kind(sections: Sections) -> tuple[str, ...]:
+    return (str(sections.get(POLICY, "")), *_parts(sections))
+
+
+def _of_policy(section: Mapping[str, Any]) -> Sections:
+    """The kind of policy, where it is not the usual one, which configurations did not use to name."""
+    name = section.get("name", USUAL_POLICY)
+    return {} if name == USUAL_POLICY else {POLICY: name}
 
 
 def _differences(base: Sections, sections: Sections) -> Sections:

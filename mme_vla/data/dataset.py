@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache.store import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, stack_history
-from mme_vla.processing.processor import Processor
+from mme_vla.memory.base import Memory
+from mme_vla.processing.base import PolicyProcessor, Sample
+from mme_vla.processing.processor import collate as collate
 from mme_vla.processing.subgoal_text import SubgoalText
-from mme_vla.types import Batch
 
 
 @dataclass(frozen=True)
@@ -42,15 +41,15 @@ class Step:
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
-    Items are dictionaries of tensors for `collate`, with the step's goal, subgoals and place beside them. They depend
+    Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside them. They depend
     on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data: tables and token
-    caches are memory-mapped, and an item decodes its two current pictures only.
+    caches are memory-mapped, and an item decodes only the pictures of its window, most often the current ones.
     """
 
     def __init__(
         self,
         sources: Sequence[EpisodeSource],
-        processor: Processor,
+        processor: PolicyProcessor,
         memory: Memory | None = None,
         caches: Sequence[VisionCache] | None = None,
         *,
@@ -86,7 +85,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             )
         if not 0 <= action_offset <= 1:
             raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
-        if processor.prompt_format.reads_subgoal and subgoal is None:
+        if processor.reads_subgoal and subgoal is None:
             raise UserError(
                 f"The prompt format {processor.prompt_name!r} reads a subgoal: set subgoal_text.kind to "
                 "simple_subgoal or grounded_subgoal, or choose processor.prompt=plain."
@@ -146,7 +145,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     def past_actions(self, step: Step) -> np.ndarray:
         """The robot's own actions right before the chunk, [n, w], as many as the prompt reads and there are."""
-        most = self.processor.prompt_format.past_actions
+        most = self.processor.past_actions
         return self.sources[step.source].past_actions(step.episode, step.index, most, self.action_offset)
 
     def __getitem__(self, index: int) -> dict[str, Any]:
@@ -154,16 +153,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         source = self.sources[step.source]
         rng = np.random.default_rng([self.seed, self.epoch, index])
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
-        cameras = self.processor.embodiment.camera_names
-        prompt, prompt_mask = self.processor.prompt(
-            step.goal, subgoal=subgoal, state=step.state, past_actions=self.past_actions(step)
-        )
-        item = {
-            "images": self.processor.images([source.frames(step.episode, [step.index], name)[0] for name in cameras]),
-            "prompt": prompt,
-            "prompt_mask": prompt_mask,
-            "state": torch.from_numpy(step.state),
-            "actions": self.processor.actions(step.actions, step.state),
+        item = self.processor.item(self._sample(step, subgoal)) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
             "place": (step.source, step.episode, step.index),
@@ -175,6 +165,21 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
         return item
 
+    def _sample(self, step: Step, subgoal: str | None) -> Sample:
+        """A step with the frames of its window; before the episode's first frame that one is repeated."""
+        source, cameras = self.sources[step.source], self.processor.embodiment.camera_names
+        window = np.arange(step.index - self.processor.window + 1, step.index + 1).clip(min=0)
+        first = int(window[0])
+        states = source.states(step.episode, first, step.index + 1)
+        return Sample(
+            views={name: source.frames(step.episode, window, name) for name in cameras},
+            states=states[window - first],
+            goal=step.goal,
+            subgoal=subgoal,
+            past_actions=self.past_actions(step),
+            actions=step.actions,
+        )
+
 
 def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> None:
     for source in sources:
@@ -184,23 +189,3 @@ def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> N
                 f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
                 f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}."
             )
-
-
-def collate(items: Sequence[dict[str, Any]]) -> Batch:
-    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
-
-    def stack(name: str) -> Tensor:
-        return torch.stack([item[name] for item in items])
-
-    images = stack("images")
-    batch = Batch(
-        images=images,
-        image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
-        prompt=stack("prompt"),
-        prompt_mask=stack("prompt_mask"),
-        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
-        actions=stack("actions"),
-        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
-        state=stack("state"),
-    )
-    return batch.without_prompt_padding()

@@ -21,6 +21,8 @@ def compute_norm_stats(
     action_offset: int = 0,
     seed: int = 42,
     robot: Embodiment = ROBOMME_JOINT,
+    every: bool = False,
+    extremes: bool = False,
 ) -> NormStats:
     """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are predicted.
 
@@ -32,6 +34,7 @@ def compute_norm_stats(
         episodes: which of each dataset's episodes count; None counts all.
         horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
         seed: of the order. robot: says which numbers of an action are relative to the state.
+        every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
 
     Raises:
         UserError: fewer than two execution steps.
@@ -39,8 +42,9 @@ def compute_norm_stats(
     steps = _execution_steps(sources, episodes)
     if len(steps) < 2:
         raise UserError(f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
-    np.random.default_rng(seed).shuffle(steps)
-    batches = max(len(steps) // BATCH, 1)
+    if not every:
+        np.random.default_rng(seed).shuffle(steps)
+    batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
     states, actions = RunningStats(), RunningStats()
     with progress("statistics", batches, unit="batches") as advance:
         for i in range(batches):
@@ -50,7 +54,7 @@ def compute_norm_stats(
             states.update(state.numpy())
             actions.update(robot.action.to_relative(chunk, state).numpy())
             advance(1)
-    return NormStats(state=states.result(), actions=actions.result())
+    return NormStats(state=states.result(extremes), actions=actions.result(extremes))
 
 
 def _execution_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None) -> np.ndarray:

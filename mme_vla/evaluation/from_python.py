@@ -78,9 +78,8 @@ def evaluate(
 def _loaded(policy: Policy | str | Path) -> tuple[Policy, str | None]:
     if isinstance(policy, Policy):
         return policy, None
-    from mme_vla.policy.mme import MMEPolicy
     from mme_vla.training.checkpoint import resolve_checkpoint
 
     where = Path(policy).expanduser()
     source = str(resolve_checkpoint(where)) if where.exists() else str(policy)
-    return MMEPolicy.from_pretrained(source), source
+    return Policy.from_pretrained(source), source

@@ -1,5 +1,5 @@
-"""Integrations: how memory tokens reach the policy. Importing this room registers the three it ships."""
+"""Integrations: how memory tokens reach the policy. Importing this room registers those it ships."""
 
-from mme_vla.integration import context, expert, modulator
+from mme_vla.integration import context, expert, film, modulator
 
-__all__ = ["context", "expert", "modulator"]
+__all__ = ["context", "expert", "film", "modulator"]

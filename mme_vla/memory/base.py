@@ -79,6 +79,15 @@ class Memory(nn.Module):
             mask=nn.functional.pad(mask, (before, after)),
         )
 
+    def full_history(self, d_vision: int, device: torch.device | str = "cpu") -> HistoryTokens:
+        """A selection [1, n, d_vision] without content that is as long as one can be."""
+        n = self.padded_length(self.capacity)
+        return HistoryTokens(
+            torch.zeros(1, n, d_vision, device=device),
+            torch.zeros(1, n, 3, device=device),
+            torch.ones(1, n, dtype=torch.bool, device=device),
+        )
+
     def start_stream(self) -> Any:
         """Return what this memory carries through one episode besides its history; None for nothing."""
         return None

@@ -8,32 +8,38 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws
+from mme_vla.backbone.base import Draws, stack_draws
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 from mme_vla.memory.base import Memory
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.saving import Saved
-from mme_vla.types import Batch
 
 if TYPE_CHECKING:
-    from mme_vla.processing.processor import Processor
+    from mme_vla.processing.base import PolicyProcessor
 
 
 class Policy(Saved):
     """A policy: a loss to train, chunks to sample, episodes to act in, parts to freeze or adapt, a folder to live in.
 
-    A subclass sets `memory` (or None), `processor`, `config`, `horizon` and `action_dim`, and implements what raises
-    NotImplementedError. Random numbers come from outside (`loss_draws`, `sample_draws`), so that training resumes and
+    A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
+    `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
+    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so that training resumes and
     episodes repeat bit for bit whatever they are batched with; only the policy knows what they mean.
     """
 
     memory: Memory | None
-    processor: "Processor | None"
+    processor: "PolicyProcessor | None"
     config: dict[str, Any]
+    history_dtype: torch.dtype = torch.bfloat16
+    """Of stored vision tokens."""
     horizon: int
     """Steps of a chunk."""
+    skipped: int = 0
+    """Steps at a chunk's beginning that lie in the past and are never executed."""
+    sample_steps: int = 1
+    """Steps of its sampler unless told otherwise."""
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
 
@@ -52,7 +58,7 @@ class Policy(Saved):
         """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
         return {}
 
-    def forward(self, batch: Batch, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, batch: Any, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of a batch, and metrics to log (detached).
 
         Args:
@@ -71,7 +77,7 @@ class Policy(Saved):
         return {}
 
     def sample_actions(
-        self, batch: Batch, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+        self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
     ) -> Tensor:
         """A normalised chunk [b, h, a].
 
@@ -91,8 +97,38 @@ class Policy(Saved):
         """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
 
         Returns:
-            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them.
+            float32 [n, h, w], or [h, w] for one episode: actions as the embodiment executes them; without the first
+            `skipped` of a chunk.
         """
+        if isinstance(episodes, Episode):
+            alone: np.ndarray = self.act([episodes], steps)[0]
+            return alone
+        if not episodes:
+            return np.zeros((0, self.horizon - self.skipped, self.embodiment.action.width), np.float32)
+        processor = self.require_processor()
+        processor.require_stats()  # before any episode's noise or memory moves on
+        batch = self.observation(episodes)
+        draws = stack_draws([e.draw() for e in episodes])
+        was_training = self.training
+        self.eval()
+        try:
+            chunk = self.answer(batch, episodes, draws, steps).float().cpu()
+        finally:
+            self.train(was_training)
+        states = torch.stack([e.state for e in episodes])
+        actions = processor.absolute_actions(chunk, states).numpy()[:, self.skipped :]
+        for episode, chosen in zip(episodes, actions, strict=True):
+            episode.acted(chosen)
+        return actions
+
+    def observation(self, episodes: Sequence[Episode]) -> Any:
+        """What running episodes see now, as a batch of the processor's kind on the policy's device."""
+        raise NotImplementedError
+
+    def answer(
+        self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """A normalised chunk [n, h, a] for what `observation` saw, through what the episodes remember."""
         raise NotImplementedError
 
     def encode_frames(self, frames: np.ndarray) -> Tensor:
@@ -104,6 +140,27 @@ class Policy(Saved):
 
     def vision_fingerprint(self) -> str:
         """A hash of what the tokens of `encode_frames` depend on, and a cache of them."""
+        raise NotImplementedError
+
+    def check_processor(self, source: str) -> None:
+        """Make sure that the network and its processor are for the same robot; a subclass compares their sizes too."""
+        processor = self.require_processor()
+        robot = embodiment_of(self.config)
+        if self.config.get("embodiment") is not None and robot != processor.embodiment:
+            raise UserError(
+                f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
+                f"{brief(robot.name)}, or the two say different things of it. The files are from two checkpoints, or "
+                "one was changed."
+            )
+
+    # Costs
+
+    def full_batch(self, device: torch.device | str = "cpu") -> Any:
+        """A batch of one without content, at its fullest: every view and word, a full memory, actions to learn from."""
+        raise NotImplementedError
+
+    def see_empty_frame(self) -> None:
+        """Run the vision tower on one black memory frame."""
         raise NotImplementedError
 
     # Parts
@@ -135,7 +192,7 @@ class Policy(Saved):
             raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
         return self.memory
 
-    def require_processor(self) -> "Processor":
+    def require_processor(self) -> "PolicyProcessor":
         """Return the processor, or say what it takes to have one."""
         if self.processor is None:
             raise UserError(

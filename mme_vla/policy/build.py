@@ -9,11 +9,12 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.words import words
-from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.processor import Processor
+from mme_vla.policy.base import Policy
+from mme_vla.policy.kinds import policy_class
+from mme_vla.processing.base import DEFAULT, PolicyProcessor
 from mme_vla.processing.prompt import PROMPTS
+from mme_vla.registry import PROCESSORS
 
 SECTIONS = (
     "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
@@ -28,7 +29,7 @@ def build_policy(
     seed: int = 42,
     config_dir: str | Path | None = None,
     **overrides: Any,
-) -> MMEPolicy:
+) -> Policy:
     """Build one of the variants with fresh weights.
 
     Args:
@@ -63,7 +64,7 @@ def build_from_config(
     device: str | torch.device = "cpu",
     seed: int | None = None,
     fresh_backbone: bool = True,
-) -> MMEPolicy:
+) -> Policy:
     """Build the policy a composed configuration describes; other sections (data, train, …) are ignored.
 
     Args:
@@ -78,7 +79,7 @@ def build_from_config(
     processor = None if torch.device(device).type == "meta" else build_processor(sections)
     with torch.random.fork_rng(devices=[]), torch.device(device):
         torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
-        policy = MMEPolicy.from_config(sections, processor, fresh_backbone=fresh_backbone)
+        policy: Policy = policy_class(sections).from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()
 
 
@@ -103,19 +104,11 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
         )
 
 
-def build_processor(sections: Mapping[str, Any]) -> Processor:
-    """Build the processor of a composed configuration, at its backbone's sizes.
+def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
+    """Build the processor of a composed configuration (`processor.name`), at its backbone's sizes.
 
     Raises:
-        UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
+        UserError: an unknown processor or setting, or a tokenizer that cannot be had.
     """
-    backbone = sections["backbone"]
-    sizes = {"image_size": backbone["vision"]["image_size"], "action_dim": backbone["action_dim"]}
-    robot = embodiment_of(sections).to_dict()
-    processor = Processor.from_config({**sections["processor"], **sizes, "embodiment": robot})
-    if processor.tokenizer.vocab_size > backbone["vocab_size"]:
-        raise UserError(
-            f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-            f"backbone.vocab_size={backbone['vocab_size']}: choose the processor that goes with the backbone."
-        )
-    return processor
+    kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT)]
+    return kind.from_sections(sections)

@@ -1,7 +1,7 @@
 """One running episode: all streaming state lives here, never on the policy."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from mme_vla.types import HistoryTokens
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
-    from mme_vla.processing.processor import Processor
+    from mme_vla.processing.base import PolicyProcessor
 
 
 class Host(Protocol):
@@ -30,7 +30,7 @@ class Host(Protocol):
 
     def require_memory(self) -> "Memory": ...
 
-    def require_processor(self) -> "Processor": ...
+    def require_processor(self) -> "PolicyProcessor": ...
 
     def encode_frames(self, frames: np.ndarray) -> Tensor: ...
 
@@ -43,8 +43,8 @@ class Episode:
     def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
         self._policy = policy
         self._generator = torch.Generator().manual_seed(seed)
-        self._images: Tensor | None = None
-        self._state: Tensor | None = None
+        self._seen: list[tuple[Tensor, Tensor]] = []
+        """Pictures and states of the frames that the policy sees at once, the current one last."""
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
@@ -95,9 +95,15 @@ class Episode:
         processor = self._policy.require_processor()
         check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
         demo, executed = self._checked_course(count, demo, actions)
-        images = processor.images([view[-1] for view in views.values()])
+        # Of the frames that the window has room for, those of the execution; the current one in any case.
+        recent = range(max(count - processor.window, 0) if processor.consecutive else count - 1, count)
+        seen = [
+            (processor.images([view[i] for view in views.values()]), torch.from_numpy(states[i].copy()))
+            for i in recent
+            if i == count - 1 or not demo[i]
+        ]
         self._take(views[self._robot.memory_camera], demo, executed)
-        self._images, self._state = images, torch.from_numpy(states[-1].copy())
+        self._see(seen)
 
     def remember(
         self, frames: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
@@ -140,7 +146,7 @@ class Episode:
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
         images = processor.images([pictures[name] for name in names])
-        self._images, self._state = images, torch.from_numpy(state.copy())
+        self._see([(images, torch.from_numpy(state.copy()))])
 
     def _checked_course(
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
@@ -158,7 +164,7 @@ class Episode:
             self.history.append(frames, self._policy.encode_frames(frames[wanted]))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
-        longest = self._policy.require_processor().prompt_format.past_actions
+        longest = self._policy.require_processor().past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
@@ -185,21 +191,30 @@ class Episode:
     def images(self) -> Tensor:
         """The current views [v, 3, s, s] uint8."""
         self._require_observation()
-        assert self._images is not None
-        return self._images
+        return self._seen[-1][0]
 
     @property
     def state(self) -> Tensor:
         """The current state [s]."""
         self._require_observation()
-        assert self._state is not None
-        return self._state
+        return self._seen[-1][1]
 
     @property
-    def prompt(self) -> tuple[Tensor, Tensor]:
-        """Token ids and mask of the goal, and the subgoal where the policy reads one."""
-        processor = self._policy.require_processor()
-        return processor.prompt(self.goal, subgoal=self.subgoal, state=self._state, past_actions=self._executed)
+    def window(self) -> tuple[Tensor, Tensor]:
+        """Views [t, v, 3, s, s] uint8 and states [t, s] of the frames that the policy sees at once, the current last.
+
+        Where fewer frames of the execution have been seen, the oldest stands for those before it.
+        """
+        self._require_observation()
+        missing = self._policy.require_processor().window - len(self._seen)
+        seen = [self._seen[0]] * missing + self._seen
+        return torch.stack([images for images, _ in seen]), torch.stack([state for _, state in seen])
+
+    @property
+    def prompt(self) -> Any:
+        """What the policy reads of the goal, and of the subgoal where it reads one."""
+        processor, state = self._policy.require_processor(), self._seen[-1][1] if self._seen else None
+        return processor.prompt(self.goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
 
     def acted(self, chunk: np.ndarray) -> None:
         """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""
@@ -237,8 +252,12 @@ class Episode:
         """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
         return self._policy.sample_draws(self._generator)
 
+    def _see(self, seen: list[tuple[Tensor, Tensor]]) -> None:
+        """Take what is new into the window."""
+        self._seen = (self._seen + seen)[-self._policy.require_processor().window :]
+
     def _require_observation(self) -> None:
-        if self._state is None:
+        if not self._seen:
             raise UserError("The episode has seen no frame yet: call observe() with the current frame before act().")
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:

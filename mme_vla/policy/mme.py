@@ -1,7 +1,5 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
-import hashlib
-import inspect
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, Self
@@ -15,19 +13,22 @@ import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.errors import UserError, brief, listed
 from mme_vla.integration.base import Integration
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
+from mme_vla.policy.kinds import policy_options
+from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES
+from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, POLICIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
-    from mme_vla.processing.processor import Processor
+    from mme_vla.processing.base import PolicyProcessor
 
 
+@POLICIES.register("mme")
 class MMEPolicy(Policy):
     """One composition of backbone, memory and integration.
 
@@ -39,7 +40,7 @@ class MMEPolicy(Policy):
         backbone: Backbone,
         memory: Memory | None,
         integration: Integration,
-        processor: "Processor | None" = None,
+        processor: "PolicyProcessor | None" = None,
         config: Mapping[str, Any] | None = None,
         *,
         compute_dtype: str = "float32",
@@ -63,11 +64,12 @@ class MMEPolicy(Policy):
         self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
+        self.sample_steps = backbone.sample_steps
         self.adapted, self.heads, self.unadaptable = backbone.adapted, backbone.heads, backbone.unadaptable
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: "Processor | None" = None, *, fresh_backbone: bool = True
+        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
         """Build from plain sections `backbone`, `memory`, `integration`, `policy`; each `name` is a registry's key.
 
@@ -101,7 +103,7 @@ class MMEPolicy(Policy):
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
-        return cls(backbone, memory, integration, processor, config, **_policy_options(cls, config.get("policy", {})))
+        return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
@@ -212,19 +214,8 @@ class MMEPolicy(Policy):
 
     # Episodes
 
-    def act(self, episodes: Episode | Sequence[Episode], steps: int | None = None) -> np.ndarray:
-        """Choose the next chunk for one episode or for many in one batch, adding nothing to their memories.
-
-        Returns:
-            float32 [n, h, w], or [h, w] for one episode: the embodiment's actions, absolute.
-        """
-        if isinstance(episodes, Episode):
-            alone: np.ndarray = self.act([episodes], steps)[0]
-            return alone
-        if not episodes:
-            return np.zeros((0, self.horizon, self.embodiment.action.width), np.float32)
-        processor = self.require_processor()
-        processor.require_stats()  # before any episode's noise or memory moves on
+    def observation(self, episodes: Sequence[Episode]) -> Batch:
+        """The current views and prompts of running episodes."""
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),
@@ -232,19 +223,13 @@ class MMEPolicy(Policy):
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
         )
-        batch = batch.without_prompt_padding().to(self.device)
-        draws = stack_draws([e.draw() for e in episodes])
-        was_training = self.training
-        self.eval()
-        try:
-            memory = self._remember(episodes)
-            chunk = self.sample_actions(batch, draws, steps, memory=memory).float().cpu()
-        finally:
-            self.train(was_training)
-        actions = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes])).numpy()
-        for episode, chosen in zip(episodes, actions, strict=True):
-            episode.acted(chosen)
-        return actions
+        return batch.without_prompt_padding().to(self.device)
+
+    def answer(
+        self, batch: Batch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """A chunk for what `observation` saw, through the episodes' memories."""
+        return self.sample_actions(batch, draws, steps, memory=self._remember(episodes))
 
     @torch.no_grad()
     def _remember(self, episodes: Sequence[Episode]) -> MemoryTokens | None:
@@ -254,30 +239,45 @@ class MMEPolicy(Policy):
         with self.autocast():
             return self.memory.remember([e.required_history() for e in episodes], [e.stream for e in episodes])
 
-    @torch.no_grad()
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        storage, encoded = self.require_memory().storage, []
-        for start in range(0, len(frames), batch_size):
-            images = self.require_processor().memory_images(frames[start : start + batch_size], device=self.device)
+        storage, width = self.require_memory().storage, self.backbone.vision_width
+
+        def pooled(some: np.ndarray | Tensor) -> Tensor:
+            images = self.require_processor().memory_images(some, device=self.device)
             with self.autocast():
-                tokens = self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
-            encoded.append(tokens.to(self.history_dtype))
-        if not encoded:
-            width = self.backbone.vision_width
-            return torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
-        return torch.cat(encoded)
+                return self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
+
+        empty = torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
+        return encode_frames(frames, pooled, empty, batch_size)
 
     def vision_fingerprint(self) -> str:
         """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        digest = hashlib.sha256(str(self.compute_dtype).encode())
-        for name, tensor in sorted(self.backbone.vision.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        return tower_fingerprint(self.backbone.vision, self.compute_dtype)
+
+    def full_batch(self, device: torch.device | str = "cpu") -> Batch:
+        """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""
+        size, views, length = self.backbone.image_size, len(self.embodiment.cameras), self._prompt_length()
+        return Batch(
+            images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
+            image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
+            prompt=torch.full((1, length), 5, device=device),
+            prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
+            history=None if self.memory is None else self.memory.full_history(self.backbone.vision_width, device),
+            actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
+        )
+
+    def _prompt_length(self) -> int:
+        return int(self.config["processor"]["prompt_length"])
+
+    def see_empty_frame(self) -> None:
+        """Run the vision tower on one black memory frame."""
+        size = self.backbone.image_size
+        self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
     def check_processor(self, source: str) -> None:
         """See `Saved`."""
+        super().check_processor(source)
         processor = self.require_processor()
         for name in ("image_size", "action_dim", "horizon"):
             found, expected = getattr(processor, name), getattr(self.backbone, name)
@@ -286,13 +286,6 @@ class MMEPolicy(Policy):
                     f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
                     "two checkpoints, or one was changed."
                 )
-        robot = embodiment_of(self.config)
-        if self.config.get("embodiment") is not None and robot != processor.embodiment:
-            raise UserError(
-                f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
-                f"{brief(robot.name)}, or the two say different things of it. The files are from two checkpoints, or "
-                "one was changed."
-            )
 
     def parts(self) -> Mapping[str, str]:
         """The backbone's parts in its order; memory, integration and the latter's experts are the part `memory`."""
@@ -301,20 +294,21 @@ class MMEPolicy(Policy):
         return {**parts, "memory": rf"memory\.|integration\.{experts}"}
 
 
+def mme_of(policy: Policy, what: str) -> MMEPolicy:
+    """The policy, where it is made of backbone, memory and integration.
+
+    Raises:
+        UserError: it is of another kind; `what` says what cannot be done with it.
+    """
+    if not isinstance(policy, MMEPolicy):
+        raise UserError(
+            f"{what} looks inside a backbone that a memory is integrated with; {policy.config.get('name', 'this')} is "
+            f"a {type(policy).__name__}, which has none."
+        )
+    return policy
+
+
 def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:
     """Draws by name; a bare tensor is a flow's `noise`."""
     named = {"noise": draws} if isinstance(draws, Tensor) else dict(draws or {})
     return named | {name: value for name, value in more.items() if value is not None}
-
-
-def _policy_options(cls: type, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """The section `policy`, whose keys are the constructor's keyword-only arguments.
-
-    Raises:
-        UserError: another key.
-    """
-    known = [p.name for p in inspect.signature(cls).parameters.values() if p.kind is p.KEYWORD_ONLY]
-    for key in options:
-        if key not in known:
-            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
-    return options

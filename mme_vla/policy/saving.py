@@ -15,10 +15,11 @@ from mme_vla.files import check_sums, inside, read_json, write_sums
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.hub import local_folder, push_folder
+from mme_vla.policy.kinds import policy_class_for
 from mme_vla.policy.tensor_files import INDEX, assign_tensors, dtype_of, load_tensors, save_tensors, weight_files
 
 if TYPE_CHECKING:
-    from mme_vla.processing.processor import Processor
+    from mme_vla.processing.base import PolicyProcessor
 
 CONFIG = "config.json"
 
@@ -39,11 +40,11 @@ class Saved(nn.Module):
     """A module that is built from a configuration and keeps a processor beside it."""
 
     config: dict[str, Any]
-    processor: "Processor | None"
+    processor: "PolicyProcessor | None"
 
     @classmethod
     def from_config(
-        cls, config: Mapping[str, Any], processor: "Processor | None" = None, *, fresh_backbone: bool = True
+        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
         """Build from plain sections."""
         raise NotImplementedError
@@ -88,6 +89,8 @@ class Saved(nn.Module):
     ) -> Self:
         """Load what `save_pretrained` wrote; of a training checkpoint, the EMA weights. No weight is drawn first.
 
+        `Policy.from_pretrained` loads every kind of policy, a subclass its own.
+
         Args:
             source: a folder on disk, or `owner/name` of a hub repository.
             device: where to put the weights.
@@ -98,10 +101,10 @@ class Saved(nn.Module):
             policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
 
         Raises:
-            UserError: no checkpoint there, a damaged file, a name that leads out of the folder, plugins that are not
+            UserError: no checkpoint there, one of another kind of policy, a damaged file, a name that leads out of the folder, plugins that are not
                 trusted, or weights that do not fit the configuration.
         """
-        from mme_vla.processing.processor import Processor
+        from mme_vla.processing.base import load_processor
 
         kind, folder = dtype_of(dtype), local_folder(source, revision, token)
         if not (folder / CONFIG).is_file():
@@ -115,10 +118,10 @@ class Saved(nn.Module):
         if dtype == "bfloat16":
             policy = {"compute_dtype": "bfloat16", **policy}
         import_trusted(config, str(source), trust_plugins)
-        loaded = cls.from_saved(config, str(folder / CONFIG), policy)
+        loaded = policy_class_for(cls, config, str(source)).from_saved(config, str(folder / CONFIG), policy)
         assign_tensors(loaded, load_tensors(folder), str(source), kind)
         loaded.compute_unsaved()
-        loaded.processor = Processor.load(folder, tokenizer)
+        loaded.processor = load_processor(folder, tokenizer)
         loaded.check_processor(str(source))
         return loaded.to(device).eval()
 

@@ -1,4 +1,4 @@
-"""Quantile normalisation of states and actions, and the running statistics it needs."""
+"""Normalisation of states and actions by quantiles or by extremes, and the running statistics it needs."""
 
 import json
 from dataclasses import dataclass, fields
@@ -17,19 +17,40 @@ BINS = 5000
 
 @dataclass(frozen=True)
 class QuantileStats:
-    """Mean, standard deviation, 1 % and 99 % quantile of each dimension; four arrays [d] of float64."""
+    """Mean, standard deviation, 1 % and 99 % quantile of each dimension; arrays [d] of float64.
+
+    min, max: the extremes, where they were kept; only normalisation by them needs them.
+    """
 
     mean: np.ndarray
     std: np.ndarray
     q01: np.ndarray
     q99: np.ndarray
+    min: np.ndarray | None = None
+    max: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.q01)
 
+    def bounds(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
+        """What becomes −1 and 1: `quantiles` or `extremes`.
+
+        Raises:
+            UserError: the extremes were not kept.
+        """
+        if kind == "quantiles":
+            return self.q01, self.q99
+        if self.min is None or self.max is None:
+            raise UserError(
+                "This policy normalises by the smallest and largest values, and these statistics hold none (min, max): "
+                "compute them from its data, or give the stats.json of its own training."
+            )
+        return self.min, self.max
+
     def to_dict(self) -> dict[str, list[float]]:
         """Return plain lists, as `norm_stats.json` holds them."""
-        return {field.name: getattr(self, field.name).tolist() for field in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.tolist() for name, value in values.items() if value is not None}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], name: str = "statistics") -> Self:
@@ -41,6 +62,8 @@ class QuantileStats:
         arrays = {}
         for field in fields(cls):
             if data.get(field.name) is None:
+                if field.name in ("min", "max"):
+                    continue
                 held = listed(sorted(data))
                 raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {held}.")
             try:
@@ -54,6 +77,8 @@ class QuantileStats:
             raise UserError(f"{name}: the lists have different lengths { {k: len(v) for k, v in arrays.items()} }.")
         if (arrays["q99"] < arrays["q01"]).any():
             raise UserError(f"{name}: q99 lies below q01 in a dimension; the statistics are damaged.")
+        if "min" in arrays and "max" in arrays and (arrays["max"] < arrays["min"]).any():
+            raise UserError(f"{name}: max lies below min in a dimension; the statistics are damaged.")
         return cls(**arrays)
 
 
@@ -104,37 +129,37 @@ class NormStats:
             raise UserError(f"{path}: {error}") from None
 
 
-def normalize(x: Tensor, stats: QuantileStats) -> Tensor:
+def normalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
     """Map [q01, q99] to [-1, 1] in the first `len(stats)` dimensions of x [..., d]; the others pass.
 
-    Nothing is clipped.
+    Nothing is clipped. With `by="extremes"` it is [min, max] that is mapped.
 
     Raises:
-        UserError: x has fewer dimensions than the statistics.
+        UserError: x has fewer dimensions than the statistics, or these lack the extremes.
     """
-    low, span = _range(x, stats)
+    low, span = _range(x, stats, by)
     n = len(stats)
     out = x.clone()
     out[..., :n] = (x[..., :n] - low) / span * 2 - 1
     return out
 
 
-def unnormalize(x: Tensor, stats: QuantileStats) -> Tensor:
+def unnormalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
     """Invert `normalize`."""
-    low, span = _range(x, stats)
+    low, span = _range(x, stats, by)
     n = len(stats)
     out = x.clone()
     out[..., :n] = (x[..., :n] + 1) / 2 * span + low
     return out
 
 
-def _range(x: Tensor, stats: QuantileStats) -> tuple[Tensor, Tensor]:
+def _range(x: Tensor, stats: QuantileStats, by: str) -> tuple[Tensor, Tensor]:
     if not x.is_floating_point():
         raise UserError(f"Only floating-point values can be normalised, got {x.dtype}.")
     if x.shape[-1] < len(stats):
         raise UserError(f"Statistics of {len(stats)} dimensions do not fit values of shape {list(x.shape)}.")
-    low = x.new_tensor(stats.q01)
-    return low, x.new_tensor(stats.q99 - stats.q01 + EPSILON)
+    low, high = stats.bounds(by)
+    return x.new_tensor(low), x.new_tensor(high - low + EPSILON)
 
 
 class RunningStats:
@@ -189,8 +214,8 @@ class RunningStats:
         for edges, counts, column in zip(self._edges, self._counts, rows.T, strict=True):
             counts += np.histogram(column, edges)[0]
 
-    def result(self) -> QuantileStats:
-        """Return the statistics of everything so far.
+    def result(self, extremes: bool = False) -> QuantileStats:
+        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value.
 
         Raises:
             UserError: fewer than two rows went in.
@@ -198,7 +223,8 @@ class RunningStats:
         if self._count < 2:
             raise UserError(f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
-        return QuantileStats(self._mean.copy(), std, self._quantile(0.01), self._quantile(0.99))
+        ends = (self._low.copy(), self._high.copy()) if extremes else ()
+        return QuantileStats(self._mean.copy(), std, self._quantile(0.01), self._quantile(0.99), *ends)
 
     def _rebin(self) -> None:
         edges = np.linspace(self._low, self._high, self._bins + 1, axis=1)

@@ -1,7 +1,6 @@
-"""`Processor`: everything between raw data and the network, saved with every checkpoint."""
+"""`Processor`: what stands between raw data and a network that reads prompts, π0.5's above all."""
 
 import inspect
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -11,25 +10,27 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.files import check_sums, inside, read_json
+from mme_vla.files import check_sums, inside
+from mme_vla.memory.base import stack_history
 from mme_vla.processing.actions import pad_width
+from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, PolicyProcessor, Sample, read_settings
 from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
 from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
+from mme_vla.registry import PROCESSORS
+from mme_vla.types import Batch
 
-CONFIG_FILE = "processor.json"
-STATS_FILE = "norm_stats.json"
 TOKENIZER_FILE = "tokenizer.model"
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
 OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]  # what processors named before robots could be chosen: front and wrist
 
 
-class Processor:
+@PROCESSORS.register("pi05")
+class Processor(PolicyProcessor):
     """Turns raw pictures, words, states and actions into what the network reads, and its answer back into actions.
-
-    Training, evaluation and serving share one such object, so they cannot differ.
 
     Args:
         image_size: s; side of the square pictures the vision tower takes, in pixels.
@@ -81,25 +82,43 @@ class Processor:
         self.embodiment.check_network(action_dim, self.horizon)
         self.stats = stats
 
-    @property
-    def horizon(self) -> int:
-        """h; steps in a chunk."""
-        return self.embodiment.action.horizon
+    @classmethod
+    def from_sections(cls, sections: Mapping[str, Any]) -> Self:
+        """Build the processor of a composed configuration, at its backbone's sizes.
 
-    @property
-    def stats(self) -> NormStats | None:
-        """Normalisation statistics; may be set once the data are known."""
-        return self._stats
-
-    @stats.setter
-    def stats(self, stats: NormStats | None) -> None:
-        robot = self.embodiment
-        if stats is not None and (len(stats.state), len(stats.actions)) != (robot.state.width, robot.action.width):
+        Raises:
+            UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
+        """
+        backbone = sections["backbone"]
+        sizes = {"image_size": backbone["vision"]["image_size"], "action_dim": backbone["action_dim"]}
+        settings = {key: value for key, value in sections["processor"].items() if key != "name"}
+        processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
+        if processor.tokenizer.vocab_size > backbone["vocab_size"]:
             raise UserError(
-                f"Statistics of {len(stats.state)}-number states and {len(stats.actions)}-number actions are not those "
-                f"of {robot.name!r}, which has {robot.state.width} and {robot.action.width}: give this robot's."
+                f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
+                f"backbone.vocab_size={backbone['vocab_size']}: choose the processor that goes with the backbone."
             )
-        self._stats = stats
+        return processor
+
+    @property
+    def reads_subgoal(self) -> bool:
+        """Whether the prompt holds a subgoal."""
+        return self.prompt_format.reads_subgoal
+
+    @property
+    def past_actions(self) -> int:
+        """Executed actions in the prompt."""
+        return self.prompt_format.past_actions
+
+    @property
+    def words_from(self) -> str:
+        """The tokenizer."""
+        return self.tokenizer.spec
+
+    @property
+    def words_fingerprint(self) -> str | None:
+        """The tokenizer's."""
+        return self.tokenizer.fingerprint
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
         """Resize the current pictures of all cameras with Pillow, as released.
@@ -202,6 +221,24 @@ class Processor:
         relative = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
         return self.embodiment.action.to_absolute(relative, state.to(relative))
 
+    def item(self, sample: Sample) -> dict[str, Any]:
+        """Pictures [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
+        state = sample.states[-1]
+        prompt, prompt_mask = self.prompt(
+            sample.goal, subgoal=sample.subgoal, state=state, past_actions=sample.past_actions
+        )
+        return {
+            "images": self.images([frames[-1] for frames in sample.views.values()]),
+            "prompt": prompt,
+            "prompt_mask": prompt_mask,
+            "state": torch.from_numpy(state),
+            "actions": self.actions(sample.actions, state),
+        }
+
+    def collate(self, items: Sequence[dict[str, Any]]) -> Batch:
+        """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
+        return collate(items)
+
     def to_config(self) -> dict[str, Any]:
         """Describe this processor as `processor.json` does; file names are relative to the folder `save` wrote."""
         on_hub = self.tokenizer.spec.startswith(HUB)
@@ -257,16 +294,10 @@ class Processor:
 
     def save(self, folder: Path | str) -> list[str]:
         """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the names of the files."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        config, written = self.to_config(), [CONFIG_FILE]
-        (folder / CONFIG_FILE).write_text(json.dumps(config, indent=2) + "\n")
-        if config["tokenizer"] == TOKENIZER_FILE:
-            self.tokenizer.save(folder / TOKENIZER_FILE)
+        written = super().save(folder)
+        if self.to_config()["tokenizer"] == TOKENIZER_FILE:
+            self.tokenizer.save(Path(folder) / TOKENIZER_FILE)
             written.append(TOKENIZER_FILE)
-        if self.stats is not None:
-            self.stats.save(folder / STATS_FILE)
-            written.append(STATS_FILE)
         return written
 
     @classmethod
@@ -281,11 +312,7 @@ class Processor:
             UserError: `folder` holds no processor, a damaged one, or one that names files elsewhere.
         """
         folder = Path(folder)
-        path = folder / CONFIG_FILE
-        if not path.is_file():
-            raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
-        check_sums(folder, [CONFIG_FILE])
-        config = read_json(inside(folder, CONFIG_FILE), "a processor's settings", limit=2**20)
+        path, config = folder / CONFIG_FILE, read_settings(folder)
         named, stats = config.get("tokenizer", ""), config.get("stats")
         if tokenizer is None:
             tokenizer = _own_tokenizer(folder, named)
@@ -296,14 +323,25 @@ class Processor:
         except UserError as error:
             raise UserError(f"{path}: {error}") from None
 
-    def require_stats(self) -> NormStats:
-        """Return the statistics, or say where they come from."""
-        if self._stats is None:
-            raise UserError(
-                "States and actions need normalisation statistics, and this processor has none. Training computes them "
-                "from its data; otherwise set processor.stats to a norm_stats.json (one stands in every checkpoint)."
-            )
-        return self._stats
+
+def collate(items: Sequence[dict[str, Any]]) -> Batch:
+    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([item[name] for item in items])
+
+    images = stack("images")
+    batch = Batch(
+        images=images,
+        image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
+        prompt=stack("prompt"),
+        prompt_mask=stack("prompt_mask"),
+        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+        actions=stack("actions"),
+        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
+        state=stack("state"),
+    )
+    return batch.without_prompt_padding()
 
 
 def _own_file(folder: Path, name: Any, what: str) -> Path:

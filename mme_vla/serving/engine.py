@@ -36,10 +36,12 @@ class Engine:
     Args:
         policy: with statistics, on its device.
         max_batch: most episodes that act together.
-        flow_steps: Euler steps a chunk.
+        flow_steps: of the sampler, for a chunk; None for the policy's own.
     """
 
-    def __init__(self, policy: Policy, max_batch: int = 16, flow_steps: int = 10, stats: ServerStats | None = None):
+    def __init__(
+        self, policy: Policy, max_batch: int = 16, flow_steps: int | None = None, stats: ServerStats | None = None
+    ) -> None:
         self.policy = policy
         self.flow_steps = flow_steps
         self.stats = stats or ServerStats()

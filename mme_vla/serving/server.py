@@ -45,7 +45,7 @@ class PolicyServer:
 
     def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
         policy.require_processor().require_stats()
-        settings.check_robot(policy.embodiment, policy.require_processor().prompt_format.past_actions)
+        settings.check_robot(policy.embodiment, policy.require_processor().past_actions)
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)

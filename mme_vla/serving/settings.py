@@ -42,7 +42,7 @@ class ServeSettings:
     api_key: str | None = field(default=None, repr=False)
     action_space: str | None = None
     execute: int | None = None
-    flow_steps: int = 10
+    flow_steps: int | None = None
     seed: int = 42
     max_batch: int = 16
     encode_chunk: int = 32
@@ -59,7 +59,8 @@ class ServeSettings:
             raise UserError("api_key must be a text of plain ASCII without blanks around it; null asks for none.")
         if not isinstance(self.port, int) or not 0 <= self.port < 65536:
             raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
-        for name in ("flow_steps", "max_batch", "encode_chunk", *(() if self.execute is None else ("execute",))):
+        given = [name for name in ("execute", "flow_steps") if getattr(self, name) is not None]
+        for name in ("max_batch", "encode_chunk", *given):
             _positive(name, getattr(self, name), whole=True)
         _positive("log_every_s", self.log_every_s)
         for spec in fields(self.limits):

@@ -11,7 +11,7 @@ from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.types import Batch, HistoryTokens
 
@@ -36,7 +36,8 @@ def unit_stats(robot: Embodiment = ROBOMME_JOINT) -> NormStats:
 
 def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
     """A tiny policy whose gates are open, so that every part reaches the action (fresh adaptive norms are shut)."""
-    policy = build_from_config(_composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed)
+    built = build_from_config(_composed(*policy_words(name, {"backbone": "tiny", **overrides})), seed=seed)
+    policy = mme_of(built, "small_policy()")
     policy.require_processor().stats = unit_stats(policy.embodiment)
     open_gates(policy)
     return policy

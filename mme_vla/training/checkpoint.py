@@ -93,9 +93,10 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
     ema.load(averaged)
     policy.load_state_dict({**averaged, **raw})
     state = optimizer.state_dict()
+    place = {id(p): i for i, p in enumerate(p for group in optimizer.param_groups for p in group["params"])}
     state["state"] = {
-        i: {key: moments[f"{name}/{key}"].clone() for key in _MOMENTS}  # no longer in a mapped file
-        for i, name in enumerate(parameters)
+        place[id(p)]: {key: moments[f"{name}/{key}"].clone() for key in _MOMENTS}  # no longer in a mapped file
+        for name, p in parameters.items()
         if f"{name}/step" in moments
     }
     optimizer.load_state_dict(state)

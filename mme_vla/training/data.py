@@ -14,8 +14,8 @@ from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.files import check_sums, inside
 from mme_vla.policy.base import Policy
+from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalisers import NormStats
-from mme_vla.processing.processor import STATS_FILE
 from mme_vla.processing.subgoal_text import SubgoalText
 
 
@@ -55,7 +55,11 @@ def prepare_data(
         check_sums(stats_from, [STATS_FILE])
         processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
-        processor.stats = compute_norm_stats(sources, split.train, processor.horizon, offset, seed, policy.embodiment)
+        counted = processor.counted
+        processor.stats = compute_norm_stats(
+            sources, split.train, counted.horizon or processor.horizon, offset, seed, policy.embodiment,
+            every=counted.every, extremes=counted.extremes,
+        )  # fmt: skip
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:

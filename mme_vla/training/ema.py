@@ -10,15 +10,26 @@ from torch import Tensor, nn
 class EMA:
     """average ← decay·average + (1 − decay)·weights after every update, begun with the initial weights as released."""
 
-    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float) -> None:
-        self.decay = decay
+    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float, warmup: bool = False) -> None:
+        """Begin with copies of the parameters.
+
+        Args:
+            decay: of the average; with `warmup` at most, and (1 + k)/(10 + k) after k updates before (0 at first).
+        """
+        self.decay, self.warmup = decay, warmup
         self._parameters = dict(parameters)
         self._average = [p.detach().clone() for p in self._parameters.values()]
 
+    def decay_after(self, done: int) -> float:
+        """The decay of the update before which `done` were done; the first one copies, while warming up."""
+        if not self.warmup:
+            return self.decay
+        return min((1 + done) / (10 + done), self.decay) if done else 0.0
+
     @torch.no_grad()
-    def update(self) -> None:
-        """Move towards the current weights."""
-        torch._foreach_lerp_(self._average, list(self._parameters.values()), 1 - self.decay)
+    def update(self, done: int = 0) -> None:
+        """Move towards the current weights, after `done` earlier updates (which only a warm-up asks)."""
+        torch._foreach_lerp_(self._average, list(self._parameters.values()), 1 - self.decay_after(done))
 
     @torch.no_grad()
     def load(self, tensors: Mapping[str, Tensor]) -> None:

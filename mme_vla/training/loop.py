@@ -16,7 +16,7 @@ from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoin
 from mme_vla.training.console import ProgressLine, memory_gib
 from mme_vla.training.ema import EMA
 from mme_vla.training.logging import Loggers
-from mme_vla.training.optim import clip_gradients, learning_rate, make_optimizer
+from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
@@ -84,7 +84,7 @@ class Trainer:
             policy.compile()
         parameters = trainable(policy)
         self.optimizer = make_optimizer(parameters.values(), settings)
-        self.ema = EMA(parameters, settings.ema)
+        self.ema = EMA(parameters, settings.ema, settings.ema_warmup)
         if run.checkpoint is not None:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
         self.model = accelerator.prepare_model(policy)
@@ -139,7 +139,7 @@ class Trainer:
     def update(self, step: int, batches: Iterator[Any], window: Window) -> dict[str, Tensor]:
         """One optimizer update from the next `accumulate` pieces of `batches`; its metrics, detached."""
         settings, device = self.settings, self.accelerator.device
-        rate = learning_rate(step, settings.lr, settings.warmup)
+        rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
@@ -160,7 +160,7 @@ class Trainer:
         norm = clip_gradients([p.grad for p in self._parameters if p.grad is not None], settings.clip_norm)
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
-        self.ema.update()
+        self.ema.update(step)
         return {**sums, "grad_norm": norm, "lr": torch.tensor(rate, device=device)}
 
     def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> float | None:

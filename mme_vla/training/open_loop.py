@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mme_vla.backbone.base import stack_draws
-from mme_vla.data.dataset import TrainingDataset, collate
+from mme_vla.data.dataset import TrainingDataset
 from mme_vla.embodiment import ActionSpace, Embodiment
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
@@ -72,11 +72,11 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     predicted = []
     generator = generator_for(seed, "open loop")
     for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
-        batch = collate([samples[i] for i in place])
-        assert batch.state is not None
+        batch = processor.collate([samples[i] for i in place])
+        states = torch.from_numpy(np.stack([samples.step(i).state for i in place]))
         draws = stack_draws([policy.sample_draws(generator) for _ in place], policy.device)
         chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()
-        predicted.append(processor.absolute_actions(chunk, batch.state))
+        predicted.append(processor.absolute_actions(chunk, states))
     recorded = [samples.step(i) for i in starts]
     stats = processor.stats
     assert stats is not None

@@ -1,7 +1,7 @@
 """Run folders: which one this run writes to, what it may resume from, and which settings it may change then."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,15 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.files import FolderLock, plain
 from mme_vla.files.locks import LOCK
+from mme_vla.policy.kinds import policy_name
 from mme_vla.training.checkpoint import checkpoints_in, read_state, resolve_checkpoint, step_of
+from mme_vla.training.settings import TrainSettings
 
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
 CHECKPOINTS = "checkpoints"
 
 MAY_DIFFER = (
-    "name", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
+    "name", "full_size", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
     "train.save_every", "train.keep", "train.workers", "train.open_loop_chunks", "train.device",
     "data.cache", "data.content", "trust_plugins",
 )  # fmt: skip
@@ -91,8 +93,7 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     if checkpoint is None:
         return Run(folder)
     state = read_state(checkpoint)
-    then, now = ({**c, "embodiment": embodiment_of(c).to_dict()} for c in (state["config"], config))
-    changed = differing_keys(then, now)
+    changed = differing_keys(_completed(state["config"]), _completed(config))
     if changed:
         pairs = [
             f"  {brief(key, quote=False)}: {brief(old)} then, {brief(new)} now" for key, (old, new) in changed.items()
@@ -143,6 +144,17 @@ def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, 
         key: (before.get(key), after.get(key))
         for key in sorted(before.keys() | after.keys())
         if before.get(key) != after.get(key) and not any(f"{key}.".startswith(f"{free}.") for free in MAY_DIFFER)
+    }
+
+
+def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with what runs of earlier versions did not say, because there was no other choice."""
+    train = {f.name: f.default for f in fields(TrainSettings) if f.default is not MISSING and f.name != "seed"}
+    return {
+        **config,
+        "embodiment": embodiment_of(config).to_dict(),
+        "train": {**train, **config["train"]},
+        "policy": {"name": policy_name(config), **(config.get("policy") or {})},
     }
 
 

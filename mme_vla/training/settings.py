@@ -6,6 +6,8 @@ from typing import Any, Self
 
 from mme_vla.errors import UserError, did_you_mean
 
+SCHEDULES = ("constant", "cosine", "steps")
+
 
 @dataclass(frozen=True)
 class KeepRule:
@@ -32,6 +34,13 @@ class TrainSettings:
     weight_decay: float = 1e-10
     clip_norm: float = 1.0
     ema: float = 0.999
+    warmup_from_zero: bool = False
+    schedule: str = "constant"
+    schedule_steps: int | None = None
+    milestones: tuple[int, ...] = ()
+    gamma: float = 0.1
+    decay_min_dim: int = 0
+    ema_warmup: bool = False
     accumulate: int = 1
     gradient_checkpointing: bool = False
     compile: bool = False
@@ -59,12 +68,21 @@ class TrainSettings:
         given = dict(values)
         given["keep"] = KeepRule(**given.get("keep", {}))
         given["betas"] = tuple(given.get("betas", cls.betas))
+        given["milestones"] = tuple(given.get("milestones") or ())
         return cls(**given, seed=seed)
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "accumulate", "log_every", "val_every", "save_every"):
             _check(name, getattr(self, name), getattr(self, name) >= 1, "at least 1")
-        for name in ("warmup", "workers", "val_samples", "open_loop_chunks", "weight_decay"):
+        _check("schedule", self.schedule, self.schedule in SCHEDULES, " or ".join(SCHEDULES))
+        if self.schedule_steps is not None:
+            fits = self.schedule_steps >= max(self.warmup, 1)
+            _check("schedule_steps", self.schedule_steps, fits, f"no fewer than train.warmup={self.warmup}, or null")
+        whole = all(isinstance(step, int) and step >= 1 for step in self.milestones)
+        _check("milestones", list(self.milestones), whole and list(self.milestones) == sorted(self.milestones),
+               "updates in ascending order, such as [1000, 2000]")  # fmt: skip
+        _check("gamma", self.gamma, 0 < self.gamma <= 1, "above 0 and at most 1")
+        for name in ("warmup", "decay_min_dim", "workers", "val_samples", "open_loop_chunks", "weight_decay"):
             _check(name, getattr(self, name), getattr(self, name) >= 0, "not negative")
         for name in ("lr", "eps", "clip_norm"):
             _check(name, getattr(self, name), getattr(self, name) > 0, "positive")

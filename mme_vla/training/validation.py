@@ -8,7 +8,6 @@ import torch
 
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
-from mme_vla.types import Batch
 
 
 class Samples(Protocol):
@@ -19,7 +18,8 @@ class Samples(Protocol):
     def __getitem__(self, index: int) -> Any: ...
 
 
-Collate = Callable[[Sequence[Any]], Batch]
+Collate = Callable[[Sequence[Any]], Any]
+"""Items as a batch of the policy's own kind, which has `to`."""
 
 
 class Validation:
@@ -30,7 +30,7 @@ class Validation:
         self._samples, self._collate, self._batch_size, self._seed = samples, collate, batch_size, seed
         size = len(samples)
         self.indices = np.linspace(0, size - 1, min(count, size)).round().astype(int).tolist()
-        self._batches: list[Batch] = []
+        self._batches: list[Any] = []
 
     @torch.no_grad()
     def loss(self, policy: Policy) -> float:

@@ -11,6 +11,7 @@ from mme_vla.errors import UserError, brief, listed
 from mme_vla.files import check_sums, inside, read_json
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalisers import NormStats, QuantileStats
+from mme_vla.weights.diffusion_policy import read_diffusion_stats
 
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FEATURES = {"state": "observation.state", "actions": "action"}
@@ -19,7 +20,7 @@ _FEATURES = {"state": "observation.state", "actions": "action"}
 def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None:
     """The statistics in a checkpoint folder, or None where it has none.
 
-    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, and the file that LeRobot's
+    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion Policy's `stats.json`, and the file that LeRobot's
     processor description names as the state of its normaliser. LeRobot's speak of the actions it was trained on:
     they fit this library's joint deltas if that policy used relative actions with an absolute gripper.
 
@@ -47,7 +48,7 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
         return NormStats.load(_own(folder, next(iter(files.values()))))
     if (folder / "norm_stats.json").is_file():
         return NormStats.load(_own(folder, folder / "norm_stats.json"))
-    return next(_lerobot_stats(folder), None)
+    return read_diffusion_stats(folder) or next(_lerobot_stats(folder), None)
 
 
 def stats_files(folder: Path) -> dict[str, Path]:

@@ -16,6 +16,7 @@ from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
+from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import partial_adapter, released_adapter
@@ -25,6 +26,7 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "lerobot": port_adapter,
     "openpi": port_adapter,
     "released": released_adapter,
+    "diffusion_policy": diffusion_adapter,
 }
 
 # What a memory adds to π0.5, as our names and the released leaves tell.
@@ -160,10 +162,10 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     if policy.processor is None or not file.is_file():
         return
     theirs = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
-    ours = policy.processor.tokenizer
-    if theirs is not None and theirs != ours.fingerprint:
+    processor, ours = policy.processor, policy.processor.words_fingerprint
+    if theirs is not None and ours is not None and theirs != ours:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {ours.spec!r} ({ours.fingerprint}): "
+            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {processor.words_from!r} ({ours}): "
             "its ids would mean other words. Set processor.tokenizer to that one."
         )
 

@@ -8,13 +8,13 @@ from collections.abc import Iterable
 from rich.console import Console
 from rich.table import Table
 
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
 from mme_vla.weights.adapter import Adapter
 from mme_vla.weights.load import ADAPTERS
 from mme_vla.weights.source import FORMATS, Source
 
 
-def print_mapping(policy: MMEPolicy, source: Source, to: str, console: Console | None = None) -> None:
+def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
     """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered layers are one row."""
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     read, written = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
@@ -26,7 +26,7 @@ def print_mapping(policy: MMEPolicy, source: Source, to: str, console: Console |
         _print_adapter(console, make(policy), policy, title)
 
 
-def _print_adapter(console: Console, adapter: Adapter, policy: MMEPolicy, title: str) -> None:
+def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: str) -> None:
     state = policy.state_dict()
     shapes = adapter.shapes(state)
     table = _table(f"{title}: {len(adapter.needed())} tensors ↔ {len(adapter.table)} of ours")

@@ -1,6 +1,6 @@
 """What a user points at: which format it is in, and its tensors under that format's names."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,32 @@ from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.policy.hub import local_folder
 from mme_vla.policy.saving import CONFIG, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
+from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
 from mme_vla.weights.orbax import find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
+from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
 
 FORMATS = {
     "ours": "save_pretrained() of this library",
     "lerobot": "LeRobot's pi05 (safetensors)",
     "openpi": "openpi's PyTorch π0.5 (safetensors)",
     "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
+    "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
 }
+
+@dataclass(frozen=True)
+class OwnNames:
+    """A format of one method, told by its tensors' names.
+
+    matches: whether names are its. plain: tensors under the one spelling that its name table knows.
+    """
+
+    matches: Callable[[Sequence[str]], bool]
+    plain: Callable[[Mapping[str, Tensor], str], dict[str, Tensor]]
+
+
+OWN_NAMES = {"diffusion_policy": OwnNames(is_diffusion_policy, plain_names)}
+"""Formats in files of `torch.save`; each is called as the model it holds."""
 
 VARIANTS = {
     "pi05_baseline": "pi05",
@@ -59,6 +76,8 @@ class Source:
         """
         if self.params is not None:
             return read_orbax(self.params, fits)
+        if self.format in OWN_NAMES:
+            return OWN_NAMES[self.format].plain(read_torch_file(self.files[0]), str(self.files[0]))
         tensors = read_files(self.folder, self.files)
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
@@ -69,7 +88,9 @@ class Source:
 
     @property
     def model(self) -> str | None:
-        """Our name of the variant a released run says it is, or None where it does not say."""
+        """Our name of the variant a checkpoint is, or None where it does not say."""
+        if self.format in OWN_NAMES:
+            return self.format
         said = variant_of(self.params) if self.params is not None else None
         if said is not None and said not in VARIANTS:
             # The word would become part of a configuration, where it could ask for more than a name.
@@ -98,6 +119,8 @@ def open_source(source: str | Path, revision: str | None = None, token: str | No
     path = local_folder(source, revision, token)
     if not path.exists():
         raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
+    if path.is_file() and path.suffix in SUFFIXES:
+        return _of_torch_file(path)
     if path.is_file():
         return _of_files(path.parent, (path,))
     if (path / WEIGHTS).is_file() or (path / INDEX).is_file():
@@ -105,6 +128,10 @@ def open_source(source: str | Path, revision: str | None = None, token: str | No
     params = find_params(path)
     if params is not None:
         return Source("released", params.parent if params.name == "params" else params, params=params)
+    if len(files := find_torch_files(path)) == 1:
+        return _of_torch_file(files[0])
+    if files:
+        raise UserError(f"{path} holds {listed(file.name for file in files)}: name the one you mean.")
     if (path / "adapter_model.safetensors").is_file():
         raise UserError(f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first.")
     raise UserError(f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}.")
@@ -124,6 +151,15 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
     raise UserError(
         f"{files[0]} is not a π0.5 policy: its tensors are called {few}. Known: {'; '.join(FORMATS.values())}."
     )
+
+
+def _of_torch_file(path: Path) -> Source:
+    names = list(read_torch_file(path))
+    for name, of in OWN_NAMES.items():
+        if of.matches(names):
+            return Source(name, path.parent, (path,))
+    few = listed(sorted(names), 3)
+    raise UserError(f"{path} holds no policy known here: its tensors are called {few}. Known: {', '.join(OWN_NAMES)}.")
 
 
 def _names(file: Path) -> list[str]:

@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.base import Policy
+from mme_vla.policy.mme import mme_of
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
+from mme_vla.weights.diffusion_policy import diffusion_adapter, write_diffusion_policy
 from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
@@ -24,7 +26,7 @@ ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's stat
 _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 
 
-def check_target(policy: MMEPolicy, fmt: str) -> None:
+def check_target(policy: Policy, fmt: str) -> None:
     """Refuse a format that has no place for this policy, before anything is read.
 
     Raises:
@@ -33,19 +35,22 @@ def check_target(policy: MMEPolicy, fmt: str) -> None:
     if fmt in ("lerobot", "openpi") and policy.memory is not None:
         raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
     if fmt == "released":
-        released_table(policy)
+        released_table(mme_of(policy, "The released layout"))
+    if fmt == "diffusion_policy":
+        diffusion_adapter(policy)
 
 
-def write_ours(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """`save_pretrained`; the processor carries the statistics."""
     policy.save_pretrained(folder, dtype=_name(dtype))
 
 
-def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """Weights and `config.json` for LeRobot's `PI05Policy`; statistics as openpi writes them, beside them.
 
     LeRobot's own processors write the state into the prompt, and know no RoboMME statistics: they are not part of this.
     """
+    policy = mme_of(policy, "LeRobot's layout of π0.5")
     size, robot = policy.backbone.image_size, policy.embodiment
     views = [VIEWS.get(name, name) for name in robot.camera_names]
     features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in views}
@@ -72,8 +77,9 @@ def write_lerobot(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: No
         stats.save(folder / STATS_FILE)
 
 
-def write_openpi(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_openpi(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """Weights, `config.json` and statistics as openpi's PyTorch training writes them."""
+    policy = mme_of(policy, "openpi's layout of π0.5")
     about = {"action_dim": policy.action_dim, "action_horizon": policy.horizon, **_SIZES, "precision": _name(dtype)}
     _write_json(folder / "config.json", about)
     tensors = to_openpi(policy, policy.state_dict())
@@ -82,8 +88,9 @@ def write_openpi(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: Nor
     _write_assets(folder, stats)
 
 
-def write_released(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
+    policy = mme_of(policy, "The released layout")
     names = {ours: theirs for theirs, ours in VARIANTS.items()}
     variant = names.get(str(policy.config.get("name")))
     if policy.memory is not None and variant is not None:
@@ -92,11 +99,12 @@ def write_released(policy: MMEPolicy, folder: Path, dtype: torch.dtype, stats: N
     _write_assets(folder / "0", stats)
 
 
-WRITERS: dict[str, Callable[[MMEPolicy, Path, torch.dtype, NormStats | None], None]] = {
+WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]] = {
     "ours": write_ours,
     "lerobot": write_lerobot,
     "openpi": write_openpi,
     "released": write_released,
+    "diffusion_policy": write_diffusion_policy,
 }
 
 

@@ -20,25 +20,28 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.results.cost_table import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.build import build_policy
-from mme_vla.policy.mme import MMEPolicy
-from mme_vla.types import Batch, HistoryTokens
+from mme_vla.policy.base import Policy
 
 
-def count_model(model: str, budget: int | None = None, backbone: str = "pi05") -> ModelCost:
+def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
     """Count a model at a memory budget (None: its own).
+
+    Args:
+        backbone: a file of `configs/backbone`; by default the one that is the model's full size.
 
     Raises:
         UserError: an unknown model, a budget for a model without memory, or a PyTorch that does not count attention.
     """
     _check_attention_is_counted()
-    policy, batch = on_meta(model, budget, backbone)
+    policy = on_meta(model, budget, backbone)
+    batch, memory = policy.full_batch("meta"), policy.memory
     return ModelCost(
         model=model,
-        prompt=batch.prompt.shape[1],
+        prompt=policy.config["processor"].get("prompt_length", 0),
         parameters=sum(p.numel() for p in policy.parameters()),
         forward=flops(lambda: policy(batch)),
         chunk=flops(lambda: policy.sample_actions(batch)),
-        memory=flops(lambda: policy.encode_memory(batch.history)),
+        memory=0 if memory is None else flops(lambda: memory(batch.history)),
         streamed=_streamed(policy, batch),
         frames=_frames(policy),
     )
@@ -51,38 +54,20 @@ def flops(work: Callable[[], object]) -> int:
     return counter.get_total_flops()
 
 
-def on_meta(model: str, budget: int | None = None, backbone: str = "pi05") -> tuple[MMEPolicy, Batch]:
-    """A model and a full batch of one, both on the meta device.
+def on_meta(model: str, budget: int | None = None, backbone: str | None = None) -> Policy:
+    """A model on the meta device.
 
     Raises:
         UserError: an unknown model, or a budget for a model without memory.
     """
+    if backbone is None:
+        backbone = str(compose("policy", [f"model={model}"]).full_size)
     policy = build_policy(model, backbone=backbone, device="meta")
-    if budget is not None:
-        if policy.memory is None:
-            raise UserError(f"{model} has no memory, so no budget of {budget} tokens.")
-        policy = build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
-    policy.augment = False  # elementwise, and it draws numbers
-    length = compose("policy", [f"model={model}", f"backbone={backbone}"]).processor.prompt_length
-    return policy, full_batch(policy, length, "meta")
-
-
-def full_batch(policy: MMEPolicy, prompt: int, device: str = "cpu") -> Batch:
-    """A batch of one without content: all views, `prompt` tokens without padding, and a memory that is full."""
-    size, views, history = policy.backbone.image_size, len(policy.embodiment.cameras), None
-    if policy.memory is not None:
-        n = policy.memory.padded_length(policy.memory.capacity)
-        features = torch.zeros(1, n, policy.backbone.vision_width, device=device)
-        mask = torch.ones(1, n, dtype=torch.bool, device=device)
-        history = HistoryTokens(features, torch.zeros(1, n, 3, device=device), mask)
-    return Batch(
-        images=torch.zeros(1, views, 3, size, size, dtype=torch.uint8, device=device),
-        image_mask=torch.ones(1, views, dtype=torch.bool, device=device),
-        prompt=torch.full((1, prompt), 5, device=device),
-        prompt_mask=torch.ones(1, prompt, dtype=torch.bool, device=device),
-        history=history,
-        actions=torch.zeros(1, policy.horizon, policy.action_dim, device=device),
-    )
+    if budget is None:
+        return policy
+    if policy.memory is None:
+        raise UserError(f"{model} has no memory, so no budget of {budget} tokens.")
+    return build_policy(model, backbone=backbone, device="meta", memory={"budget": budget})
 
 
 def all_models() -> list[str]:
@@ -98,19 +83,17 @@ def _check_attention_is_counted() -> None:
         raise UserError(f"This PyTorch ({torch.__version__}) counts {found} FLOPs for an attention of 1,024,000.")
 
 
-def _streamed(policy: MMEPolicy, batch: Batch) -> int | None:
-    memory, history = policy.memory, batch.history
-    if not isinstance(memory, RecurrentMemory) or history is None:
+def _streamed(policy: Policy, batch: Any) -> int | None:
+    memory = policy.memory
+    if not isinstance(memory, RecurrentMemory):
         return None
-    last = slice(-(memory.storage.grid**2), None)
+    history, last = batch.history, slice(-(memory.storage.grid**2), None)
     frame: Any = history.features[:, last], history.positions[:, last], history.mask[:, last]
     return flops(lambda: memory.read(memory.update(memory.init_state(1), *frame)))
 
 
-def _frames(policy: MMEPolicy) -> int:
+def _frames(policy: Policy) -> int:
     if policy.memory is None:
         return 0
-    size = policy.backbone.image_size
-    image = torch.empty(1, 3, size, size, device="meta")
     wanted = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
-    return wanted * flops(lambda: policy.backbone.encode_images(image))
+    return wanted * flops(policy.see_empty_frame)

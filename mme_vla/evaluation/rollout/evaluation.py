@@ -130,7 +130,7 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
     batches may change the last bits of an action.
     """
-    kept = ("seed", "split", "env", "max_steps", "flow_steps", "render")
+    kept = ("seed", "split", "env", "max_steps", "render")
     dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
     return {
         "model": facts.model,
@@ -140,6 +140,7 @@ def run_settings(
         "dtype": dtype,
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
+        "flow_steps": settings.flow_steps or policy.sample_steps,
         **{name: getattr(settings, name) for name in kept},
     }
 
@@ -164,7 +165,7 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
     """
     if subgoals is None:
         return
-    if not policy.require_processor().prompt_format.reads_subgoal:
+    if not policy.require_processor().reads_subgoal:
         raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
     kind = subgoal_kind(policy)
     if kind is not None and kind != f"{subgoals.kind}_subgoal":

@@ -31,7 +31,7 @@ class RolloutSettings:
     env: str = "mme_vla"
     max_steps: int = MAX_STEPS
     execute: int | None = None
-    flow_steps: int = 10
+    flow_steps: int | None = None
     workers: int | None = None
     max_batch: int = 16
     encode_chunk: int = 32
@@ -47,11 +47,11 @@ class RolloutSettings:
         ):  # fmt: skip
             if value not in known:
                 raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")
-        least = {"max_steps": 1, "flow_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
+        least = {"max_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
         for name, smallest in least.items():
             self._whole(name, getattr(self, name), smallest)
         self._whole("seed", self.seed, 0)
-        for name in ("workers", "execute"):
+        for name in ("workers", "execute", "flow_steps"):
             if getattr(self, name) is not None:
                 self._whole(name, getattr(self, name), 1)
         if not self.timeout_s > 0:
