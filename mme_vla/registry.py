@@ -94,14 +94,16 @@ class Registry[T]:
 
 MEMORIES: Registry[Any] = Registry("memory")
 INTEGRATIONS: Registry[Any] = Registry("integration")
-BACKBONES: Registry[Any] = Registry("backbone")
+BACKBONES: Registry[Any] = Registry("backbone", {"openvla": "mme_vla.backbone.openvla.backbone"})
 POLICIES: Registry[Any] = Registry(
     "policy",
-    {"mme": "mme_vla.policy.mme", "diffusion_policy": "mme_vla.policy.diffusion.policy"},
+    {"mme": "mme_vla.policy.mme", "diffusion_policy": "mme_vla.policy.diffusion.policy",
+     "openvla": "mme_vla.policy.openvla"},
 )
 PROCESSORS: Registry[Any] = Registry(
     "processor",
-    {"pi05": "mme_vla.processing.processor", "diffusion_policy": "mme_vla.policy.diffusion.processing"},
+    {"pi05": "mme_vla.processing.processor", "diffusion_policy": "mme_vla.policy.diffusion.processing",
+     "openvla": "mme_vla.processing.openvla"},
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")

@@ -100,13 +100,19 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(chosen)]).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in chosen])
         pairs = zip(self._source, self._episode, strict=True)
-        self._ends = np.cumsum([len(sources[s].decisions(int(e))) for s, e in pairs], dtype=np.int64)
+        self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
         if not len(self):
             raise UserError("The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
         """Number of steps at which the robot decides: all of the execution, or those before a planned motion."""
         return int(self._ends[-1]) if len(self._ends) else 0
+
+    def decisions(self, source: int, episode: int) -> Any:
+        """Frames of an episode at which the robot decides, without those that lack a full chunk where that counts."""
+        decisions = self.sources[source].decisions(episode)
+        short = self.processor.horizon - 1 if self.processor.full_chunks_only else 0
+        return decisions[: max(len(decisions) - short, 0)]
 
     @property
     def total_frames(self) -> int:
@@ -123,7 +129,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             raise IndexError(f"item {index} of {len(self)}")
         at = int(np.searchsorted(self._ends, index, side="right"))
         source, episode = int(self._source[at]), int(self._episode[at])
-        decisions = self.sources[source].decisions(episode)
+        decisions = self.decisions(source, episode)
         return source, episode, int(decisions[len(decisions) - (int(self._ends[at]) - index)])
 
     def step(self, index: int) -> Step:

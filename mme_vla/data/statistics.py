@@ -9,7 +9,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import NormStats, RunningStats
+from mme_vla.processing.normalisers import ExactStats, NormStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 
@@ -23,6 +23,7 @@ def compute_norm_stats(
     robot: Embodiment = ROBOMME_JOINT,
     every: bool = False,
     extremes: bool = False,
+    exact: bool = False,
 ) -> NormStats:
     """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are predicted.
 
@@ -35,6 +36,7 @@ def compute_norm_stats(
         horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
         seed: of the order. robot: says which numbers of an action are relative to the state.
         every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
+        exact: quantiles of all rows at once (linear interpolation), not of their histogram.
 
     Raises:
         UserError: fewer than two execution steps.
@@ -45,7 +47,7 @@ def compute_norm_stats(
     if not every:
         np.random.default_rng(seed).shuffle(steps)
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
-    states, actions = RunningStats(), RunningStats()
+    states, actions = (ExactStats() if exact else RunningStats() for _ in range(2))
     with progress("statistics", batches, unit="batches") as advance:
         for i in range(batches):
             rows = [_row(sources, step, horizon, action_offset) for step in steps[i * BATCH : (i + 1) * BATCH]]

@@ -46,12 +46,13 @@ class Counted:
     horizon: chunk steps of each observation that count, relative where the embodiment says so; None for the chunk's.
     every: every execution step once, in the data's order; else in shuffled batches of which an incomplete last one is
         left out, as the released code of π0.5 does.
-    extremes: keep the smallest and the largest value too.
+    extremes: keep the smallest and the largest value too. exact: quantiles of all rows at once, not of their histogram.
     """
 
     horizon: int | None = None
     every: bool = False
     extremes: bool = False
+    exact: bool = False
 
 
 class PolicyProcessor:
@@ -64,6 +65,8 @@ class PolicyProcessor:
     embodiment: Embodiment
     window: int = 1
     """Frames an observation consists of, the current one last; clamped at the episode's start."""
+    full_chunks_only: bool = False
+    """Whether steps with fewer recorded actions ahead of them than a chunk has are left out of training."""
     consecutive: bool = True
     """Whether the frames of the window follow each other in an episode; else they are those at which it was asked."""
     prompt_name: str = "plain"

@@ -22,7 +22,7 @@ from mme_vla.types import Batch
 class OpenVlaProcessor(Processor):
     """Lanczos-3 pictures, Llama's words, clipped quantiles of raw numbers, and the state for the network."""
 
-    counted = Counted(horizon=1, every=True, extremes=True)
+    counted = Counted(horizon=1, every=True, extremes=True, exact=True)
     full_chunks_only = True
     jpeg: bool = False
     """Write every picture as JPEG and read it again before it is resized, as the original's data were."""

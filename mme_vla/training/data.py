@@ -58,7 +58,7 @@ def prepare_data(
         counted = processor.counted
         processor.stats = compute_norm_stats(
             sources, split.train, counted.horizon or processor.horizon, offset, seed, policy.embodiment,
-            every=counted.every, extremes=counted.extremes,
+            every=counted.every, extremes=counted.extremes, exact=counted.exact,
         )  # fmt: skip
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None

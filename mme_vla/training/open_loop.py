@@ -66,7 +66,7 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     processor = policy.require_processor()
     horizon = policy.horizon
     source, episode, _ = samples.locate(0)
-    count = len(samples.sources[source].decisions(episode))
+    count = len(samples.decisions(source, episode))
     starts = np.arange(0, count, horizon)
     starts = starts[np.linspace(0, len(starts) - 1, min(chunks, len(starts))).round().astype(int)].tolist()
     predicted = []

@@ -42,7 +42,6 @@ class OpenVlaBackbone(Backbone):
 
     Config = OpenVlaConfig
     hosts = frozenset({"blocks"})
-    heads = ("state_token", "head")
     adapted = (
         *("patch_embed.proj", "attn.qkv", "attn.proj", "mlp.fc1", "mlp.fc2"),
         *("attn_pool.q", "attn_pool.kv", "attn_pool.proj"),
@@ -66,6 +65,7 @@ class OpenVlaBackbone(Backbone):
         self.vlm = Prismatic(config.vision, config.vlm, config.vocab_size)
         self.state_token = StateToken(config.state_dim, width) if config.state_dim else None
         self.head = ActionHead(width, config.action_dim)
+        self.heads = ("head",) if self.state_token is None else ("state_token", "head")
 
     @property
     def vision(self) -> Any:  # type: ignore[override]
