@@ -11,7 +11,7 @@ from torch import Tensor
 from mme_vla.backbone.memoryvla.dit import DitConfig
 from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.memory.bank import MemoryBank
-from mme_vla.policy.memoryvla_core import MemoryVlaConfig, MemoryVlaCore
+from mme_vla.policy.memoryvla.core import MemoryVlaConfig, MemoryVlaCore
 from mme_vla.weights.name_tables import read
 from mme_vla.weights.names.memoryvla import memoryvla_piece, memoryvla_table
 

@@ -9,7 +9,7 @@ from mme_vla.backbone.memoryvla.diffusion import Schedule
 from mme_vla.backbone.memoryvla.dit import Dit, DitConfig
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.memory.bank import BankState, MemoryBank, groups_of, runs_of
-from mme_vla.policy.memoryvla_core import MemoryVlaConfig, MemoryVlaCore
+from mme_vla.policy.memoryvla.core import MemoryVlaConfig, MemoryVlaCore
 from mme_vla.weights.names.memoryvla import memoryvla_table
 
 

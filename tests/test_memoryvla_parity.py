@@ -14,7 +14,7 @@ from torch import Tensor
 from mme_vla.backbone.layers.time import sin_cos
 from mme_vla.backbone.memoryvla.diffusion import Schedule
 from mme_vla.memory.bank import BankState, MemoryBank, groups_of, runs_of
-from mme_vla.policy.memoryvla_core import MemoryVlaCore, cognition_token
+from mme_vla.policy.memoryvla.core import MemoryVlaCore, cognition_token
 
 TOLERANCE, LONG = 1e-4, 1e-3  # of the largest entry: single modules; gradients, ten steps of sampling, acting
 ROLES = ["cog", "per"]

@@ -114,8 +114,8 @@ def test_what_this_backbone_cannot_do_is_refused_in_words() -> None:
         build_policy("openvla_oft_framesamp_context", integration={"prompt_sees_memory": False})
     with pytest.raises(UserError, match="'openvla' has no place for"):
         build_policy("framesamp_modul", backbone="openvla_tiny", embodiment="robomme_joint_absolute")
-    with pytest.raises(UserError, match=r"jpeg must be true or false"):
-        build_policy("openvla_oft", processor={"jpeg": "yes"})
+    with pytest.raises(UserError, match="as wide as the robot's"):
+        build_policy("openvla_oft", backbone={"action_dim": 32})
 
 
 def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from mme_vla.errors import UserError, brief, did_you_mean
 LARGEST, DEEPEST = 2**24, 2**10
 """Bounds of every size and of layers: far above any network here, and a damaged file's number ends in words."""
 
-_WORDS: Mapping[Any, str] = {int: "a whole number", float: "a number"}
+_WORDS: Mapping[Any, str] = {int: "a whole number", float: "a number", bool: "true or false"}
 
 
 class Sizes:
@@ -31,7 +31,7 @@ class Sizes:
             kind = known[key].type
             nested = isinstance(kind, type) and is_dataclass(kind)
             accepted = (Mapping, kind) if nested else (int, float) if kind is float else kind
-            if isinstance(value, bool) or not isinstance(value, accepted):  # type: ignore[arg-type]
+            if isinstance(value, bool) is not (kind is bool) or not isinstance(value, accepted):  # type: ignore[arg-type]
                 wanted = "a section" if nested else _WORDS.get(kind, "text")
                 raise UserError(f"{cls.__name__}.{key} must be {wanted}, not {brief(value)}.")
             built[key] = kind.from_dict(value) if nested and isinstance(value, Mapping) else value  # type: ignore[union-attr]

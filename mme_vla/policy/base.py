@@ -76,9 +76,7 @@ class Policy(Saved):
         """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
         return {}
 
-    def sample_actions(
-        self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
-    ) -> Tensor:
+    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
         """A normalised chunk [b, h, a].
 
         Args:

@@ -92,6 +92,15 @@ def centre_crop(images: Tensor) -> Tensor:
     return quantised(crop(flat.float() / 255, middle, middle).clamp(0, 1)).view(images.shape)
 
 
+def centre_cut(images: Tensor) -> Tensor:
+    """As `centre_crop`, but of whole pixels and resized back with Lanczos-3: how MemoryVLA shows pictures."""
+    size = images.shape[-1]
+    side = int(SIDE * size)
+    start = (size - side) // 2
+    cut = images[..., start : start + side, start : start + side].movedim(-3, -1)
+    return torch.from_numpy(lanczos(cut.cpu().numpy(), size)).movedim(-1, -3).to(images.device)
+
+
 def quantised(pixels: Tensor) -> Tensor:
     """[0, 1] → uint8, as TensorFlow's `convert_image_dtype` rounds: the floor of 255.5·x."""
     return (pixels * 255.5).floor().clamp(0, 255).to(torch.uint8)

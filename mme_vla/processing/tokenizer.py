@@ -78,6 +78,17 @@ class Tokenizer:
             raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
         return found
 
+    @property
+    def end(self) -> int:
+        """The id that ends a text.
+
+        Raises:
+            UserError: the model has none.
+        """
+        if self._processor.eos_id() < 0:
+            raise UserError(f"Tokenizer {self.spec!r} has no end-of-sequence token, which this policy's prompts need.")
+        return self._processor.eos_id()
+
     def decode(self, ids: list[int]) -> str:
         """Turn ids back into text; special tokens vanish."""
         return self._processor.decode(ids)

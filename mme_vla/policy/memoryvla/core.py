@@ -16,6 +16,18 @@ from mme_vla.memory.bank import BankState, MemoryBank
 
 
 @dataclass(frozen=True)
+class BankConfig(Sizes):
+    """Both banks' options; see `MemoryBank`."""
+
+    length: int = 16
+    retrieval_layers: int = 2
+    time_code: bool = True
+    fusion: str = "gate"
+    consolidation: str = "tome"
+    store_fused: bool = False
+
+
+@dataclass(frozen=True)
 class MemoryVlaConfig(Sizes):
     """Sizes of MemoryVLA, and how its head is trained and asked.
 
@@ -27,6 +39,7 @@ class MemoryVlaConfig(Sizes):
     vision: FusedVisionConfig = field(default_factory=FusedVisionConfig)
     vlm: LlamaConfig = field(default_factory=LlamaConfig)
     head: DitConfig = field(default_factory=DitConfig)
+    bank: BankConfig = field(default_factory=BankConfig)
     vocab_size: int = 32_064
     perceptual_width: int = 256
     compression_width: int = 512
