@@ -1,4 +1,4 @@
-"""OpenVLA-OFT as a policy: its five compositions learn, act, are trained by the command and go on where they stopped."""
+"""OpenVLA-OFT as a policy: its five compositions learn and act, and refuse what they cannot do."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -49,8 +49,8 @@ def load_policy(
     Raises:
         UserError: neither a checkpoint nor a model is named, or both (or a part of one), or there is no such device.
     """
-    from mme_vla.policy.build import build_from_config
     from mme_vla.policy.base import Policy
+    from mme_vla.policy.build import build_from_config
     from mme_vla.training.checkpoint import LATEST, resolve_checkpoint
 
     device = find_device(cfg.device) if device is None else device

@@ -19,8 +19,8 @@ from mme_vla.config.composition import compose, config_dir
 from mme_vla.errors import UserError
 from mme_vla.evaluation.results.cost_table import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
-from mme_vla.policy.build import build_policy
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_policy
 
 
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
