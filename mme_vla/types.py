@@ -11,9 +11,6 @@ from typing import Any, Self
 
 from torch import Tensor
 
-GRID = 16
-"""Side of a view's token grid; memories pool it, and token positions count in its lines."""
-
 
 class TensorStruct:
     """A dataclass of tensors (or nested structs, or None) that moves between devices as one."""
@@ -54,7 +51,7 @@ class HistoryTokens(TensorStruct):
 
     features: [b, n, d_vision]; pooled vision tokens.
     positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's first,
-        video included, the rest patch centres in units of the 16×16 grid's lines.
+        video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.
     """
 

@@ -15,7 +15,6 @@ from mme_vla import UserError, build_policy
 from mme_vla.backbone.pi05 import gemma
 from mme_vla.commands.analyse import main
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.previews import write_film
 from mme_vla.evaluation.analyses.attention_mass import AttentionWatch
 from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.evaluation.analyses.modulation import ModulationWatch
@@ -24,6 +23,7 @@ from mme_vla.evaluation.analyses.recurrence_plot import recurrence_plot
 from mme_vla.evaluation.analyses.replay import replay
 from mme_vla.evaluation.analyses.rerun_log import RerunLog
 from mme_vla.evaluation.results.cost_table import counted
+from mme_vla.media import of_one_size, write_film
 from mme_vla.testing.small import random_batch, small_policy, unit_stats
 
 
@@ -141,7 +141,7 @@ def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSo
 
 def test_pictures_of_any_size_become_a_video(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b.mp4"
-    write_film([Image.new("RGB", size, (200, 30, 30)) for size in ((64, 40), (101, 57))], path)
+    write_film(of_one_size([Image.new("RGB", size, (200, 30, 30)) for size in ((64, 40), (101, 57))]), path)
     with av.open(str(path)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     assert [frame.shape for frame in frames] == [(58, 102, 3)] * 2

@@ -160,7 +160,7 @@ def test_the_gradient_of_every_parameter(golden: Any) -> None:
 
 
 def test_a_sample_and_what_is_executed_of_it(golden: Any) -> None:
-    for policy, arrays, about in golden.values():
+    for policy, arrays, _ in golden.values():
         batch = batch_of(arrays, policy)
         draws = {"noise": arrays["in/sample_noise"], "added": arrays["in/step_noise"].transpose(0, 1)}
         chunk = policy.sample_actions(batch, draws)

@@ -19,6 +19,7 @@ from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
+from mme_vla.media import GAP, MARGIN, TILE
 
 SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3)  # a single move
 ONE_OF_EACH_SUITE = {"StopCube": "easy", "VideoUnmask": "easy", "PickHighlight": "easy", "RouteStick": "easy"}
@@ -114,7 +115,7 @@ def test_an_episode_of_each_suite_is_drawn_to_its_success(task: str, difficulty:
     assert all(shot.picture.shape == (256, 256, 3) and shot.picture.std() > 10 for shot in snapshots)
     changed = [np.abs(a.picture.astype(int) - b.picture).mean() for a, b in pairwise(snapshots)]
     assert max(changed) > 1, "nothing moves"
-    assert show.strip(snapshots, tiles=4).width == 4 * (show.TILE + show.GAP) - show.GAP
+    assert show.strip(snapshots, tiles=4).width == 2 * MARGIN + 4 * (TILE + GAP) - GAP
 
 
 def test_the_first_waypoint_of_the_execution_is_not_lost_with_those_of_the_video() -> None:

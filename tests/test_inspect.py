@@ -19,7 +19,8 @@ from mme_vla.commands.inspect import (
 )
 from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.memory_picture import MARGIN, TILE, contact_sheet
+from mme_vla.data.memory_picture import memory_sheet
+from mme_vla.media import MARGIN, TILE
 
 
 @pytest.fixture
@@ -58,7 +59,7 @@ def test_a_memory_is_drawn_as_it_selects(sample: EpisodeSource, console: Console
 def test_remembered_patches_keep_their_colour_and_others_are_dimmed() -> None:
     frames = np.zeros((3, 64, 64, 3), np.uint8)
     frames[..., 0] = 200
-    sheet = contact_sheet(frames, np.array([[0, 0]]), grid=4, exec_start=1, step=2, title="x")
+    sheet = memory_sheet(frames, np.array([[0, 0]]), grid=4, exec_start=1, step=2, title="x")
     top = sheet.height - MARGIN - TILE - 32
     inside = sheet.getpixel((MARGIN + TILE // 8, top + TILE // 8))
     outside = sheet.getpixel((MARGIN + TILE * 7 // 8, top + TILE * 7 // 8))
@@ -71,7 +72,7 @@ def test_remembered_patches_keep_their_colour_and_others_are_dimmed() -> None:
 def test_more_frames_than_fit_are_counted() -> None:
     frames = np.zeros((80, 16, 16, 3), np.uint8)
     selected = np.array([[frame, 0] for frame in range(80)])
-    assert contact_sheet(frames, selected, 2, 0, 79, "t" * 500).height < 2000
+    assert memory_sheet(frames, selected, 2, 0, 79, "t" * 500).height < 2000
 
 
 def test_a_checkpoint_shows_its_parts(tmp_path: Path, console: Console) -> None:

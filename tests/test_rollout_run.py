@@ -21,10 +21,10 @@ from mme_vla.envs.vector.jobs import Job
 from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import checkpoint_label, default_output, memory_budget
-from mme_vla.evaluation.rollout.film import BORDER, RED, compose_frame
 from mme_vla.evaluation.rollout.plan import Shard, choose_episodes, choose_shard, take_share
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.media import BORDER, RED, film_frame
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch
 
@@ -244,10 +244,10 @@ def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp
 
 def test_a_caption_stands_below_the_pictures() -> None:
     front, wrist = np.zeros((64, 64, 3), np.uint8), np.full((64, 64, 3), 9, np.uint8)
-    bare, told = (compose_frame(front, wrist, text, demo=False) for text in (None, "press the button"))
+    bare, told = (film_frame([front, wrist], text) for text in (None, "press the button"))
     assert bare.shape == (88, 128, 3) and np.array_equal(bare[:64], told[:64])
     assert told[64:].max() > 200 and bare[64:].max() == 0
-    demo = compose_frame(front, wrist, None, demo=True)
+    demo = film_frame([front, wrist], video=True)
     assert (demo[:BORDER, :128] == RED).all() and (demo[BORDER : 64 - BORDER, BORDER : 128 - BORDER].max() <= 9)
 
 

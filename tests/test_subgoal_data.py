@@ -13,10 +13,10 @@ from mme_vla.commands import subgoal_build
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
+from mme_vla.subgoal.clips import Clip, read_image, sample_video
 from mme_vla.subgoal.finetuning import collecting as module
 from mme_vla.subgoal.finetuning.collecting import build, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, resting_frames, selected_steps, transitions, windows
-from mme_vla.subgoal.finetuning.media import Clip, read_image, sample_video
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
 from mme_vla.subgoal.finetuning.swift import command, write_arguments
 

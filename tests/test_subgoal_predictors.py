@@ -8,7 +8,7 @@ import pytest
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal import Memer, Oracle, QwenVL, build_predictor
-from mme_vla.subgoal.finetuning.media import Clip
+from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
 from mme_vla.subgoal.models.tiny import save_tiny
 

@@ -13,11 +13,11 @@ from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.run_file import claim_run, read_run
 from mme_vla.files import read_text, write_sums
+from mme_vla.media import film_bytes, png_bytes
 from mme_vla.play.game import Option
 from mme_vla.play.questions import parse_choice
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.examples import RowDataset
-from mme_vla.subgoal.finetuning.media import write_mp4, write_png
 from mme_vla.subgoal.models.api import Api, Reply, Settings
 from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
 
@@ -102,8 +102,8 @@ class _Words:
 def write_rows(folder: Path) -> None:
     """Two rows, one with a picture and a point, one with a video."""
     pictures = np.random.default_rng(0).integers(0, 255, (12, 32, 32, 3), np.uint8)
-    write_png(pictures[0], folder / "a.png")
-    write_mp4(pictures, folder / "a.mp4")
+    (folder / "a.png").write_bytes(png_bytes(pictures[0]))
+    (folder / "a.mp4").write_bytes(film_bytes(pictures))
     rows: list[dict[str, Any]] = [
         {
             "messages": _messages("<image> What next?", "pick up at <bbox>"),

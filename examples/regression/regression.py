@@ -44,7 +44,7 @@ class Regression(Backbone):
         width, vision = config.vlm.width, config.vision
         self.vision_width = self.token_width = width
         self.depth, self.head_dim = config.depth, width // config.num_heads
-        self.horizon, self.action_dim = config.horizon, config.action_dim
+        self.horizon, self.action_dim, self.vocab_size = config.horizon, config.action_dim, config.vocab_size
         self.image_size, self.grid = vision.image_size, vision.image_size // vision.patch_size
         self.vision = nn.Conv2d(3, width, vision.patch_size, vision.patch_size)
         self.words, self.order = nn.Embedding(config.vocab_size, width), nn.Embedding(1024, width)

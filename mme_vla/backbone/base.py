@@ -42,7 +42,7 @@ class Backbone(nn.Module):
     """A vision tower, a language model and a head that answers with actions. It knows nothing of memory.
 
     A subclass is made from its sizes and the experts that an integration asks for, and sets:
-        Config: the class of its sizes; `Config.from_dict(section)` reads them, and integrations are built from them.
+        Config: the dataclass of its sizes, read from the section `backbone`; integrations are built from it.
         vision_width: width d_vision of the tokens a memory stores. token_width: of the tokens in the prefix.
         answer_width: of the residual stream that a hook changes (0: there is none).
         depth: layers of that stream. head_dim: width of one attention head.
@@ -50,6 +50,7 @@ class Backbone(nn.Module):
         horizon, action_dim: of the chunk [h, a] it answers with.
         sample_steps: of an iterative head, unless told otherwise.
         image_size: side of the square pictures it reads.
+        vocab_size: words it knows; None where it does not say.
         hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition` and `beside`.
 
     and implements the methods below. Losses and samples are its own affair (a flow, a regression, a diffusion): whoever
@@ -67,6 +68,7 @@ class Backbone(nn.Module):
     action_dim: int
     sample_steps: int = 1
     image_size: int
+    vocab_size: int | None = None
     hosts: frozenset[str] = frozenset({"blocks"})
 
     @property

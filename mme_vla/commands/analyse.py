@@ -143,8 +143,8 @@ def selection(args: argparse.Namespace) -> None:
     from mme_vla.commands.inspect import build_memory
     from mme_vla.config.composition import compose
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.data.previews import write_film
     from mme_vla.evaluation.analyses.selection import selection_sheets
+    from mme_vla.media import of_one_size, write_film
 
     source = EpisodeSource(args.dataset)
     memory = build_memory(compose("inspect", [f"memory={args.memory}", *args.set]))
@@ -156,7 +156,7 @@ def selection(args: argparse.Namespace) -> None:
                 log.views(source, args.episode, step)
                 log.picture("remembered", sheet)
     path = args.output or Path("outputs/analyse") / f"{source.name}_episode{args.episode}_{args.memory}.mp4"
-    write_film(sheets, path, args.fps)
+    write_film(of_one_size(sheets), path, fps=args.fps)
     sheets[-1].save(path.with_suffix(".png"))
     print(f"wrote {path} ({len(sheets)} pictures) and {path.with_suffix('.png')}")
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.config.composition import cli
+from mme_vla.config.sections import read_section
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 
@@ -17,6 +18,8 @@ def main(cfg: DictConfig) -> None:
     if cfg.episodes is not None:
         episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
     output = Path(cfg.output)
-    written = convert(episodes, output, ConvertOptions(images=cfg.images, fps=cfg.fps, **cfg.video))
+    written = convert(
+        episodes, output, read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps)
+    )
     already = len(episodes) - written
     print(f"{output}: {len(episodes)} episodes ({written} written now, {already} already there).")

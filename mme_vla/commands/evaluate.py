@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.commands.loading import load_policy, words_of
 from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.config.devices import find_device
-from mme_vla.config.variant import composition_digest
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.policy.digest import composition_digest
 
 if TYPE_CHECKING:
     import torch

@@ -6,20 +6,20 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image, ImageDraw
 
 from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.errors import UserError
+from mme_vla.media import RED, Tile, contact_sheet, spread
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
+    from PIL.Image import Image
 
     from mme_vla.envs.task import Task
 
-TILE, GAP, CAPTION = 176, 6, 18  # pixels
-VIDEO_RED, INK = (200, 33, 33), (60, 60, 60)
+COLUMNS = 4  # pictures a row
 EVERY = 8
 """Steps between two pictures that are taken; which of them are shown is decided at the end."""
 
@@ -61,21 +61,14 @@ def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Sn
     return snapshots, success
 
 
-def strip(snapshots: Sequence[Snapshot], tiles: int) -> Image.Image:
+def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
     """Some of the snapshots side by side, spread evenly, each with its step; video frames have a red border."""
-    chosen = [snapshots[i] for i in np.unique(np.linspace(0, len(snapshots) - 1, tiles).round().astype(int))]
-    columns = min(4, len(chosen))
-    rows = -(-len(chosen) // columns)
-    sheet = Image.new("RGB", (columns * (TILE + GAP) - GAP, rows * (TILE + CAPTION)), "white")
-    draw = ImageDraw.Draw(sheet)
-    for i, shot in enumerate(chosen):
-        x, y = i % columns * (TILE + GAP), i // columns * (TILE + CAPTION)
-        sheet.paste(Image.fromarray(shot.picture).resize((TILE, TILE), Image.Resampling.LANCZOS), (x, y))
-        if shot.video:
-            draw.rectangle((x, y, x + TILE - 1, y + TILE - 1), outline=VIDEO_RED, width=4)
-        kind = "video, step" if shot.video else "step"
-        draw.text((x + 2, y + TILE + 3), f"{kind} {shot.step}", INK)
-    return sheet
+    chosen = [snapshots[i] for i in spread(len(snapshots), tiles)]
+    labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in chosen]
+    pictures = [
+        Tile(shot.picture, label, RED if shot.video else None) for shot, label in zip(chosen, labels, strict=True)
+    ]
+    return contact_sheet(pictures, COLUMNS)
 
 
 def page(entries: Sequence[tuple[str, str, str]]) -> str:

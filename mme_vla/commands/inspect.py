@@ -147,15 +147,14 @@ def build_memory(cfg: DictConfig) -> "Memory":
     """The memory the configuration names, of any width: it is only asked to select.
 
     Raises:
-        UserError: an unknown memory or option.
+        UserError: an unknown backbone, memory or option.
     """
-    from omegaconf import OmegaConf
+    from mme_vla.backbone.shape import shape_of
+    from mme_vla.policy import mme
 
-    import mme_vla.memory  # noqa: F401  (registers what ships)
-    from mme_vla.registry import MEMORIES
-
-    options: Any = OmegaConf.to_container(cfg.memory, resolve=True)
-    return MEMORIES.build(options, d_vision=cfg.backbone.vlm.width, width=cfg.backbone.action.width)
+    chosen: Any = OmegaConf.to_container(cfg, resolve=True)
+    backbone = shape_of(chosen["backbone"])
+    return mme.build_memory(chosen["memory"], backbone, backbone.token_width)
 
 
 def draw_memory(
@@ -168,7 +167,7 @@ def draw_memory(
     console: "Console",
 ) -> Path:
     """Draw what `memory` remembers at `step` into a PNG in `folder`, and print it in numbers."""
-    from mme_vla.data.memory_picture import contact_sheet
+    from mme_vla.data.memory_picture import memory_sheet
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
@@ -186,7 +185,7 @@ def draw_memory(
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
     title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
     start = int(source.exec_starts[episode])
-    contact_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
+    memory_sheet(frames, selected, memory.storage.grid, start, step, title).save(path)
     return path
 
 

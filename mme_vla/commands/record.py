@@ -125,11 +125,12 @@ def run(cfg: "DictConfig") -> None:
     Raises:
         UserError: something that the configuration asks for is not possible; nothing that exists is overwritten.
     """
+    from mme_vla.config.sections import read_section
     from mme_vla.data.conversion import ConvertOptions
 
     if not cfg.lerobot and cfg.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
-    options = ConvertOptions(images=cfg.images, fps=cfg.fps, **cfg.video)
+    options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps)
     jobs = plan(cfg)
     wanted = Wanted(jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5))
     places = ", ".join(map(str, wanted.places))

@@ -6,6 +6,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig
 
 from mme_vla.config.composition import cli
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.subgoal.finetuning.collecting import build, open_input
 from mme_vla.subgoal.finetuning.rows import SETS, RowOptions
@@ -23,7 +24,7 @@ def main(cfg: DictConfig) -> dict[str, int]:
         if name not in SETS:
             raise UserError(f"sets: there is no {name!r}; known: {', '.join(SETS)}.")
     noise = None if cfg.noise is None else tuple(_list(cfg, "noise", int))
-    options = RowOptions(noise=noise, seed=cfg.seed, **cfg.rows)
+    options = read_section(RowOptions, cfg.rows, "rows", noise=noise, seed=cfg.seed)
     episodes = [episode for entry in inputs for episode in open_input(entry, tasks)]
     episodes = [episode for episode in episodes if numbers is None or episode.number in numbers]
     output = Path(cfg.output)

@@ -1,4 +1,4 @@
-"""What a composition is called, and a digest that tells compositions apart.
+"""What a composition is called.
 
 A model's name stands in folders, cards and records, so it must be true: `memory=framesamp integration=modulator` on
 top of another model is `framesamp_modul`, and a composition that no file of `configs/model` describes gets a name of
@@ -12,9 +12,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
-
-from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.embodiment.robomme import embodiment_of
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
@@ -37,9 +34,9 @@ def decisive(cfg: DictConfig) -> Sections:
         if key in cfg:
             value = cfg[key]
             plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-            found |= _flat({key: plain})
+            found |= flat({key: plain})
     if "policy" in cfg:
-        found |= _of_policy(cfg.policy)
+        found |= of_policy(cfg.policy)
     return {key: value for key, value in found.items() if value is not None and key not in FREE}
 
 
@@ -78,22 +75,6 @@ def variant_name(
     return f"{name}-{_suffix(_differences(plain or {}, sections), words=plain is not None)}"
 
 
-def composition_digest(config: Mapping[str, Any]) -> str:
-    """Twelve letters that are equal for two policies exactly if they are composed alike, sizes included.
-
-    Args:
-        config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was trained on and in
-            which precision it computes do not count; nor do keys that are not set, so that a later option with an
-            empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
-    """
-    kept = _flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | _of_policy(config.get("policy") or {})
-    kept = {key: value for key, value in kept.items() if value is not None and key != "processor.tokenizer"}
-    robot = embodiment_of(config)
-    if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
-        kept |= _flat({"embodiment": robot.to_dict()})
-    return _digest(kept, 12)
-
-
 def _parts(sections: Sections) -> tuple[str, str]:
     members = sections.get("memory.members")
     joined = [str(m.get("name") if isinstance(m, Mapping) else m) for m in members or ()]
@@ -104,7 +85,7 @@ def _kind(sections: Sections) -> tuple[str, ...]:
     return (str(sections.get(POLICY, "")), *_parts(sections))
 
 
-def _of_policy(section: Mapping[str, Any]) -> Sections:
+def of_policy(section: Mapping[str, Any]) -> Sections:
     """The kind of policy, where it is not the usual one, which configurations did not use to name."""
     name = section.get("name", USUAL_POLICY)
     return {} if name == USUAL_POLICY else {POLICY: name}
@@ -118,7 +99,7 @@ def _differences(base: Sections, sections: Sections) -> Sections:
 def _suffix(differences: Sections, words: bool = True) -> str:
     """The differences in words where these are short, else a digest of them."""
     text = "-".join(f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items())
-    return text if words and len(text) <= LONGEST else _digest(differences, 6)
+    return text if words and len(text) <= LONGEST else digest(differences, 6)
 
 
 def _word(value: Any) -> str:
@@ -126,13 +107,15 @@ def _word(value: Any) -> str:
     return re.sub(r"[^\w.]+", "_", plain).strip("_.")
 
 
-def _digest(values: Mapping[str, Any], letters: int) -> str:
+def digest(values: Mapping[str, Any], letters: int) -> str:
+    """So many letters that are equal for equal values, whatever their order."""
     text = json.dumps(values, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:letters]
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
-    flat: Sections = {}
+def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
+    """Nested sections as one, under dotted keys."""
+    found: Sections = {}
     for key, value in values.items():
-        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return flat
+        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return found

@@ -18,6 +18,7 @@ import numpy as np
 from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries
+from mme_vla.embodiment.robomme import ARM_JOINTS, POSE
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
@@ -53,15 +54,15 @@ class ConvertOptions:
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
     """The dataset's columns, under the names of the released LeRobot datasets."""
-    tool = ["x", "y", "z", "roll", "pitch", "yaw", "gripper"]
-    joints = [*(f"joint{i}" for i in range(1, 8)), "gripper"]
+    tool = [*POSE, "gripper"]
+    joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
     kind = "video" if options.images == "video" else "image"
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
     return {
         "image": dict(view),
         "wrist_image": dict(view),
-        "state": {"dtype": "float32", "shape": (8,), "names": joints},
-        "actions": {"dtype": "float32", "shape": (8,), "names": joints},
+        "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
+        "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},

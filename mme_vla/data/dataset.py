@@ -41,9 +41,10 @@ class Step:
 class TrainingDataset(Dataset[dict[str, Any]]):
     """Execution steps of several datasets, source by source, episode by episode, step by step.
 
-    Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside them. They depend
-    on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data: tables and token
-    caches are memory-mapped, and an item decodes only the pictures of its window, most often the current ones.
+    Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside
+    them. They depend on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data:
+    tables and token caches are memory-mapped, and an item decodes only the pictures of its window, most often the
+    current ones.
     """
 
     def __init__(
@@ -168,7 +169,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
-        source = self.sources[step.source]
         rng = np.random.default_rng([self.seed, self.epoch, index])
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
         item = self.processor.item(self._sample(step, subgoal)) | {

@@ -1,15 +1,16 @@
 """A memory as a picture: a timeline of how much is remembered of each frame, and the frames themselves."""
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 
-TILE, GAP, COLUMNS, MOST = 160, 12, 8, 47  # pixels, pixels, tiles a row, remembered frames shown at most
-MARGIN, TIMELINE, LABEL = 20, 90, 20  # pixels
-INK, FAINT = (40, 40, 40), (150, 150, 150)
+from mme_vla.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
+
+COLUMNS, MOST = 8, 47  # tiles a row, remembered frames shown at most
+TIMELINE = 90  # pixels
 VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
 
 
-def contact_sheet(
+def memory_sheet(
     frames: np.ndarray, selected: np.ndarray, grid: int, exec_start: int, step: int, title: str
 ) -> Image.Image:
     """Draw what is remembered at `step`.
@@ -27,38 +28,26 @@ def contact_sheet(
     if len(remembered) > MOST:  # the first frame, and those of which most is kept
         fullest = remembered[np.argsort(-counts[remembered], kind="stable")[:MOST]]
         shown = np.unique(np.append(fullest, remembered[0]))[:MOST]
-    tiles = [*shown.tolist(), None]
-    columns = min(COLUMNS, len(tiles))
-    rows = -(-len(tiles) // columns)
-    width = 2 * MARGIN + max(columns, 6) * (TILE + GAP) - GAP
-    top = 2 * MARGIN + LABEL + TIMELINE + 2 * LABEL
-    sheet = Image.new("RGB", (width, top + rows * (TILE + LABEL + GAP) + MARGIN), "white")
-    draw = ImageDraw.Draw(sheet)
-    draw.text((MARGIN, MARGIN), fitted(title, width - 2 * MARGIN, 17), INK, font(17))
-    _timeline(draw, counts, grid**2, exec_start, step, (MARGIN, 2 * MARGIN + LABEL, width - MARGIN, TIMELINE))
+    tiles = []
+    for frame in shown.tolist():
+        patches = selected[selected[:, 0] == frame, 1]
+        kind, colour = ("video", VIDEO) if frame < exec_start else ("execution", EXECUTION)
+        label = f"{frame} {kind} {len(patches)}/{grid**2}"
+        tiles.append(Tile(np.asarray(_highlighted(frames[frame], patches, grid)), label, colour))
+    tiles.append(Tile(frames[step], f"now: frame {step}", NOW))
+    header = Image.new("RGB", (max(min(COLUMNS, len(tiles)), 6) * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), "white")
+    draw = ImageDraw.Draw(header)
+    _timeline(draw, counts, grid**2, exec_start, step, (0, 0, header.width, TIMELINE))
     hidden = len(remembered) - len(shown)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
     note += f" {hidden} more frames are remembered in part." if hidden else ""
-    draw.text((MARGIN, top - LABEL - 4), note, FAINT, font(13))
-    for place, frame in enumerate(tiles):
-        x = MARGIN + (place % columns) * (TILE + GAP)
-        y = top + (place // columns) * (TILE + LABEL + GAP)
-        if frame is None:
-            tile, label, colour = _thumbnail(frames[step]), f"now: frame {step}", NOW
-        else:
-            patches = selected[selected[:, 0] == frame, 1]
-            tile = _highlighted(frames[frame], patches, grid)
-            kind, colour = ("video", VIDEO) if frame < exec_start else ("execution", EXECUTION)
-            label = f"{frame} {kind} {len(patches)}/{grid**2}"
-        sheet.paste(tile, (x, y))
-        draw.rectangle((x - 2, y - 2, x + TILE + 1, y + TILE + 1), outline=colour, width=2)
-        draw.text((x, y + TILE + 3), label, INK, font(13))
-    return sheet
+    draw.text((0, header.height - LABEL - 4), note, FAINT, font(13))
+    return contact_sheet(tiles, COLUMNS, title, header)
 
 
 def _highlighted(frame: np.ndarray, patches: np.ndarray, grid: int) -> Image.Image:
     """The frame, bright in the remembered patches and outlined around them."""
-    picture = _thumbnail(frame)
+    picture = thumbnail(frame)
     mask = np.isin(np.arange(grid**2), patches).reshape(grid, grid)
     large = Image.fromarray(mask.astype(np.uint8) * 255).resize((TILE, TILE), Image.Resampling.NEAREST)
     grey = picture.convert("L").convert("RGB")
@@ -100,21 +89,3 @@ def _timeline(
     for frame, text in phases.items():
         x = min(left + frame * scale, right - draw.textlength(text, font(13)))
         draw.text((x, bottom + 3), text, INK, font(13))
-
-
-def _thumbnail(frame: np.ndarray) -> Image.Image:
-    return Image.fromarray(frame).resize((TILE, TILE), Image.Resampling.LANCZOS)
-
-
-def font(size: int) -> "ImageFont.FreeTypeFont | ImageFont.ImageFont":
-    return ImageFont.load_default(size)
-
-
-def fitted(text: str, width: int, size: int) -> str:
-    """The text, cut with an ellipsis where it is too long for `width` pixels."""
-    face = font(size)
-    if face.getlength(text) <= width:
-        return text
-    while text and face.getlength(text + "…") > width:
-        text = text[:-1]
-    return text.rstrip() + "…"

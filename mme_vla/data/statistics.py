@@ -37,7 +37,8 @@ def compute_norm_stats(
         horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
         seed: of the order. robot: says which numbers of an action are relative to the state.
         every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
-        exact: quantiles of all rows at once (linear interpolation), not of their histogram. video: count the conditioning video's steps too.
+        exact: quantiles of all rows at once (linear interpolation), not of their histogram.
+        video: count the conditioning video's steps too.
 
     Raises:
         UserError: fewer than two execution steps.

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Self
 
+from mme_vla.config.sections import section_keys
 from mme_vla.embodiment import fields
 from mme_vla.errors import UserError, brief
 
@@ -50,7 +51,7 @@ class ActionSpace:
             UserError: an unknown or missing key, or a value that cannot be.
         """
         where = "embodiment.action"
-        found = fields.section(given, where, _KEYS, required=("width",))
+        found = section_keys(given, where, _KEYS, required=("width",))
         width = fields.whole(found["width"], f"{where}.width")
         horizon = fields.whole(found.get("horizon", 20), f"{where}.horizon")
         execute = fields.whole(found.get("execute", min(16, horizon)), f"{where}.execute")

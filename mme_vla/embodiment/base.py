@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
+from mme_vla.config.sections import section_keys
 from mme_vla.embodiment import fields
 from mme_vla.embodiment.actions import ActionSpace
 from mme_vla.errors import UserError, brief, did_you_mean
@@ -69,14 +70,14 @@ class Embodiment:
         Raises:
             UserError: an unknown or missing key, or a value that cannot be; it is named.
         """
-        found = fields.section(given, "embodiment", _KEYS, required=("name", "cameras", "state", "action"))
+        found = section_keys(given, "embodiment", _KEYS, required=("name", "cameras", "state", "action"))
         cameras = _cameras(found["cameras"])
         names = [camera.name for camera in cameras]
         memory_camera = found.get("memory_camera") or names[0]
         if memory_camera not in names:
             near = did_you_mean(str(memory_camera), names)
             raise UserError(f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}")
-        state = fields.section(found["state"], "embodiment.state", ("key", "width"), required=("width",))
+        state = section_keys(found["state"], "embodiment.state", ("key", "width"), required=("width",))
         width = fields.whole(state["width"], "embodiment.state.width")
         fps, video = found.get("fps"), found.get("conditioning_video", False)
         if fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000):
@@ -134,7 +135,7 @@ def _cameras(given: Any) -> tuple[Camera, ...]:
     cameras = []
     for name, settings in given.items():
         where = f"embodiment.cameras.{name}"
-        found = fields.section(settings or {}, where, ("key", "augment"))
+        found = section_keys(settings or {}, where, ("key", "augment"))
         augment, key = found.get("augment", "all"), found.get("key")
         if augment not in AUGMENTATIONS:
             raise UserError(f"{where}.augment={brief(augment)}. {did_you_mean(str(augment), AUGMENTATIONS)}")

@@ -1,29 +1,12 @@
 """Reading the values of an embodiment's section, each refused under its own key."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from mme_vla.errors import UserError, brief, did_you_mean, listed
+from mme_vla.errors import UserError, brief
 
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
-
-
-def section(given: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
-    """A mapping with no unknown and no missing key.
-
-    Raises:
-        UserError: it is something else; `where` names it.
-    """
-    if not isinstance(given, Mapping):
-        raise UserError(f"{where} must be a section of keys, got {brief(given)}.")
-    for key in given:
-        if key not in known:
-            raise UserError(f"Unknown key {where}.{brief(key, quote=False)}. {did_you_mean(str(key), list(known))}")
-    for key in required:
-        if given.get(key) is None:
-            raise UserError(f"{where} lacks the key {key!r}; it has {listed(list(map(str, given))) or 'none'}.")
-    return {str(key): value for key, value in given.items()}
 
 
 def columns(given: Any, where: str) -> tuple[str, ...]:

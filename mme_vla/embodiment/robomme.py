@@ -10,8 +10,12 @@ from mme_vla.embodiment.base import Camera, Embodiment, State
 from mme_vla.errors import UserError
 
 ARM_JOINTS = 7
+POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Of the tool, in the world: metres and radians."""
 CAMERAS = ("front", "wrist")
 """What the benchmark's environments show."""
+SIDE = 256
+"""Of the benchmark's pictures, in pixels; points of subgoals and choices are pixels of its front picture."""
 
 ROBOMME_JOINT = Embodiment(
     name="robomme_joint",

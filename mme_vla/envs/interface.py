@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 import torch
 
+from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
 from mme_vla.envs.robot.control import PlanningError
@@ -265,7 +266,7 @@ class RoboMMEEnv(gymnasium.Env):
                 {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}
                 for choice in task.choices()
             ]
-        for name in ("front", "wrist"):
+        for name in CAMERAS:
             if getattr(self.include, f"{name}_camera_intrinsic"):
                 info[f"{name}_camera_intrinsic"] = INTRINSIC.copy()
         return info

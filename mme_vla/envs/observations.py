@@ -11,6 +11,7 @@ import gymnasium
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from mme_vla.embodiment.robomme import ARM_JOINTS, SIDE
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -18,11 +19,10 @@ if TYPE_CHECKING:
 
     from mme_vla.envs.task import Task
 
-IMAGE_SIZE = 256
-FOCAL_LENGTH = 128.0  # pixels: 90 degrees over 256 pixels
-INTRINSIC = np.array([[FOCAL_LENGTH, 0, 128], [0, FOCAL_LENGTH, 128], [0, 0, 1]], np.float32)
+FOCAL_LENGTH = SIDE / 2  # pixels: the side is seen under 90 degrees
+INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], [0, 0, 1]], np.float32)
 """Intrinsic matrix of both cameras, [3, 3]."""
-CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
+SENSORS = {"front": "base_camera", "wrist": "hand_camera"}
 """The benchmark's names of the cameras, and the simulator's."""
 _FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2])
 
@@ -120,7 +120,7 @@ class Observer:
         """The present moment; `info` is what the task has just evaluated."""
         qpos = self.task.qpos
         frame: dict[str, Any] = {
-            "joint_state": qpos[:7].astype(np.float32),
+            "joint_state": qpos[:ARM_JOINTS].astype(np.float32),
             "eef_state": self._eef.copy(),
             "gripper_state": np.zeros(2) if self.task.stick else qpos[-2:].astype(np.float32),
         }
@@ -128,7 +128,7 @@ class Observer:
             frame["maniskill_obs"] = type(self.task).get_obs(self.task, info)
         elif self.render:
             self._take_pictures()
-        for name, camera in CAMERAS.items():
+        for name, camera in SENSORS.items():
             if self.render:
                 depth = getattr(self.include, f"{name}_depth")
                 images = self._read(camera, rgb=True, depth=depth)
@@ -141,7 +141,7 @@ class Observer:
 
     def segmentation(self) -> np.ndarray:
         """Object ids [256, 256] of the front picture that was taken last; nothing is rendered for it."""
-        return self._read(CAMERAS["front"], segmentation=True)["segmentation"][..., 0]
+        return self._read(SENSORS["front"], segmentation=True)["segmentation"][..., 0]
 
     def extrinsic(self, name: str) -> np.ndarray:
         """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
@@ -153,7 +153,7 @@ class Observer:
     def _take_pictures(self) -> None:
         scene = self.task.scene
         scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        for camera in CAMERAS.values():
+        for camera in SENSORS.values():
             scene.sensors[camera].capture()
 
     def _read(
@@ -200,7 +200,7 @@ def frame_keys(include: Include, render: bool) -> list[str]:
     keys = ["front_rgb", "wrist_rgb"] if render else []
     keys += ["joint_state", "eef_state", "gripper_state"]
     for kind in ("depth", "camera_extrinsic"):
-        for name in CAMERAS:
+        for name in SENSORS:
             if getattr(include, f"{name}_{kind}") and (render or kind != "depth"):
                 keys.append(f"{name}_{kind}")
     return [*keys, *(["maniskill_obs"] if include.maniskill_obs else [])]
@@ -208,13 +208,13 @@ def frame_keys(include: Include, render: bool) -> list[str]:
 
 def observation_space(keys: Sequence[str]) -> gymnasium.spaces.Dict:
     """Lists of frames, as Gymnasium describes them; the raw simulator observation is left out."""
-    image = gymnasium.spaces.Box(0, 255, (IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
-    depth = gymnasium.spaces.Box(-(2**15), 2**15 - 1, (IMAGE_SIZE, IMAGE_SIZE, 1), np.int16)
+    image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
+    depth = gymnasium.spaces.Box(-(2**15), 2**15 - 1, (SIDE, SIDE, 1), np.int16)
     boxes: dict[str, gymnasium.Space] = {
         "rgb": image,
         "depth": depth,
         "extrinsic": gymnasium.spaces.Box(-np.inf, np.inf, (3, 4), np.float32),
-        "joint_state": gymnasium.spaces.Box(-np.inf, np.inf, (7,), np.float32),
+        "joint_state": gymnasium.spaces.Box(-np.inf, np.inf, (ARM_JOINTS,), np.float32),
         "eef_state": gymnasium.spaces.Box(-np.inf, np.inf, (6,), np.float64),
         "gripper_state": gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64),
     }

@@ -21,9 +21,9 @@ import numpy as np
 import sapien
 from scipy.spatial.transform import Rotation
 
+from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
 from mme_vla.envs.choices import nearest_to_pixel
 from mme_vla.envs.grounding import project
-from mme_vla.envs.observations import IMAGE_SIZE
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -71,12 +71,13 @@ class JointAngle(ActionSpace):
     name = "joint_angle"
 
     def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(7 if stick else 8)
+        return _unbounded(ARM_JOINTS + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
-        numbers = _numbers(action, 7 if stick else 8, "seven joint angles and the gripper", longer=stick)
-        control.step(numbers[: 7 if stick else 8])
+        width = ARM_JOINTS + (not stick)
+        numbers = _numbers(action, width, "seven joint angles and the gripper", longer=stick)
+        control.step(numbers[:width])
 
 
 class EndEffectorPose(ActionSpace):
@@ -85,7 +86,7 @@ class EndEffectorPose(ActionSpace):
     name = "ee_pose"
 
     def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(6 if stick else 7)
+        return _unbounded(len(POSE) + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
@@ -102,7 +103,7 @@ class Waypoint(ActionSpace):
     name = "waypoint"
 
     def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(6 if stick else 7)
+        return _unbounded(len(POSE) + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
@@ -122,7 +123,7 @@ class MultiChoice(ActionSpace):
     name = "multi_choice"
 
     def space(self, stick: bool) -> gymnasium.Space:
-        point = gymnasium.spaces.Box(0, IMAGE_SIZE, (2,), np.float64)
+        point = gymnasium.spaces.Box(0, SIDE, (2,), np.float64)
         return gymnasium.spaces.Dict({"choice": gymnasium.spaces.Text(1), "point": point})
 
     def act(self, control: Control, action: Any) -> None:
@@ -182,8 +183,8 @@ def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.n
 
 def _pose_numbers(action: Any, stick: bool) -> np.ndarray:
     if stick:
-        return _numbers(action, 6, "x, y, z, roll, pitch, yaw", longer=True)
-    return _numbers(action, 7, "x, y, z, roll, pitch, yaw and the gripper")
+        return _numbers(action, len(POSE), ", ".join(POSE), longer=True)
+    return _numbers(action, len(POSE) + 1, f"{', '.join(POSE)} and the gripper")
 
 
 def _pose(numbers: np.ndarray) -> sapien.Pose:

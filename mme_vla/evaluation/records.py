@@ -68,7 +68,7 @@ class EpisodeRecord:
     steps: control steps executed, one an action but for planned motions. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
-    composition: `composition_digest` (config/variant.py) of the policy, so that no two configurations are averaged
+    composition: `composition_digest` (policy/digest.py) of the policy, so that no two configurations are averaged
         under one name; None in records written before there was one, and of players that are no policy of this library.
     extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.

@@ -7,8 +7,12 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mme_vla.errors import UserError
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
-from mme_vla.types import GRID, HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+LINES = 16
+"""Rows and columns of token positions count in so many parts of a view's side, as released, whatever its token grid."""
 
 
 class Memory(nn.Module):
@@ -32,6 +36,18 @@ class Memory(nn.Module):
     storage: StorageSpec
     pad_left: bool = False
     reporting: bool = False
+
+    def check_grid(self, views: int) -> None:
+        """Make sure that views of views×views tokens can be pooled to what this memory stores.
+
+        Raises:
+            UserError: they cannot.
+        """
+        if views % self.storage.grid:
+            sides = ", ".join(str(side) for side in range(1, views + 1) if views % side == 0)
+            raise UserError(
+                f"memory.grid={self.storage.grid}: the backbone's {views}×{views} tokens a view pool to {sides} a side."
+            )
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """Say which stored tokens step `step` remembers.
@@ -107,12 +123,12 @@ def whole_frames(frames: np.ndarray, grid: int) -> np.ndarray:
 
 
 def token_positions(indices: np.ndarray, grid: int) -> np.ndarray:
-    """(frame, patch) [n, 2] → (frame, row, column) [n, 3] float32, rows and columns at patch centres in grid lines.
+    """(frame, patch) [n, 2] → (frame, row, column) [n, 3] float32, rows and columns at patch centres in sixteenths.
 
     An 8×8 patch y sits at 2y + 1, a 4×4 patch at 4y + 2.
     """
     frame, patch = indices[:, 0], indices[:, 1]
-    cell = GRID / grid
+    cell = LINES / grid
     return np.stack([frame, (patch // grid + 0.5) * cell, (patch % grid + 0.5) * cell], axis=1).astype(np.float32)
 
 

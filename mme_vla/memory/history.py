@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.types import GRID
 
 
 @dataclass(frozen=True)
 class StorageSpec:
     """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
 
-    grid: side of the pooled token grid (16×16 tokens are pooled to grid×grid before they are stored).
+    grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are stored); it divides the
+        backbone's (`Memory.check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
     scorer: name of the frame scorer whose rows are stored beside the tokens; empty for none.
@@ -32,8 +32,8 @@ class StorageSpec:
     scorer: str = ""
 
     def __post_init__(self) -> None:
-        if self.grid < 1 or GRID % self.grid:
-            raise UserError(f"memory.grid={self.grid}: a view's {GRID}×{GRID} tokens pool to 1, 2, 4, 8 or 16 a side.")
+        if self.grid < 1:
+            raise UserError(f"memory.grid={self.grid} must be at least 1: the side of a remembered frame's token grid.")
         if self.pooling not in ("mean", "max"):
             raise UserError(f"memory.pooling={self.pooling!r}: choose mean (as released) or max (as the paper writes).")
         if self.keep_every < 1:

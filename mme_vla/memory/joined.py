@@ -21,7 +21,7 @@ WHOLE = 16  # shares are multiples of it, so that they hold whole frames of the 
 class JoinedMemory(Memory):
     """Each member selects and encodes as if it were alone, within its share of the budget.
 
-    The history keeps what serves all of them: the finest grid, of which coarser ones are pooled when they are read
+    The history keeps what serves all of them: a grid of which all of theirs are pooled when they are read
     (exact but for the rounding of what is stored), and every frame that anyone keeps.
 
     Selections lie one after the other in `HistoryTokens`, each padded as its member pads. One member's may vary in
@@ -210,7 +210,8 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
             f"{' and '.join(scorers)} score frames differently ({', '.join(scorers.values())}), and one history keeps "
             "one set of scores: set the same grid and stride for both, or join only one of them."
         )
-    grid, every = max(spec.grid for spec in specs.values()), math.gcd(*(spec.keep_every for spec in specs.values()))
+    grid = math.lcm(*(spec.grid for spec in specs.values()))
+    every = math.gcd(*(spec.keep_every for spec in specs.values()))
     return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
 
 

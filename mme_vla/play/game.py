@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
-SIDE = 256  # of the front picture, in pixels
 ONGOING = "ongoing"
 UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)
 """Stands for the frames of an environment that does not render."""

@@ -6,8 +6,9 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError
-from mme_vla.play.game import SIDE, ChoiceSession
+from mme_vla.play.game import ChoiceSession
 from mme_vla.registry import PLAYERS
 
 

@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.play import questions as prompts
 from mme_vla.play.game import ChoiceSession
 from mme_vla.play.players import PLAYERS, NoChoiceError, Player
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.finetuning.media import Clip, sample_video
+from mme_vla.subgoal.clips import Clip, sample_video
 from mme_vla.subgoal.models.api import Api, ApiFailure, Settings
 from mme_vla.subgoal.models.qwen3vl import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.words.parsing import MalformedAnswer
@@ -141,7 +142,7 @@ class GeminiPlayer(ModelPlayer):
     """
 
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
-        asked = Settings(**settings)
+        asked = read_section(Settings, settings, "player")
         super().__init__(asked.model, tries)
         self.api = Api(asked, self.usage, client)
         self._turns: list[tuple[str, list[Any]]] = []

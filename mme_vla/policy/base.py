@@ -25,8 +25,9 @@ class Policy(Saved):
 
     A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
     `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
-    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so that training resumes and
-    episodes repeat bit for bit whatever they are batched with; only the policy knows what they mean.
+    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so
+    that training resumes and episodes repeat bit for bit whatever they are batched with; only the policy knows what
+    they mean.
     """
 
     memory: Memory | None

@@ -108,7 +108,12 @@ def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
     """Build the processor of a composed configuration (`processor.name`), at its backbone's sizes.
 
     Raises:
-        UserError: an unknown processor or setting, or a tokenizer that cannot be had.
+        UserError: no processor, an unknown one or setting, or a tokenizer that cannot be had.
     """
+    if not sections.get("processor"):
+        raise UserError(
+            f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under `defaults` of its file "
+            "write `/processor@_global_.processor: tiny`, or the name of a configs/processor file of your own."
+        )
     kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT)]
     return kind.from_sections(sections)

@@ -12,6 +12,7 @@ import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.backbone.shape import read_backbone
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
 from mme_vla.integration.base import Integration, doors_of
@@ -21,11 +22,22 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, POLICIES
+from mme_vla.registry import INTEGRATIONS, MEMORIES, POLICIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
+
+
+def build_memory(section: Mapping[str, Any], backbone: Backbone, width: int) -> Memory:
+    """The memory of a configuration for this backbone's vision tokens; its own tokens are `width` wide.
+
+    Raises:
+        UserError: an unknown memory or option, or a grid to which the backbone's cannot be pooled.
+    """
+    memory: Memory = MEMORIES.build(section, d_vision=backbone.vision_width, width=width)
+    memory.check_grid(backbone.grid)
+    return memory
 
 
 @POLICIES.register("mme")
@@ -78,9 +90,7 @@ class MMEPolicy(Policy):
         Raises:
             UserError: an unknown name or option, or sizes that do not fit together.
         """
-        section = dict(config["backbone"])
-        backbone_cls: type[Backbone] = BACKBONES[section.pop("name")]
-        sizes = backbone_cls.Config.from_dict(section)
+        backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # a robot that does not fit is told before anything is built
         chosen = config.get("integration")
         if chosen and (unhosted := doors_of(INTEGRATIONS[chosen.get("name")]) - backbone_cls.hosts):
@@ -98,8 +108,7 @@ class MMEPolicy(Policy):
             backbone.draw_experts(list(experts))
         memory: Memory | None = None
         if config.get("memory"):
-            widths = {"d_vision": backbone.vision_width, "width": integration.memory_width}
-            memory = MEMORIES.build(config["memory"], **widths)
+            memory = build_memory(config["memory"], backbone, integration.memory_width)
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")

@@ -101,8 +101,8 @@ class Saved(nn.Module):
             policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
 
         Raises:
-            UserError: no checkpoint there, one of another kind of policy, a damaged file, a name that leads out of the folder, plugins that are not
-                trusted, or weights that do not fit the configuration.
+            UserError: no checkpoint there, one of another kind of policy, a damaged file, a name that leads out of
+                the folder, plugins that are not trusted, or weights that do not fit the configuration.
         """
         from mme_vla.processing.base import load_processor
 

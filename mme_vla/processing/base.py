@@ -130,7 +130,7 @@ class PolicyProcessor:
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Pictures of all cameras, in the embodiment's order, each [H, W, 3] or [n, H, W, 3], as the network takes them.
+        """Pictures of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the network takes them.
 
         Returns:
             uint8 [v, 3, s, s'], or [n, v, 3, s, s'].

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.backbone.shape import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, listed
@@ -89,14 +90,15 @@ class Processor(PolicyProcessor):
         Raises:
             UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
         """
-        backbone = sections["backbone"]
-        sizes = {"image_size": backbone["vision"]["image_size"], "action_dim": backbone["action_dim"]}
+        backbone = shape_of(sections["backbone"])
+        sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
         processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
-        if processor.tokenizer.vocab_size > backbone["vocab_size"]:
+        room = backbone.vocab_size
+        if room is not None and processor.tokenizer.vocab_size > room:
             raise UserError(
                 f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-                f"backbone.vocab_size={backbone['vocab_size']}: choose the processor that goes with the backbone."
+                f"backbone.vocab_size={room}: choose the processor that goes with the backbone."
             )
         return processor
 

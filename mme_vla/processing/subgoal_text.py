@@ -7,6 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, did_you_mean
 
 KINDS = ("simple_subgoal", "grounded_subgoal")
@@ -40,7 +41,7 @@ class SubgoalText:
     @classmethod
     def from_config(cls, config: Mapping[str, Any] | None) -> Self | None:
         """Build from the section `subgoal_text`, or return None where there is none."""
-        return None if config is None else cls(**config)
+        return None if config is None else read_section(cls, config, "subgoal_text")
 
     @property
     def columns(self) -> tuple[str, str]:

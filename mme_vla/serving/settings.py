@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
+from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.serving.listen import is_local
@@ -70,11 +71,8 @@ class ServeSettings:
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> Self:
         """Build from a composed configuration; keys of other purposes are left aside."""
-        known = {spec.name for spec in fields(cls)} - {"limits"}
-        found = {key: config[key] for key in known & set(config)}
-        if found.get("api_key") == "":  # an empty environment variable, as compose files leave it
-            found["api_key"] = None
-        return cls(**found, limits=Limits(**config.get("limits", {})))
+        # An empty environment variable, as compose files leave it, is no key.
+        return read_section(cls, {**config, "api_key": config.get("api_key") or None}, others=True)
 
     def executed(self, robot: Embodiment) -> int:
         """Actions of a chunk that a challenge client gets, and executes."""

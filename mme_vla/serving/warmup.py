@@ -2,10 +2,9 @@
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.policy.base import Policy
 from mme_vla.serving.settings import ServeSettings
-
-SIDE = 256  # pixels; what RoboMME's cameras give
 
 
 def warm_up(policy: Policy, settings: ServeSettings) -> None:

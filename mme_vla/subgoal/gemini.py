@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
@@ -79,7 +80,7 @@ class Gemini(SubgoalPredictor):
         if wait < 0:
             raise UserError(f"wait={wait} must be a number of steps, 0 or more.")
         self.wait, self.workers = wait, workers
-        self.api = Api(Settings(**settings), self.usage, client)
+        self.api = Api(read_section(Settings, settings, "subgoal"), self.usage, client)
         self._lock = threading.Lock()
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> GeminiEpisode:

@@ -8,7 +8,7 @@ import numpy as np
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.answers import merge_keyframes, recent_frames
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
-from mme_vla.subgoal.finetuning.media import Clip
+from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import Question
 from mme_vla.subgoal.qwenvl import VLMPredictor
 from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_memer

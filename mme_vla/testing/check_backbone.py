@@ -6,6 +6,7 @@ import torch
 
 from mme_vla.backbone.base import Backbone, Injection
 from mme_vla.backbone.layers.blocks import Block
+from mme_vla.config.sections import read_section
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
@@ -25,7 +26,7 @@ def check_backbone(name: str, **sizes: Any) -> None:
     kind: type[Backbone] = BACKBONES[name]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        backbone = kind(kind.Config.from_dict(sizes)).eval()
+        backbone = kind(read_section(kind.Config, sizes, "backbone")).eval()
     batch = _batch(backbone)
     images = batch.images.float() / 127.5 - 1
     check_tokens(backbone, images)

@@ -1,10 +1,11 @@
 """What a training run may be told (`configs/train`), checked before anything starts."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Self
 
-from mme_vla.errors import UserError, did_you_mean
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError
 
 SCHEDULES = ("constant", "cosine", "steps")
 
@@ -61,15 +62,7 @@ class TrainSettings:
         Raises:
             UserError: an unknown key or an impossible value.
         """
-        known = {f.name for f in fields(cls)} - {"seed"}
-        for key in values:
-            if key not in known:
-                raise UserError(f"train has no key {key!r}. {did_you_mean(str(key), known)}")
-        given = dict(values)
-        given["keep"] = KeepRule(**given.get("keep", {}))
-        given["betas"] = tuple(given.get("betas", cls.betas))
-        given["milestones"] = tuple(given.get("milestones") or ())
-        return cls(**given, seed=seed)
+        return read_section(cls, values, "train", seed=seed)
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch_size", "accumulate", "log_every", "val_every", "save_every"):

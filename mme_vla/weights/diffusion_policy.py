@@ -1,4 +1,4 @@
-"""Diffusion Policy's own checkpoints: `.pth` files {model, global_step, ckpt_manager}, with `stats.json` beside them."""
+"""Diffusion Policy's own checkpoints: `.pth` files {model, global_step, ckpt_manager}, `stats.json` beside them."""
 
 import json
 import re

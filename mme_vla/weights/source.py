@@ -24,6 +24,7 @@ FORMATS = {
     "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
 }
 
+
 @dataclass(frozen=True)
 class OwnNames:
     """A format of one method, told by its tensors' names.

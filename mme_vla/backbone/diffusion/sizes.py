@@ -1,15 +1,15 @@
 """Sizes of Diffusion Policy's networks: `configs/backbone/dp*.yaml`, where each is explained."""
 
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Self
 
 from mme_vla.backbone.pi05.sizes import VisionConfig
-from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, brief
 
 NAME = "diffusion_policy"
 LARGEST = 2**16
-_LISTS = {"picture": 2, "widths": None}
 
 
 @dataclass(frozen=True)
@@ -50,29 +50,16 @@ class DiffusionSizes:
                 f"backbone.name={brief(name)} is no network of Diffusion Policy: choose backbone=dp, or dp_tiny to try "
                 "things out."
             )
-        known = {f.name: f for f in fields(cls)}
-        for key in values:
-            if key not in known:
-                raise UserError(f"backbone has no key {brief(key)}. {did_you_mean(str(key), known)}")
-        for key, of in known.items():
-            if key not in values and of.default is MISSING and of.default_factory is MISSING:
-                raise UserError(f"backbone needs the key {key!r}.")
-        for key, length in _LISTS.items():
-            if key in values:
-                values[key] = _numbers(values[key], f"backbone.{key}", length)
-        if isinstance(values.get("memory_tower"), Mapping):
-            values["memory_tower"] = VisionConfig.from_dict(values["memory_tower"])
-        return cls(**values)
+        return read_section(cls, values, "backbone")
 
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if f.type is int and (isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST):
-                raise UserError(f"backbone.{f.name}={brief(value)} must be a whole number from 1 to {LARGEST}.")
-        if not isinstance(self.crop, int | float) or not 0 < self.crop <= 1:
+            numbers = [n for n in (value if isinstance(value, tuple) else [value]) if isinstance(n, int)]
+            if value == () or not all(1 <= n <= LARGEST for n in numbers):
+                raise UserError(f"backbone.{f.name}={brief(value)} must be made of whole numbers from 1 to {LARGEST}.")
+        if not 0 < self.crop <= 1:
             raise UserError(f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
-        if not isinstance(self.memory_tower, VisionConfig):
-            raise UserError(f"backbone.memory_tower={brief(self.memory_tower)} must be a section.")
         halved = 2 ** (len(self.widths) - 1)
         if self.horizon % halved:
             raise UserError(
@@ -95,12 +82,3 @@ class DiffusionSizes:
         """Height and width that the network sees."""
         height, width = self.picture
         return int(self.crop * height), int(self.crop * width)
-
-
-def _numbers(given: Any, where: str, length: int | None) -> tuple[int, ...]:
-    numbers = list(given) if isinstance(given, list | tuple) else []
-    whole = all(isinstance(n, int) and not isinstance(n, bool) and 1 <= n <= LARGEST for n in numbers)
-    if not numbers or not whole or length not in (None, len(numbers)):
-        count = "whole numbers" if length is None else f"{length} whole numbers"
-        raise UserError(f"{where}={brief(given)} must be a list of {count} from 1 to {LARGEST}.")
-    return tuple(numbers)

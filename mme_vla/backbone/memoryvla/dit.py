@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers.time import sin_cos
-from mme_vla.backbone.sizes import Sizes, check_positive
+from mme_vla.backbone.sizes import check_positive
 from mme_vla.errors import UserError, did_you_mean
 
 TIME_FEATURES = 256
@@ -16,7 +16,7 @@ INITS = ("zero", "xavier")
 
 
 @dataclass(frozen=True)
-class DitConfig(Sizes):
+class DitConfig:
     """DiT-L by default; S is 384 × 6 layers × 4 heads, B 768 × 12 × 12.
 
     perceptual_init: how the attention to perceptual tokens begins: `zero`, as released (it begins silent), or `xavier`.

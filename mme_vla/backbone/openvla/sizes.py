@@ -3,12 +3,12 @@
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from mme_vla.backbone.sizes import Sizes, check_positive
+from mme_vla.backbone.sizes import check_positive
 from mme_vla.errors import UserError
 
 
 @dataclass(frozen=True)
-class TowerConfig(Sizes):
+class TowerConfig:
     """One vision transformer; its tokens after the block before the last are read, so it has two blocks at least."""
 
     width: int
@@ -25,7 +25,7 @@ class TowerConfig(Sizes):
 
 
 @dataclass(frozen=True)
-class FusedVisionConfig(Sizes):
+class FusedVisionConfig:
     """DINOv2 and SigLIP on the same patches. `image_size` must be a multiple of `patch_size`."""
 
     image_size: int = 224
@@ -52,7 +52,7 @@ class FusedVisionConfig(Sizes):
 
 
 @dataclass(frozen=True)
-class LlamaConfig(Sizes):
+class LlamaConfig:
     """A Llama without grouped keys.
 
     norm_eps: OpenVLA's published configuration leaves it at the class's default of 1e-6, although Llama 2 itself has
@@ -72,7 +72,7 @@ class LlamaConfig(Sizes):
 
 
 @dataclass(frozen=True)
-class OpenVlaConfig(Sizes):
+class OpenVlaConfig:
     """OpenVLA-OFT: the VLM, a token of the state, and a head that reads a chunk off zeroed slots.
 
     state_dim: numbers of the state that the network reads; 0 for none. end_id: the token that closes the sequence.

@@ -52,6 +52,7 @@ class Pi05Backbone(Backbone):
         self.vision_width = self.token_width = config.vlm.width
         self.answer_width = width = config.action.width
         self.depth, self.head_dim = config.depth, config.head_dim
+        self.vocab_size = config.vocab_size
         self.image_size, self.grid = config.vision.image_size, config.vision.image_size // config.vision.patch_size
         self.horizon, self.action_dim = config.horizon, config.action_dim
         # The vision tower comes first: with one seed it is the same in every variant, and so is a cache made by it.

@@ -2,12 +2,11 @@
 
 from dataclasses import dataclass, field
 
-from mme_vla.backbone.sizes import Sizes, check_positive
+from mme_vla.backbone.sizes import check_positive
 from mme_vla.errors import UserError
 
-
 @dataclass(frozen=True)
-class VisionConfig(Sizes):
+class VisionConfig:
     """SigLIP; its output width is the VLM's. `image_size` must be a multiple of `patch_size`."""
 
     image_size: int = 224
@@ -24,7 +23,7 @@ class VisionConfig(Sizes):
 
 
 @dataclass(frozen=True)
-class ExpertConfig(Sizes):
+class ExpertConfig:
     """One Gemma expert's own sizes; depth, heads and head width are shared by all (paper, section 4.1)."""
 
     width: int
@@ -35,7 +34,7 @@ class ExpertConfig(Sizes):
 
 
 @dataclass(frozen=True)
-class BackboneConfig(Sizes):
+class BackboneConfig:
     """π0.5: a vision tower, a VLM expert and an action expert under joint attention."""
 
     vision: VisionConfig = field(default_factory=VisionConfig)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import h5py
 import numpy as np
 
+from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.observations import INTRINSIC
 from mme_vla.files import remove_drafts, write_atomically
 
@@ -37,7 +38,7 @@ class EpisodeWriter:
         for name, text in (("difficulty", task.difficulty), ("available_multi_choices", json.dumps(choices))):
             setup.create_dataset(name, data=text, dtype=h5py.string_dtype())
         setup.create_dataset("task_goal", data=task.goals(), dtype=h5py.string_dtype())
-        for camera in ("front", "wrist"):
+        for camera in CAMERAS:
             setup[f"{camera}_camera_intrinsic"] = INTRINSIC
 
     def add(self, step: "RecordedStep") -> None:

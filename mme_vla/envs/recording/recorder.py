@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import ARM_JOINTS, POSE
 from mme_vla.envs.grounding import Grounding, project
 from mme_vla.envs.observations import AngleTrack, Include, Observer
 from mme_vla.envs.recording.demonstration import demonstrate
@@ -151,17 +152,17 @@ class Recorder:
 
     def _actions(self, planned: "SubTask") -> dict[str, Any]:
         task, action = self._task, self._action
-        pose = self._demonstrator.arm.forward(action[:7])
-        gripper = -1.0 if task.stick else float(action[7])
+        pose = self._demonstrator.arm.forward(action[:ARM_JOINTS])
+        gripper = -1.0 if task.stick else float(action[ARM_JOINTS])
         angles = self._action_angles.follow(pose.q)
         if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
         shown = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
         return {
-            "joint_action": np.append(action[:7], gripper),
+            "joint_action": np.append(action[:ARM_JOINTS], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
-            "waypoint_action": np.full(7, np.nan, np.float32) if self._waypoint is None else self._waypoint,
+            "waypoint_action": np.full(len(POSE) + 1, np.nan, np.float32) if self._waypoint is None else self._waypoint,
             "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in shown]}),
         }
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.robot.kinematics import ARM_JOINTS, Arm
+from mme_vla.embodiment.robomme import ARM_JOINTS
+from mme_vla.envs.robot.kinematics import Arm
 from mme_vla.envs.robot.planning import plan_free, plan_screw
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import sapien
 
-ARM_JOINTS = 7
+from mme_vla.embodiment.robomme import ARM_JOINTS
+
 LIMIT_TOLERANCE = 1e-3
 """How far past a joint limit still counts as within, radians (metres for the fingers)."""
 IK_TOLERANCE = 1e-3

@@ -11,7 +11,8 @@ import sapien
 import toppra
 from toppra import algorithm, constraint
 
-from mme_vla.envs.robot.kinematics import ARM_JOINTS, Arm
+from mme_vla.embodiment.robomme import ARM_JOINTS
+from mme_vla.envs.robot.kinematics import Arm
 from mme_vla.envs.robot.path_search import sample_path
 
 CONTROL_STEP = 0.05

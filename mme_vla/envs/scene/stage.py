@@ -11,13 +11,13 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.rendering import keep_renderer
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.things import Thing
 
 RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
 """Joint angles at the start of every episode, and the target of the reset action; radians."""
-IMAGE_SIZE = 256
 FIELD_OF_VIEW = np.pi / 2
 
 
@@ -136,7 +136,7 @@ class Stage(BaseEnv):
     @property
     def _default_sensor_configs(self) -> Sequence[CameraConfig]:
         pose = sapien_utils.look_at(eye=[0.3, 0, 0.4], target=[0, 0, -0.2])
-        return [CameraConfig("base_camera", pose, IMAGE_SIZE, IMAGE_SIZE, FIELD_OF_VIEW, 0.01, 100)]
+        return [CameraConfig("base_camera", pose, SIDE, SIDE, FIELD_OF_VIEW, 0.01, 100)]
 
     @property
     def _default_human_render_camera_configs(self) -> Sequence[CameraConfig]:

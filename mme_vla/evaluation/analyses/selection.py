@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.memory_picture import contact_sheet
+from mme_vla.data.memory_picture import memory_sheet
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory
@@ -41,4 +41,4 @@ def selection_sheets(
         seen = step + 1
         selected = memory.select(history, step)
         title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
-        yield step, contact_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)
+        yield step, memory_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.embodiment.robomme import CAMERAS, benchmark_state
+from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_state
 from mme_vla.envs.make import make_env
 from mme_vla.envs.task_names import STICK_TASKS
 from mme_vla.errors import UserError
@@ -24,7 +24,7 @@ REPORTED = (
     "status", "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "error_message", "exception_type",
 )  # fmt: skip
 """What is passed on of the environment's info."""
-_BLIND = np.zeros((256, 256, 3), np.uint8)
+_BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
 """Every camera by its name: lists of uint8 [H, W, 3]; `state`: float32 [t, s]."""
@@ -155,8 +155,8 @@ class ChunkEnv:
 
     def _draw(self, frames: "_Frames", count: int, demo: int = 0, caption: str | None = None) -> None:
         if self._video is not None:
-            for index, (front, wrist) in enumerate(frames.newest(count)):
-                self._video.add(front, wrist, caption, demo=index < demo)
+            for index, views in enumerate(frames.newest(count)):
+                self._video.add(views, caption, demo=index < demo)
 
     def _finish_video(self, report: dict[str, Any]) -> dict[str, Any]:
         if self._video is None:
@@ -189,9 +189,9 @@ class _Frames:
             pictures += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         return len(joints)
 
-    def newest(self, count: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        front, wrist = (self._pictures[name][len(self._states) - count :] for name in CAMERAS)
-        return zip(front, wrist, strict=True)
+    def newest(self, count: int) -> Iterator[tuple[np.ndarray, ...]]:
+        """The last frames, each as its pictures: the robot's cameras in its order, then the benchmark's others."""
+        return zip(*(pictures[len(self._states) - count :] for pictures in self._pictures.values()), strict=True)
 
     def observation(self) -> Observation:
         state = np.stack(self._states) if self._states else np.zeros((0, ROBOMME_JOINT.state.width), np.float32)

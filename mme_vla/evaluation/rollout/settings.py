@@ -2,9 +2,10 @@
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Self
 
+from mme_vla.config.sections import read_section
 from mme_vla.envs.make import ENVS
 from mme_vla.envs.metadata import SPLITS
 from mme_vla.errors import UserError, did_you_mean
@@ -66,7 +67,7 @@ class RolloutSettings:
         Raises:
             UserError: a value that cannot be.
         """
-        return cls(**{field.name: config[field.name] for field in fields(cls) if field.name in config})
+        return read_section(cls, config, others=True)
 
     def worker_count(self, episodes: int) -> int:
         """How many workers run that many episodes."""

@@ -1,4 +1,4 @@
-"""`DiffusionPolicy`: chunks of absolute joint targets by denoising; alone as its authors trained it, or with a memory."""
+"""`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or with a memory."""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Self

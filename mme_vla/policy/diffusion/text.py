@@ -78,9 +78,9 @@ class ClipText(TextFeatures):
             tower = CLIPTextModelWithProjection.from_pretrained(self.source)
         except (OSError, ValueError) as error:
             raise UserError(
-                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]}). Connect once so that it is "
-                "kept, give a folder that holds it (processor.text=<folder>), or processor.text=hashed to try things "
-                "out."
+                f"The text tower {self.source} cannot be had ({str(error).splitlines()[0]}). Connect once so that it "
+                "is kept, give a folder that holds it (processor.text=<folder>), or try things out with "
+                "processor.text=hashed."
             ) from None
         if tower.config.projection_dim != self.width:
             raise UserError(

@@ -10,13 +10,12 @@ from mme_vla.backbone.memoryvla.compression import Compression
 from mme_vla.backbone.memoryvla.diffusion import Schedule
 from mme_vla.backbone.memoryvla.dit import Dit, DitConfig
 from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig
-from mme_vla.backbone.sizes import Sizes
 from mme_vla.errors import UserError
 from mme_vla.memory.bank import BankState, MemoryBank
 
 
 @dataclass(frozen=True)
-class BankConfig(Sizes):
+class BankConfig:
     """Both banks' options; see `MemoryBank`."""
 
     length: int = 16
@@ -28,7 +27,7 @@ class BankConfig(Sizes):
 
 
 @dataclass(frozen=True)
-class MemoryVlaConfig(Sizes):
+class MemoryVlaConfig:
     """Sizes of MemoryVLA, and how its head is trained and asked.
 
     perceptual_width, compression_width: of a perceptual token, and of the bottleneck's middle.

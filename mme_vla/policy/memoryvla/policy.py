@@ -12,6 +12,7 @@ from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.layers.attention import additive_mask
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.vision import IMAGENET
+from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.memory.bank import MemoryBank
@@ -85,7 +86,7 @@ class MemoryVlaPolicy(Policy):
             UserError: an unknown option, sizes that do not fit together, or a memory beside its own banks.
         """
         section = {key: value for key, value in config["backbone"].items() if key != "name"}
-        sizes = MemoryVlaConfig.from_dict(section)
+        sizes = read_section(MemoryVlaConfig, section, "backbone")
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
         if config.get("memory") or config.get("integration"):
             raise UserError("MemoryVLA has banks of its own (backbone.bank): leave memory and integration at none.")

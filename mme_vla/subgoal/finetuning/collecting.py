@@ -23,9 +23,20 @@ from mme_vla.data.layout import SAMPLE
 from mme_vla.data.progress import progress
 from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.errors import UserError, brief
-from mme_vla.files import SUMS, FolderLock, claim_plan, file_sum, plain, read_json, write_atomically, write_sums
+from mme_vla.files import (
+    SUMS,
+    FolderLock,
+    claim_plan,
+    file_sum,
+    plain,
+    read_json,
+    remove_drafts,
+    write_atomically,
+    write_sums,
+)  # fmt: skip
+from mme_vla.media import png_bytes, write_film
+from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.finetuning.labels import Labels
-from mme_vla.subgoal.finetuning.media import write_mp4, write_png
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
 
 if TYPE_CHECKING:
@@ -95,6 +106,8 @@ def _build(
             f"{output} holds something else, or the result of other inputs, sets or options. Choose another output, "
             "repeat that command to finish it, or remove the folder yourself."
         )
+    for folder in (output, *(path for path in output.rglob("*") if path.is_dir())):
+        remove_drafts(folder)
     missing = [e for e in episodes if not all(_part(output, name, e).is_file() for name in sets)]
     if not all((output / f"{name}.jsonl").is_file() for name in sets):
         with progress("subgoal data", len(episodes), len(episodes) - len(missing), "episodes") as advance:
@@ -119,12 +132,12 @@ def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], op
         for image, frame in built.images.items():
             wanted.setdefault(frame, []).append(output / image)
         if built.video:
-            _write_once(output / built.video, lambda path: write_mp4(episode.pictures(range(labels.exec_start)), path))
+            _write_once(output / built.video, partial(_write_video, episode, labels.exec_start))
     missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(wanted.items())}
     steps = [t for t, paths in missing.items() if paths]
     for t, picture in zip(steps, episode.pictures(steps), strict=True):
         for path in missing[t]:
-            _write_once(path, partial(write_png, picture))
+            _write_once(path, partial(_write_png, picture))
     for name in sets:  # the rows last: where they are, their pictures are
         rows = episode_rows(name, labels, options).rows
         with write_atomically(_part(output, name, episode)) as draft:
@@ -135,6 +148,15 @@ def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path)
+
+
+def _write_video(episode: Demonstration, length: int, path: Path) -> None:
+    write_film(episode.pictures(range(length)), path, **ENCODING)
+
+
+def _write_png(picture: np.ndarray, path: Path) -> None:
+    with write_atomically(path) as draft:
+        draft.write_bytes(png_bytes(picture))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:

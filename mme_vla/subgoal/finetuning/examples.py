@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mme_vla.errors import UserError, brief
 from mme_vla.files import Sums, inside, is_text, read_json_lines
-from mme_vla.subgoal.finetuning.media import VIDEO_FRAMES, Clip, read_image
+from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip, read_image
 from mme_vla.subgoal.models.qwen3vl import IMAGE_TOKENS, TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.words.parsing import write_boxes
 from mme_vla.subgoal.words.prompts import BBOX

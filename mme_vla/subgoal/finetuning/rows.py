@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.subgoal.answers import SubgoalHistory
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, selected_steps, windows
-from mme_vla.subgoal.words.parsing import SIDE, Point, mark_points
+from mme_vla.subgoal.words.parsing import Point, mark_points
 from mme_vla.subgoal.words.prompts import memer_answer, memer_system, memer_user, subgoal_system, subgoal_user
 
 Row = dict[str, Any]

@@ -18,8 +18,9 @@ import numpy as np
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.files import read_json, sealed, unsealed
+from mme_vla.media import film_bytes, png_bytes
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.finetuning.media import mp4_bytes, png_bytes
+from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.models.threads import within
 
 log = logging.getLogger(__name__)
@@ -85,8 +86,8 @@ class Shown:
     def part(self) -> Mapping[str, Any]:
         """What is sent."""
         picture = self.pixels.ndim == 3
-        kind, data = ("image/png", png_bytes(self.pixels)) if picture else ("video/mp4", mp4_bytes(self.pixels))
-        return {"inline_data": {"mime_type": kind, "data": data}}
+        data = png_bytes(self.pixels) if picture else film_bytes(self.pixels, **ENCODING)
+        return {"inline_data": {"mime_type": "image/png" if picture else "video/mp4", "data": data}}
 
 
 @dataclass(frozen=True)

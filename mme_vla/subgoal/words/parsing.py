@@ -9,11 +9,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, brief
 from mme_vla.files import is_text, parse_json
 from mme_vla.subgoal.words.prompts import BBOX
 
-SIDE = 256  # of the front picture, in pixels
 THOUSAND = 1000
 Point = tuple[int, int]
 

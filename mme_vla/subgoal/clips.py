@@ -1,51 +1,20 @@
-"""Pictures and videos as files and as bytes."""
+"""Pictures and videos as models look at them: which frames of a video, out of memory or out of a file."""
 
-import io
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.files import decoding, require_file
+from mme_vla.media import FPS
 
 VIDEO_FRAMES = 10  # that a model looks at, at most
+ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
+"""How films that models look at are compressed (`mme_vla.media.Film`): finer than those for people."""
+
 _REMEDY = "Build the training data again."
-FPS = 30  # of the videos predictors are shown; the simulator's steps simply play faster
-
-
-def write_mp4(frames: Iterable[np.ndarray], path: Path) -> int:
-    """Write frames [H, W, 3] uint8 as an H.264 video; the file appears only when it is whole. Returns their number."""
-    draft = path.with_name(f"{path.name}.partial")
-    with draft.open("wb") as handle:
-        count = _encode(frames, handle)
-    draft.replace(path)
-    return count
-
-
-def mp4_bytes(frames: Sequence[np.ndarray] | np.ndarray) -> bytes:
-    """The same in memory."""
-    buffer = io.BytesIO()
-    _encode(frames, buffer)
-    return buffer.getvalue()
-
-
-def png_bytes(frame: np.ndarray) -> bytes:
-    """A picture [H, W, 3] uint8 as PNG."""
-    from PIL import Image
-
-    buffer = io.BytesIO()
-    Image.fromarray(frame).save(buffer, "PNG")
-    return buffer.getvalue()
-
-
-def write_png(frame: np.ndarray, path: Path) -> None:
-    """Write a picture; the file appears only when it is whole."""
-    draft = path.with_name(f"{path.name}.partial")
-    draft.write_bytes(png_bytes(frame))
-    draft.replace(path)
 
 
 def read_image(path: Path) -> np.ndarray:
@@ -112,26 +81,3 @@ def sample_video(
     count = min(max(int(length / fps * rate), least), most, length)
     count = max(count - count % 2, min(2, length))
     return np.linspace(0, length - 1, count).round().astype(np.int64)
-
-
-def _encode(frames: Iterable[np.ndarray], handle: io.IOBase | object) -> int:
-    import av
-
-    count, stream = 0, None
-    with av.open(handle, "w", format="mp4") as container:
-        for frame in frames:
-            if stream is None:
-                height, width = frame.shape[:2]
-                stream = container.add_stream("libx264", rate=FPS)
-                stream.height, stream.width = height, width
-                stream.pix_fmt = "yuv420p" if height % 2 == width % 2 == 0 else "yuv444p"
-                # One thread: the file does not depend on how threads were scheduled.
-                stream.codec_context.thread_count = 1
-                stream.options = {"crf": "18", "preset": "medium", "threads": "1"}
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
-            count += 1
-        if stream is not None:
-            container.mux(stream.encode(None))
-    if not count:
-        raise ValueError("A video needs at least one frame.")
-    return count

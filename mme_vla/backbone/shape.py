@@ -1,0 +1,31 @@
+"""From the section `backbone` of a configuration to the class it names, its sizes and its shape."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from mme_vla.backbone.base import Backbone
+from mme_vla.config.sections import read_section
+from mme_vla.registry import BACKBONES
+
+
+def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
+    """The class that the section `backbone` names, and its sizes.
+
+    Raises:
+        UserError: an unknown backbone or size.
+    """
+    kind: type[Backbone] = BACKBONES[str(section.get("name"))]
+    return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
+
+
+def shape_of(section: Mapping[str, Any]) -> Backbone:
+    """The backbone of a section without weights (on the device `meta`), to be asked for its sizes.
+
+    Raises:
+        UserError: an unknown backbone or size.
+    """
+    kind, sizes = read_backbone(section)
+    with torch.device("meta"):
+        return kind(sizes)
