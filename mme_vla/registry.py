@@ -97,13 +97,21 @@ INTEGRATIONS: Registry[Any] = Registry("integration")
 BACKBONES: Registry[Any] = Registry("backbone", {"openvla": "mme_vla.backbone.openvla.backbone"})
 POLICIES: Registry[Any] = Registry(
     "policy",
-    {"mme": "mme_vla.policy.mme", "diffusion_policy": "mme_vla.policy.diffusion.policy",
-     "openvla": "mme_vla.policy.openvla", "memoryvla": "mme_vla.policy.memoryvla.policy"},
+    {
+        "mme": "mme_vla.policy.mme",
+        "diffusion_policy": "mme_vla.policy.diffusion.policy",
+        "openvla": "mme_vla.policy.openvla",
+        "memoryvla": "mme_vla.policy.memoryvla.policy",
+    },
 )
 PROCESSORS: Registry[Any] = Registry(
     "processor",
-    {"pi05": "mme_vla.processing.processor", "diffusion_policy": "mme_vla.policy.diffusion.processing",
-     "openvla": "mme_vla.processing.openvla", "memoryvla": "mme_vla.policy.memoryvla.processing"},
+    {
+        "pi05": "mme_vla.processing.processor",
+        "diffusion_policy": "mme_vla.policy.diffusion.processing",
+        "openvla": "mme_vla.processing.openvla",
+        "memoryvla": "mme_vla.policy.memoryvla.processing",
+    },
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")

@@ -11,7 +11,6 @@ from golden import error
 from memoryvla_golden import about, arrays, bank, core, golden_name
 from torch import Tensor
 
-from mme_vla.backbone.layers.time import sin_cos
 from mme_vla.backbone.memoryvla.diffusion import Schedule
 from mme_vla.memory.bank import BankState, MemoryBank, groups_of, runs_of
 from mme_vla.policy.memoryvla.core import MemoryVlaCore, cognition_token
@@ -55,7 +54,7 @@ def test_memoryvla_modules(folder: Path, network: MemoryVlaCore) -> None:
     near(network.compression(features), golden["se/out"])
     for role, one in (("cog", network.cognition_bank), ("per", network.perceptual_bank)):
         assert one.time is not None
-        near(sin_cos(golden[f"{role}/time/in"], one.time.frequencies), golden[f"{role}/time/frequencies"])
+        near(one.time.features(golden[f"{role}/time/in"]), golden[f"{role}/time/frequencies"])
         near(one.time(golden[f"{role}/time/in"]), golden[f"{role}/time/out"])
         block = [golden[f"{role}/block/{name}"] for name in ("query", "key", "value")]
         near(one.blocks[0](*block), golden[f"{role}/block/out"])

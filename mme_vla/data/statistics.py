@@ -61,9 +61,7 @@ def compute_norm_stats(
     return NormStats(state=states.result(extremes), actions=actions.result(extremes))
 
 
-def _counted_steps(
-    sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool
-) -> np.ndarray:
+def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:
     """All (source, episode, step) of the execution phases, or of whole records, int32 [n, 3]."""
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):

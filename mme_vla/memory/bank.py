@@ -11,10 +11,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.layers.time import sin_cos
 from mme_vla.errors import UserError, did_you_mean
 
 FUSIONS, CONSOLIDATIONS = ("gate", "add"), ("tome", "fifo")
+LONGEST = 10_000.0  # of the time code's periods, in units of 2π
 GATE_STD = 1e-3  # of a fresh gate, which so begins at about one half
 
 
@@ -34,7 +34,7 @@ class BankState:
 
 
 class TimeCode(nn.Module):
-    """Times [n] → [n, d], through sines, cosines and two layers."""
+    """Times [n] → [n, d], through cosines, sines and two layers."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -42,8 +42,15 @@ class TimeCode(nn.Module):
         self.input, self.output = nn.Linear(self.frequencies, width), nn.Linear(width, width)
 
     def forward(self, times: Tensor) -> Tensor:
-        features = sin_cos(times, self.frequencies).to(self.input.weight.dtype)
+        features = self.features(times).to(self.input.weight.dtype)
         return self.output(functional.silu(self.input(features)))
+
+    def features(self, times: Tensor) -> Tensor:
+        """[cos(t f) | sin(t f)] of times [n], f_j = 10000^(−j/half); of an odd width the last number is 0."""
+        half = self.frequencies // 2
+        ramp = torch.arange(half, device=times.device, dtype=torch.float32) / max(half, 1)
+        angles = times.float()[:, None] * LONGEST**-ramp
+        return functional.pad(torch.cat([angles.cos(), angles.sin()], -1), (0, self.frequencies % 2))
 
 
 class RetrievalBlock(nn.Module):

@@ -58,5 +58,5 @@ class ClippedQuantiles:
                 f"Statistics of {len(self.low)} numbers do not fit values {x.dtype} of shape {list(x.shape)}."
             )
         still = self.still if len(self.still) else np.zeros(len(self.low), bool)
-        flags = (torch.from_numpy(flag).to(x.device) for flag in (self.scaled, still))
-        return x.new_tensor(self.low), x.new_tensor(self.high - self.low + EPSILON), *flags
+        scaled, motionless = (torch.from_numpy(flag).to(x.device) for flag in (self.scaled, still))
+        return x.new_tensor(self.low), x.new_tensor(self.high - self.low + EPSILON), scaled, motionless

@@ -6,7 +6,6 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.layers.time import sin_cos
 from mme_vla.backbone.sizes import check_positive
 from mme_vla.errors import UserError, did_you_mean
 
@@ -35,6 +34,13 @@ class DitConfig:
             raise UserError(
                 f"head.perceptual_init={self.perceptual_init!r}. {did_you_mean(self.perceptual_init, INITS)}"
             )
+
+
+def step_features(steps: Tensor) -> Tensor:
+    """[cos(t f) | sin(t f)] of diffusion steps [n], f_j = 10000^(−j/half): [n, TIME_FEATURES] float32."""
+    ramp = torch.arange(TIME_FEATURES // 2, device=steps.device, dtype=torch.float32) / (TIME_FEATURES // 2)
+    angles = steps.float()[:, None] * 10_000.0**-ramp
+    return torch.cat([angles.cos(), angles.sin()], -1)
 
 
 class DitBlock(nn.Module):
@@ -104,7 +110,7 @@ class Dit(nn.Module):
         """
         if drop is not None:
             cognition = torch.where(drop[:, None, None], self.nothing, cognition)
-        time = sin_cos(steps, TIME_FEATURES).to(self.time_in.weight.dtype)
+        time = step_features(steps).to(self.time_in.weight.dtype)
         time = self.time_out(nn.functional.silu(self.time_in(time)))
         first = time[:, None] + self.cognition(cognition)
         return torch.cat([first, self.action(x)], 1) + self.positions

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from mme_vla.backbone.sizes import check_positive
 from mme_vla.errors import UserError
 
+
 @dataclass(frozen=True)
 class VisionConfig:
     """SigLIP; its output width is the VLM's. `image_size` must be a multiple of `patch_size`."""

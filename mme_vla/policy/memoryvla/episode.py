@@ -1,18 +1,26 @@
 """An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter them."""
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.policy.episode import Episode
-from mme_vla.policy.memoryvla.core import BankStates
-
-if TYPE_CHECKING:
-    from mme_vla.policy.memoryvla.policy import MemoryVlaPolicy
+from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.memoryvla.core import BankStates, MemoryVlaCore
+from mme_vla.policy.memoryvla.processing import MemoryVlaProcessor
 
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
+
+
+class Writer(Host, Protocol):
+    """What such an episode asks of its policy besides."""
+
+    core: MemoryVlaCore
+
+    def require_processor(self) -> MemoryVlaProcessor: ...
+
+    def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates: ...
 
 
 class MemoryVlaEpisode(Episode):
@@ -22,7 +30,7 @@ class MemoryVlaEpisode(Episode):
     latter is written when the next frames arrive, so that choosing twice at one frame gives the same chunk.
     """
 
-    def __init__(self, policy: "MemoryVlaPolicy", goal: str, seed: int = 0) -> None:
+    def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self._writer = policy
         self.banks: BankStates = policy.core.init_state()
