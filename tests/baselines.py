@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from golden import ERRORS
 from torch import Tensor
 
 SHARED = Path(__file__).resolve().parent.parent.parent / "shared" / "parity_baselines"
@@ -45,3 +46,13 @@ def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
         return 1 + 0.2 * uniform
     fan = int(np.prod(shape[1:], dtype=np.int64))
     return torch.tensor(np.float32(np.sqrt(3 / fan))) * uniform
+
+
+def relative_error(found: Tensor, expected: Tensor) -> float:
+    """Largest difference over the largest expected number; also kept under the running test's name (docs/parity.md)."""
+    assert found.shape == expected.shape, (found.shape, expected.shape)
+    worst = (found.detach().double() - expected.double()).abs().max().item()
+    worst /= expected.abs().max().item() or 1.0
+    test = os.environ.get("PYTEST_CURRENT_TEST", "").rsplit(" ", 1)[0].rsplit("::", 1)[-1]
+    ERRORS[test] = max(worst, ERRORS.get(test, 0.0))
+    return worst

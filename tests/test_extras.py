@@ -59,6 +59,8 @@ SUFFICE = [
     Case((), "mme_vla.data.sample --help", "full"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
     Case(("orbax",), f"mme_vla.weights.convert {STEP} jax --to released", ""),
+    Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
+                         "train.open_loop_chunks=0 output=diffused", "checkpoint"),
     Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
     Case(("vlm",), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
                    "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
@@ -86,6 +88,7 @@ NEED = [
     Case((), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
     Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
     Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
+    Case((), "mme_vla.train model=diffusion_policy output=run4", "baselines", 2),
     Case((), "mme_vla.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
     Case((), "mme_vla.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
 ]

@@ -12,8 +12,8 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import Table, print_table
+from mme_vla.policy.run_folders import find_run, resolve_checkpoint
 from mme_vla.testing.small import small_policy
-from mme_vla.training.checkpoint import find_run, resolve_checkpoint
 from mme_vla.training.finish import worse_than_still
 from mme_vla.training.start import weights_to_start_from
 

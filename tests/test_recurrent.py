@@ -92,15 +92,15 @@ def test_a_growing_list_costs_one_update_a_frame(make, exec_start):
     memory, stream = make(), None
     history = RandomHistory(exec_start + 1, exec_start)
     stream = memory.start_stream()
-    memory.remember([history], [stream])
+    memory.encode([history], [stream])
     before, gathered = stream.updates, history.gathered
     for replan in range(1, 5):
         history.length += 16
-        now = memory.remember([history], [stream])
+        now = memory.encode([history], [stream])
         assert stream.updates == before + replan
         assert history.gathered == gathered + replan * GRID**2
         assert same_memory(now, memory(window(memory, len(history), exec_start)))
-    memory.remember([history], [stream])
+    memory.encode([history], [stream])
     assert stream.updates == before + 4, "nothing new was seen"
 
 
@@ -108,11 +108,11 @@ def test_a_growing_list_costs_one_update_a_frame(make, exec_start):
 def test_any_other_list_is_computed_anew(make):
     memory = make(max_steps=6)
     history, stream = RandomHistory(81), memory.start_stream()
-    memory.remember([history], [stream])
+    memory.encode([history], [stream])
     assert stream.updates == 6
     for more, frames in ((5, 6), (16, 6)):  # off the stride; then on it, but the earliest frame has fallen out
         before, history.length = stream.updates, history.length + more
-        now = memory.remember([history], [stream])
+        now = memory.encode([history], [stream])
         assert stream.updates == before + frames
         assert same_memory(now, memory(window(memory, len(history))))
 
@@ -123,7 +123,7 @@ def test_episodes_at_different_places_share_a_call(make):
     histories = [RandomHistory(20), RandomHistory(1), RandomHistory(90, 40), RandomHistory(20)]
     streams = [memory.start_stream() for _ in histories]
     for _ in range(2):
-        together = memory.remember(histories, streams)
+        together = memory.encode(histories, streams)
         for i, history in enumerate(histories):
             alone = memory(window(memory, len(history), history.exec_start))
             assert torch.equal(together.mask[i], alone.mask[0])

@@ -10,7 +10,7 @@ import pytest
 
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.data.columns import find_columns
-from mme_vla.data.tables import check_vectors
+from mme_vla.data.table_files import check_vectors
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.files import SUMS
 from mme_vla.policy.digest import composition_digest

@@ -96,3 +96,36 @@ def test_the_core_does_without_transformers() -> None:
 
 def test_the_top_level_is_a_dozen_files() -> None:
     assert len(list(PACKAGE.glob("*.py"))) <= TOP_LEVEL
+
+
+# Names that several modules have because they are the same thing in each room.
+ALIKE = {
+    "base": "the contract of a room",
+    "settings": "what a command may be told",
+    "progress": "the bar a person sees",
+    "episodes": "the episodes there are: of the benchmark, of a dataset",
+}
+WRITING, READING = {"remember", "look", "observe"}, {"select", "recall", "encode", "gather"}
+
+
+def test_no_two_modules_of_one_name_mean_different_things() -> None:
+    named: dict[str, list[str]] = {}
+    for name, file in modules().items():
+        # A command is called as what it runs, and its entry as the command.
+        if file.stem != "__init__" and not is_entry(file) and name.split(".")[1:2] != ["commands"]:
+            named.setdefault(file.stem, []).append(name)
+    twice = {stem: found for stem, found in named.items() if len(found) > 1}
+    assert set(twice) == set(ALIKE), f"one name for two things: {twice}"
+
+
+def test_episodes_write_and_memories_read_under_names_of_their_own() -> None:
+    methods: dict[str, set[str]] = {}
+    for room in ("memory", "policy", "subgoal"):
+        for file in (PACKAGE / room).rglob("*.py"):
+            for node in ast.walk(ast.parse(file.read_text())):
+                if isinstance(node, ast.ClassDef):
+                    defined = {f.name for f in node.body if isinstance(f, ast.FunctionDef)}
+                    methods.setdefault(room if room == "memory" else node.name, set()).update(defined)
+    assert not methods["memory"] & WRITING, "a memory selects and encodes; Episode is what is written to"
+    assert methods["memory"] >= READING and methods["Episode"] >= WRITING
+    assert not methods["Episode"] & (READING - {"recall"})

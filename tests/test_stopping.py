@@ -11,7 +11,7 @@ import pytest
 import torch
 from test_training import loggers, policy, trainer
 
-from mme_vla.training.checkpoint import resolve_checkpoint
+from mme_vla.policy.run_folders import resolve_checkpoint
 from mme_vla.training.console import ProgressLine
 from mme_vla.training.logging import read_metrics
 from mme_vla.training.stopping import stop_asked

@@ -17,8 +17,9 @@ from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.config.composition import compose
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
 from mme_vla.processing.normalisers import NormStats, QuantileStats
-from mme_vla.training.checkpoint import check_disk, checkpoints_in, resolve_checkpoint
+from mme_vla.training.checkpoint import check_disk
 from mme_vla.training.console import ProgressLine
 from mme_vla.training.data import check_frozen
 from mme_vla.training.finish import loss_change

@@ -214,7 +214,7 @@ def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]"
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.mme import MMEPolicy, mme_of
-    from mme_vla.training.checkpoint import resolve_checkpoint
+    from mme_vla.policy.run_folders import resolve_checkpoint
 
     if (args.checkpoint is None) == (args.model is None):
         raise UserError("Name one policy: --checkpoint FOLDER, or --model NAME for one with fresh weights.")

@@ -54,7 +54,8 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     With `trust_plugins` the modules that the checkpoint names are imported.
     """
     from mme_vla.policy.base import Policy
-    from mme_vla.training.checkpoint import STATE, read_state, resolve_checkpoint
+    from mme_vla.policy.run_folders import STATE, resolve_checkpoint
+    from mme_vla.training.checkpoint import read_state
 
     folder = resolve_checkpoint(folder)
     policy = Policy.from_pretrained(folder, trust_plugins=trust_plugins)

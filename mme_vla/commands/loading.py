@@ -51,7 +51,7 @@ def load_policy(
     """
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
-    from mme_vla.training.checkpoint import LATEST, resolve_checkpoint
+    from mme_vla.policy.run_folders import LATEST, resolve_checkpoint
 
     device = find_device(cfg.device) if device is None else device
     named = words_of(*_MODEL_KEYS)

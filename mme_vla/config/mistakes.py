@@ -46,6 +46,14 @@ class ConfigTree:
                 return f"{choice.input_line!r} names no config of the group. Known: {', '.join(options)}."
         if isinstance(error, yaml.YAMLError):
             return f"Cannot read a config file: {error}"
+        ours = [o.input_line for o in self.values if str(o.key_or_group).startswith("memory.")]
+        if ours and isinstance(members := self.defaults().get("memory"), list):
+            names = ", ".join(str(m.get("name") if isinstance(m, Mapping) else m) for m in members)
+            return (
+                f"{ours[0]!r}: the model's file gives memory as the list [{names}], without keys. In that file write "
+                f"`/memory: joined` under defaults and `memory: {{members: [{names}]}}`: the same memory with keys. Or "
+                f"choose it on the command line, memory=[{names.replace(' ', '')}], for a model that has a memory."
+            )
         text = str(error) or str(error.__cause__)
         unknown = _BAD_KEY.match(text)
         key = (unknown[1] or unknown[2]) if unknown else ""

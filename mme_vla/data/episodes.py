@@ -22,7 +22,7 @@ from mme_vla.data.layout import (
     read_info,
     resolve_root,
 )
-from mme_vla.data.tables import REMEDY, check_vectors, open_table, read_episode_table, video_file
+from mme_vla.data.table_files import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment

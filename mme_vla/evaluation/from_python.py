@@ -78,7 +78,7 @@ def evaluate(
 def _loaded(policy: Policy | str | Path) -> tuple[Policy, str | None]:
     if isinstance(policy, Policy):
         return policy, None
-    from mme_vla.training.checkpoint import resolve_checkpoint
+    from mme_vla.policy.run_folders import resolve_checkpoint
 
     where = Path(policy).expanduser()
     source = str(resolve_checkpoint(where)) if where.exists() else str(policy)

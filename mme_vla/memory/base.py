@@ -108,7 +108,7 @@ class Memory(nn.Module):
         """Return what this memory carries through one episode besides its history; None for nothing."""
         return None
 
-    def remember(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+    def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         """Memory tokens [n, budget, d] of n running episodes at their latest frames.
 
         Args:

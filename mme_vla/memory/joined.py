@@ -92,10 +92,10 @@ class JoinedMemory(Memory):
     def start_stream(self) -> tuple[Any, ...]:
         return tuple(member.start_stream() for member in self.memories)
 
-    def remember(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+    def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         views = [self._views(history) for history in histories]
         return self._joined([
-            member.remember([view[i] for view in views], [stream[i] for stream in streams])
+            member.encode([view[i] for view in views], [stream[i] for stream in streams])
             for i, member in enumerate(self.memories)
         ])  # fmt: skip
 

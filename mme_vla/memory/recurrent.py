@@ -194,7 +194,7 @@ class RecurrentMemory(Memory):
     def start_stream(self) -> RecurrentStream:
         return RecurrentStream()
 
-    def remember(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
+    def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         """Memory tokens of running episodes.
 
         While an episode's frame list extends the one its stream has taken, only the new frames enter; where it does

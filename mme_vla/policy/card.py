@@ -18,7 +18,7 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     rows = {
         "memory": _part(config.get("memory")),
         "integration": _part(config.get("integration")),
-        "backbone": f"{backbone.get('name', 'pi05')}, {backbone.get('depth', '?')} layers",
+        "backbone": backbone.get("name", "pi05") + (f", {backbone['depth']} layers" if "depth" in backbone else ""),
         "robot": str((config.get("embodiment") or {}).get("name", "robomme_joint")),
         "action chunk": f"{backbone.get('horizon', '?')} steps of {backbone.get('action_dim', '?')} numbers",
         "parameters": f"{sum(p.numel() for p in policy.parameters()) / 1e6:.1f} M",
@@ -29,12 +29,12 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
         "---", "library_name: mme-vla", "pipeline_tag: robotics", "tags:", "- robotics",
         "- vision-language-action", "- memory", f"- {name}", "---", "",
         f"# {name}", "",
-        "A vision-language-action policy of the MME-VLA library: a π0.5 backbone"
+        f"A {type(policy).__name__} of the MME-VLA library"
         + (" with a memory of the episode." if config.get("memory") else " without memory."), "",
         *_table(rows), "",
         "## Use", "",
-        "```python", "from mme_vla import MMEPolicy", "",
-        'policy = MMEPolicy.from_pretrained("<this repository or folder>")',
+        "```python", "from mme_vla import Policy", "",
+        'policy = Policy.from_pretrained("<this repository or folder>")',
         'episode = policy.start_episode("the goal in words")',
         "```", "",
         "## Data", "", str(known.get("data") or "Not recorded."), "",

@@ -5,12 +5,15 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.errors import UserError
+from mme_vla.policy.run_folders import newest_checkpoint
 
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
 
 
 def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
     """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of that name.
+
+    A folder of a training run stands for its newest checkpoint, and `latest` for the newest run beside it.
 
     Args:
         source: a path, or `owner/name` of a hub repository.
@@ -20,7 +23,7 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
     Raises:
         UserError: neither a path nor a repository that can be reached.
     """
-    path = Path(source).expanduser()
+    path = newest_checkpoint(Path(source).expanduser())
     if path.exists() or not _REPOSITORY.fullmatch(str(source)):
         if revision is not None:
             raise UserError(f"revision={revision!r} names a state of a hub repository, but {source} is a path.")

@@ -246,7 +246,7 @@ class MMEPolicy(Policy):
         if self.memory is None:
             return None
         with self.autocast():
-            return self.memory.remember([e.required_history() for e in episodes], [e.stream for e in episodes])
+            return self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""

@@ -92,7 +92,8 @@ class Saved(nn.Module):
         `Policy.from_pretrained` loads every kind of policy, a subclass its own.
 
         Args:
-            source: a folder on disk, or `owner/name` of a hub repository.
+            source: a folder on disk (of a checkpoint, or of a run: then its newest; `…/latest`: of the newest run), or
+                `owner/name` of a hub repository.
             device: where to put the weights.
             dtype: what the weights become. `bfloat16` halves the memory, for inference; compute is then bfloat16 too.
             revision: branch, tag or commit of the repository. token: for private repositories.

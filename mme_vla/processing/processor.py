@@ -15,9 +15,9 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.files import check_sums, inside
 from mme_vla.memory.base import stack_history
-from mme_vla.processing.actions import pad_width
 from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, PolicyProcessor, Sample, read_settings
 from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
+from mme_vla.processing.padding import pad_width
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
 from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer

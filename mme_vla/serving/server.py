@@ -139,7 +139,7 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "state_dim": policy.embodiment.state.width,
         "action_space": policy.embodiment.action.space,
         "action_dim": policy.embodiment.action.width,
-        "horizon": policy.horizon,
+        "horizon": policy.horizon - policy.skipped,
         "execute": settings.executed(policy.embodiment),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),

@@ -160,7 +160,7 @@ def check_streaming(memory: Memory, frames: int) -> None:
     for until in (16, 32, 37, frames):
         for episode, history in zip((first, second), histories, strict=True):
             episode.extend(history, 16, until)
-        streamed = memory.remember(histories, streams)
+        streamed = memory.encode(histories, streams)
         fresh = _encoded(memory, stack_history([memory.recall(history, len(history) - 1) for history in histories]))
         error = float((_valid(streamed) - _valid(fresh)).abs().max())
         assert error <= TOLERANCE, f"after {until} frames the stream's tokens differ from a fresh look by {error:.2g}."

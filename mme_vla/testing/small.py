@@ -29,7 +29,8 @@ def unit_stats(robot: Embodiment = ROBOMME_JOINT) -> NormStats:
 
     def quantiles(width: int) -> QuantileStats:
         ones = np.ones(width)
-        return QuantileStats(q01=-ones, q99=ones.copy(), mean=np.zeros(width), std=ones.copy())
+        low, high = -ones, ones.copy()
+        return QuantileStats(q01=low, q99=high, mean=np.zeros(width), std=ones.copy(), min=low, max=high)
 
     return NormStats(state=quantiles(robot.state.width), actions=quantiles(robot.action.width))
 

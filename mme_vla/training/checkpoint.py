@@ -14,7 +14,6 @@ pickled: a checkpoint from a stranger cannot run code.
 import importlib.metadata
 import json
 import os
-import re
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -26,13 +25,13 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError, listed
 from mme_vla.files import check_sums, inside, read_json, write_sums
 from mme_vla.policy.base import Policy
+from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
 from mme_vla.policy.tensor_files import check_values, load_tensors, read_files, replace_folder
 from mme_vla.training.ema import EMA
 from mme_vla.training.settings import KeepRule
 
 FORMAT = "mme_vla training checkpoint 1"
-STATE, RAW, OPTIMIZER = "training_state.json", "raw.safetensors", "optimizer.safetensors"
-_STEP = re.compile(r"step_(\d+)")
+RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"
 _MOMENTS = ("exp_avg", "exp_avg_sq", "step")
 
 
@@ -100,64 +99,6 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
         if f"{name}/step" in moments
     }
     optimizer.load_state_dict(state)
-
-
-def checkpoints_in(folder: Path) -> list[Path]:
-    """The finished checkpoints in a `checkpoints` folder, oldest step first."""
-    found = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
-    return sorted(found, key=step_of)
-
-
-def checkpoint_name(step: int) -> str:
-    """The folder name of the checkpoint after `step` updates."""
-    return f"step_{step:06d}"
-
-
-def step_of(checkpoint: Path) -> int:
-    """The step in a checkpoint folder's name."""
-    match = _STEP.fullmatch(checkpoint.name)
-    return int(match[1]) if match else -1
-
-
-LATEST = "latest"
-"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
-
-
-def find_run(path: Path) -> Path:
-    """`path`, or the newest run where it ends in `latest`, as in `outputs/tokendrop_expert/latest`.
-
-    Raises:
-        UserError: there is no run with a checkpoint beside it.
-    """
-    if path.name != LATEST or path.exists():
-        return path
-    runs = [run for run in path.parent.glob("*") if checkpoints_in(run / "checkpoints")]
-    if not runs:
-        raise UserError(
-            f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another."
-        )
-    return max(runs, key=lambda run: (checkpoints_in(run / "checkpoints")[-1].stat().st_mtime_ns, run.name))
-
-
-def resolve_checkpoint(path: Path) -> Path:
-    """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
-
-    A path that ends in `latest` stands for the newest run of its folder.
-
-    Raises:
-        UserError: there is no checkpoint.
-    """
-    path = find_run(path)
-    for folder in (path, path / "checkpoints"):
-        found = checkpoints_in(folder)
-        if found:
-            return found[-1]
-    if (path / "config.json").is_file():
-        return path
-    raise UserError(
-        f"No checkpoint at {path}: expected a folder such as outputs/<model>/<date>/checkpoints/step_000500, "
-        "or the run folder above it."
-    )
 
 
 def read_state(checkpoint: Path) -> dict[str, Any]:

@@ -11,11 +11,11 @@ from mme_vla.errors import UserError, brief
 from mme_vla.files import FolderLock, plain
 from mme_vla.files.locks import LOCK
 from mme_vla.policy.kinds import policy_name
-from mme_vla.training.checkpoint import checkpoints_in, read_state, resolve_checkpoint, step_of
+from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, resolve_checkpoint, step_of
+from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
 
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
-CHECKPOINTS = "checkpoints"
 
 MAY_DIFFER = (
     "name", "full_size", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",

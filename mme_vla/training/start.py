@@ -4,7 +4,7 @@ from pathlib import Path
 
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
-from mme_vla.training.checkpoint import checkpoints_in, find_run, resolve_checkpoint
+from mme_vla.policy.run_folders import newest_checkpoint
 from mme_vla.weights import transfer
 
 ASK, NONE = "ask", "none"
@@ -38,7 +38,6 @@ def start_from(policy: Policy, source: str) -> str:
         UserError: no checkpoint, another tokenizer, a weight of another shape, or weights missing that are not the
             memory's.
     """
-    folder = find_run(Path(source))
-    if checkpoints_in(folder) or checkpoints_in(folder / "checkpoints"):
-        source = str(resolve_checkpoint(folder))
+    found = newest_checkpoint(Path(source))
+    source = source if found == Path(source) else str(found)
     return f"weights from {source}: {transfer(policy, source)}"

@@ -2,7 +2,7 @@
 
 import re
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from mme_vla.weights.adapter import Adapter, memory_parameters
 from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.ports import port_adapter
-from mme_vla.weights.released import partial_adapter, released_adapter
+from mme_vla.weights.released import members_of, partial_adapter, released_adapter
 from mme_vla.weights.source import Source, open_source
 
 ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
@@ -135,19 +135,21 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
         check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
     else:
         of_format = partial_adapter(policy) if found.format == "released" else ADAPTERS[found.format](policy)
+        members = [place for place, _ in members_of(policy.memory)]
 
         def behind(theirs: Mapping[str, Tensor]) -> list[str]:
-            shapes = _reduced(of_format, own, theirs).shapes(state)
-            return sorted(name for name in set(theirs) - set(shapes) if _MEMORY_LEAF.search(name))
+            known = {constant.path for constant in of_format.derived}
+            known |= set(_reduced(of_format, own, members, theirs).shapes(state))
+            return sorted(name for name in set(theirs) - known if _MEMORY_LEAF.search(name))
 
         def fits(theirs: Mapping[str, Tensor]) -> None:
             left = set(behind(theirs))
             here = {name: tensor for name, tensor in theirs.items() if name not in left}
-            _reduced(of_format, own, theirs).check_fit(here, state, str(source))
+            _reduced(of_format, own, members, theirs).check_fit(here, state, str(source))
 
         theirs = found.tensors(fits)
         left = behind(theirs)
-        adapter = _reduced(of_format, own, theirs)
+        adapter = _reduced(of_format, own, members, theirs)
         theirs = {name: tensor for name, tensor in theirs.items() if name not in left}
         ours = adapter.translate(theirs, state, str(source))
     check_kinds(ours, state, str(source))
@@ -170,12 +172,14 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
         )
 
 
-def _reduced(adapter: Adapter, own: set[str], theirs: Mapping[str, Tensor]) -> Adapter:
-    """Leave out the memory's parameters that the checkpoint does not hold."""
+def _reduced(adapter: Adapter, own: set[str], members: Sequence[str], theirs: Mapping[str, Tensor]) -> Adapter:
+    """Leave out the memory's parameters that the checkpoint does not hold, and members that it does not hold whole."""
+    absent = {name for name, pieces in adapter.table.items() if not all(piece.path in theirs for piece in pieces)}
+    torn = tuple(f"{place}." for place in members if any(name.startswith(f"{place}.") for name in absent))
     table = {
         name: pieces
         for name, pieces in adapter.table.items()
-        if name not in own or all(piece.path in theirs for piece in pieces)
+        if name not in own or (name not in absent and not name.startswith(torn))
     }
     return replace(adapter, table=table)
 

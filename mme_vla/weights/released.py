@@ -13,6 +13,8 @@ import mme_vla.weights.names.jax_backbone as backbone_names
 import mme_vla.weights.names.jax_integration as integration_names
 import mme_vla.weights.names.jax_memory as memory_names
 from mme_vla.errors import UserError, listed
+from mme_vla.memory.base import Memory
+from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors
 from mme_vla.weights.adapter import Adapter, memory_parameters, pi05_of
@@ -29,10 +31,25 @@ def released_adapter(policy: MMEPolicy) -> Adapter:
 
 
 def partial_adapter(policy: Any) -> Adapter:
-    """The released tree as far as it has names for this policy: what parts of one's own have beyond it is left out."""
+    """The released tree as far as it has names for this policy: what parts of one's own have beyond it is left out.
+
+    Members of a joined memory have the names that each would have alone: a reader keeps those that are there whole.
+    """
     table, state = _table(policy), policy.state_dict()
+    unread, derived = released_unread(policy), released_derived(policy)
+    for place, member in members_of(policy.memory):
+        table |= prefixed(place, memory_names.released_names(member))
+        unread += memory_names.released_unread(member)
+        derived += memory_names.released_derived(member)
     known = {name: pieces for name, pieces in table.items() if name in state or policy.part_of(name) != "memory"}
-    return Adapter(known, released_unread(policy), derived=released_derived(policy))
+    return Adapter(known, unread, derived=derived)
+
+
+def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
+    """The members of a joined memory, each with the beginning of its tensors' names in the policy."""
+    if not isinstance(memory, JoinedMemory):
+        return []
+    return [(f"memory.members.{i}", member) for i, member in enumerate(memory.memories)]
 
 
 def released_table(policy: MMEPolicy) -> NameTable:

@@ -12,18 +12,25 @@ Schedule = Any
 """A `diffusers.DDPMParallelScheduler`, whose package is asked for only where it is used."""
 
 
+def require_diffusers() -> None:
+    """Make sure that the package is there, before anything is built.
+
+    Raises:
+        UserError: it is not.
+    """
+    try:
+        import diffusers  # noqa: F401
+    except ImportError:
+        raise missing_extra("Diffusion Policy", "baselines") from None
+
+
 def noise_schedule(steps: int) -> Schedule:
     """A squared-cosine schedule of so many steps that predicts noise and clips its guesses of the chunk to ±1.
 
     It moves its own tables to where it is used: make a new one for each use.
-
-    Raises:
-        UserError: diffusers is not installed.
     """
-    try:
-        from diffusers import DDPMParallelScheduler
-    except ImportError:
-        raise missing_extra("Diffusion Policy", "baselines") from None
+    from diffusers import DDPMParallelScheduler
+
     with torch.device("cpu"):  # also where a policy is built on meta
         return DDPMParallelScheduler(
             num_train_timesteps=steps,

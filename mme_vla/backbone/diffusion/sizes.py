@@ -57,7 +57,8 @@ class DiffusionSizes:
             value = getattr(self, f.name)
             numbers = [n for n in (value if isinstance(value, tuple) else [value]) if isinstance(n, int)]
             if value == () or not all(1 <= n <= LARGEST for n in numbers):
-                raise UserError(f"backbone.{f.name}={brief(value)} must be made of whole numbers from 1 to {LARGEST}.")
+                where = "processor" if f.name == "window" else "backbone"  # which the backbone follows
+                raise UserError(f"{where}.{f.name}={brief(value)} must be made of whole numbers from 1 to {LARGEST}.")
         if not 0 < self.crop <= 1:
             raise UserError(f"backbone.crop={brief(self.crop)} must lie above 0 and at most at 1.")
         halved = 2 ** (len(self.widths) - 1)

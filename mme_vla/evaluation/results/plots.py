@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
 COLOURS = ("#1f6f8b", "#e07a2f", "#5a9367", "#8d5a97", "#c44536", "#7a8b99", "#b8972f", "#3d5a80")
-FAMILIES = {"none": "#7a8b99", "symbolic": "#b8972f", "perceptual": "#1f6f8b", "recurrent": "#8d5a97"}
+FAMILIES = {"none": "#7a8b99", "symbolic": "#b8972f", "perceptual": "#1f6f8b", "recurrent": "#8d5a97",
+            "prior": "#b5523b"}  # fmt: skip
 INK, FAINT = "#2b2d42", "#8d99ae"
 MOST_BARS = 8
 SWEPT = ("framesamp_modul", "tokendrop_modul")
@@ -134,7 +135,8 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
         return svg(canvas)
 
 
-_FAMILY_NAMES = {"none": "no memory", "symbolic": "symbolic", "perceptual": "perceptual", "recurrent": "recurrent"}
+_FAMILY_NAMES = {"none": "no memory", "symbolic": "symbolic", "perceptual": "perceptual", "recurrent": "recurrent",
+                 "prior": "prior method"}  # fmt: skip
 
 
 def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) -> str:

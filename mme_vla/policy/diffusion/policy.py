@@ -88,6 +88,7 @@ class DiffusionPolicy(Policy):
         Raises:
             UserError: an unknown name or option, sizes that do not fit together, or a package that is missing.
         """
+        ddpm.require_diffusers()
         sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
         integration = _pooled(config.get("integration"), sizes)
         if (integration is None) != (not config.get("memory")):
@@ -232,7 +233,7 @@ class DiffusionPolicy(Policy):
         memory = None
         if self.memory is not None:
             with torch.no_grad(), self.autocast():
-                memory = self.memory.remember([e.required_history() for e in episodes], [e.stream for e in episodes])
+                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
         return self.sample_actions(batch, draws, steps, memory)
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
@@ -268,6 +269,7 @@ class DiffusionPolicy(Policy):
             "window": (processor.window, sizes.window),
             "text_dim": (processor.text.width, sizes.text_dim),
             "horizon": (processor.horizon, sizes.horizon),
+            "memory_size": (processor.memory_size, sizes.memory_tower.image_size),
         }
         for name, (found, expected) in pairs.items():
             if found != expected:

@@ -223,5 +223,5 @@ class DiffusionProcessor(PolicyProcessor):
                 check_sums(folder, [stats])
                 settings["stats"] = NormStats.load(path)
             return cls(embodiment=robot, **settings)
-        except (TypeError, IndexError, UserError) as error:
+        except (TypeError, ValueError, KeyError, IndexError) as error:
             raise UserError(f"{folder}: its processor cannot be built ({error}).") from None

@@ -1,0 +1,76 @@
+"""Where a run of training lies on disk: its checkpoints, the newest of them, and what `latest` means."""
+
+import re
+from pathlib import Path
+
+from mme_vla.errors import UserError
+
+CHECKPOINTS = "checkpoints"
+STATE = "training_state.json"
+"""The file of a checkpoint that is written last: where it is, the checkpoint is whole."""
+_STEP = re.compile(r"step_(\d+)")
+
+
+def checkpoints_in(folder: Path) -> list[Path]:
+    """The finished checkpoints in a `checkpoints` folder, oldest step first."""
+    found = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
+    return sorted(found, key=step_of)
+
+
+def checkpoint_name(step: int) -> str:
+    """The folder name of the checkpoint after `step` updates."""
+    return f"step_{step:06d}"
+
+
+def step_of(checkpoint: Path) -> int:
+    """The step in a checkpoint folder's name."""
+    match = _STEP.fullmatch(checkpoint.name)
+    return int(match[1]) if match else -1
+
+
+LATEST = "latest"
+"""`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
+
+
+def find_run(path: Path) -> Path:
+    """`path`, or the newest run where it ends in `latest`, as in `outputs/tokendrop_expert/latest`.
+
+    Raises:
+        UserError: there is no run with a checkpoint beside it.
+    """
+    if path.name != LATEST or path.exists():
+        return path
+    runs = [run for run in path.parent.glob("*") if checkpoints_in(run / CHECKPOINTS)]
+    if not runs:
+        raise UserError(
+            f"No run with a checkpoint in {path.parent}, so there is no {path}: train one, or name another."
+        )
+    return max(runs, key=lambda run: (checkpoints_in(run / CHECKPOINTS)[-1].stat().st_mtime_ns, run.name))
+
+
+def resolve_checkpoint(path: Path) -> Path:
+    """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
+
+    A path that ends in `latest` stands for the newest run of its folder.
+
+    Raises:
+        UserError: there is no checkpoint.
+    """
+    found = newest_checkpoint(path)
+    if found != path or (path / "config.json").is_file():
+        return found
+    raise UserError(
+        f"No checkpoint at {path}: expected a folder such as outputs/<model>/<date>/checkpoints/step_000500, "
+        "or the run folder above it."
+    )
+
+
+def newest_checkpoint(path: Path) -> Path:
+    """The newest checkpoint where `path` is a run, its `checkpoints` folder or ends in `latest`; else `path` itself.
+
+    Raises:
+        UserError: `latest`, and there is no run with a checkpoint beside it.
+    """
+    path = find_run(path)
+    found = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
+    return found[-1] if found else path
