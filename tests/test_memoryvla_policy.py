@@ -177,8 +177,6 @@ def test_what_it_has_no_place_for_is_refused_in_words() -> None:
         build_policy("memoryvla", memory="framesamp", integration="context")
     with pytest.raises(UserError, match="group_size"):
         build_policy("memoryvla", processor={"group_size": 1})
-    with pytest.raises(UserError, match="needs its own processor"):
-        build_policy("memoryvla", processor="tiny")
 
 
 def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ class DitBlock(nn.Module):
     """Self-attention over the chunk, attention to the perceptual tokens, an MLP; norms before each."""
 
     def __init__(self, width: int, heads: int) -> None:
-        from timm.layers import Attention, Mlp
+        from timm.layers import Attention, GELUTanh, Mlp
 
         super().__init__()
         plain = partial(nn.LayerNorm, width, eps=EPS, elementwise_affine=False)
@@ -55,7 +55,7 @@ class DitBlock(nn.Module):
         self.attention = Attention(width, num_heads=heads, qkv_bias=True)
         self.cross_norm = nn.LayerNorm(width, eps=EPS)
         self.cross = nn.MultiheadAttention(width, heads, batch_first=True)
-        self.mlp = Mlp(width, 4 * width, act_layer=partial(nn.GELU, approximate="tanh"))
+        self.mlp = Mlp(width, 4 * width, act_layer=GELUTanh)
 
     def forward(self, x: Tensor, perceptual: Tensor) -> Tensor:
         x = x + self.attention(self.norm(x))

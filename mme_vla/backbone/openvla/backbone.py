@@ -59,6 +59,7 @@ class OpenVlaBackbone(Backbone):
         self.config = config
         width = config.vlm.width
         self.vision_width, self.token_width = config.vision.width, width
+        self.vocab_size = config.vocab_size
         self.depth, self.head_dim = config.vlm.depth, width // config.vlm.num_heads
         self.image_size, self.grid = config.vision.image_size, config.vision.grid
         self.horizon, self.action_dim = config.horizon, config.action_dim

@@ -95,7 +95,7 @@ class Angles(nn.Module):
 def _llama(config: LlamaConfig, vocab_size: int) -> Any:
     import transformers
 
-    sizes = transformers.LlamaConfig(
+    sizes: Any = transformers.LlamaConfig(  # type: ignore[call-arg]
         vocab_size=vocab_size,
         hidden_size=config.width,
         intermediate_size=config.mlp_dim,
@@ -105,6 +105,6 @@ def _llama(config: LlamaConfig, vocab_size: int) -> Any:
         rms_norm_eps=config.norm_eps,
         max_position_embeddings=MAX_POSITIONS,
         tie_word_embeddings=False,
-        attn_implementation="sdpa",
     )
+    sizes._attn_implementation = "sdpa"
     return transformers.LlamaForCausalLM(sizes)

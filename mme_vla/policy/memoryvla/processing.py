@@ -8,7 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.config.sections import read_section
+from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
+from mme_vla.policy.memoryvla.core import MemoryVlaConfig
 from mme_vla.processing.base import Counted, Sample
 from mme_vla.processing.clipped_quantiles import ClippedQuantiles
 from mme_vla.processing.openvla import OpenVlaProcessor
@@ -52,6 +55,20 @@ class MemoryVlaProcessor(OpenVlaProcessor):
             raise UserError(f"processor.group_size must be a whole number from 2 on, not {brief(size)}.")
         built = super().from_config({key: value for key, value in config.items() if key != "group_size"})
         built.group_size = size
+        return built
+
+    @classmethod
+    def from_sections(cls, sections: Mapping[str, Any]) -> Self:
+        """As `Processor.from_sections`, at the sizes of the section `backbone`, which is no `Backbone` here."""
+        of_network = {key: value for key, value in sections["backbone"].items() if key != "name"}
+        sizes = read_section(MemoryVlaConfig, of_network, "backbone")
+        own = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
+        built = cls.from_config({**sections["processor"], **own, "embodiment": embodiment_of(sections).to_dict()})
+        if built.tokenizer.vocab_size > sizes.vocab_size:
+            raise UserError(
+                f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but "
+                f"backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the backbone."
+            )
         return built
 
     @property
