@@ -122,13 +122,8 @@ def add_adapters(
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
         raise missing_extra("LoRA", "vlm") from None
-    config = LoraConfig(
-        r=rank,
-        lora_alpha=alpha,
-        lora_dropout=dropout,
-        target_modules=chosen,
-        init_lora_weights=INITS[init],  # type: ignore[arg-type]
-    )
+    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": chosen, "init_lora_weights": INITS[init]}
+    config = LoraConfig(r=rank, lora_dropout=dropout, **options)
     inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}
 

@@ -21,11 +21,10 @@ _FEATURES = {"state": "observation.state", "actions": "action"}
 def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None:
     """The statistics in a checkpoint folder, or None where it has none.
 
-    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion Policy's `stats.json`, OpenVLA-OFT's
-    `dataset_statistics.json` of one dataset,
-    and the file that LeRobot's processor description names as the state of its normaliser. LeRobot's speak of the
-    actions it was trained on: they fit this library's joint deltas if that policy used relative actions with an
-    absolute gripper.
+    Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion Policy's `stats.json`,
+    OpenVLA-OFT's `dataset_statistics.json` of one dataset, and the file that LeRobot's processor description names as
+    the state of its normaliser. LeRobot's speak of the actions it was trained on: they fit this library's joint deltas
+    if that policy used relative actions with an absolute gripper.
 
     Args:
         folder: the checkpoint (for released runs: the step).
