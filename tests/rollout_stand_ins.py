@@ -43,11 +43,11 @@ class InlineEnvs:
     def busy(self) -> bool:
         return bool(self._replies)
 
-    def start(self, worker: int, job: Job) -> None:
+    def start(self, worker: int, job: Job, **how: Any) -> None:
         env = make_rollout_env(job.task, job.split, job.episode, **self._options)
         self.made[job] = env._env
         self._running[worker] = (job, env)
-        self._replies.append(Reply.of_outcome(worker, job, True, env.reset()))
+        self._replies.append(Reply.of_outcome(worker, job, True, env.reset(**how)))
 
     def send(self, worker: int, action: Any) -> None:
         job, env = self._running[worker]

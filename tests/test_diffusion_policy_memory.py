@@ -1,14 +1,19 @@
 """`diffusion_policy` with a memory: any of ours joins the condition through `film`, and decides about actions."""
 
+import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 pytest.importorskip("diffusers")
 
-from mme_vla import UserError, build_policy
+from mme_vla import Policy, UserError, build_policy
+from mme_vla.commands.train import train
+from mme_vla.config.composition import compose
 from mme_vla.policy.diffusion.policy import DiffusionPolicy
 from mme_vla.testing.small import moving_frames, unit_stats
 from mme_vla.types import HistoryTokens
@@ -89,6 +94,20 @@ def test_an_episode_remembers(policy: DiffusionPolicy) -> None:
     same, again, other = answer(0), answer(0), answer(5)
     np.testing.assert_array_equal(same, again)
     assert not np.allclose(same, other, atol=1e-6)
+
+
+def test_it_trains_on_cached_tokens(tmp_path: Path) -> None:
+    tower = [f"backbone.memory_tower.{key}={value}" for key, value in SMALL["memory_tower"].items()]
+    cfg = compose("train", [
+        "model=diffusion_policy", "memory=framesamp", "integration=film", "memory.budget=64", *tower, "logger=none",
+        "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=0",
+        "train.open_loop_chunks=0", f"data.cache.root={tmp_path / 'caches'}",
+    ])  # fmt: skip
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    checkpoint = train(cfg, config, tmp_path / "run", begun=time.perf_counter())
+    again = Policy.from_pretrained(checkpoint)
+    assert again.config["name"] == "diffusion_policy_framesamp_film"
+    assert again.memory is not None and again.memory.budget == 64
 
 
 def test_its_tower_stays_as_it_is_and_the_cameras_encoder_learns(policy: DiffusionPolicy) -> None:

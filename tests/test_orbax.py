@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -40,6 +41,17 @@ def test_plain_layout_reads_with_and_without_outer_names() -> None:
     assert tree["time_mlp_in/kernel"].dtype == torch.bfloat16
     assert tree["time_mlp_in/kernel"].float().tolist() == [[0, 0.25, 0.5], [0.75, 1, 1.25]]
     assert tree["scale"].shape == ()
+
+
+@pytest.mark.timeout(60)
+def test_a_pipe_in_the_place_of_a_part_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    folder = tmp_path / "params"
+    shutil.copytree(RUN / "100" / "params", folder)
+    part = max((file for file in folder.rglob("*") if file.is_file()), key=lambda file: file.stat().st_size)
+    part.unlink()
+    os.mkfifo(part)
+    with pytest.raises(UserError, match=f"{part.name} is not a file"):
+        read_orbax(folder)
 
 
 @pytest.mark.parametrize("place", [RUN, RUN / "100", RUN / "100" / "params"])

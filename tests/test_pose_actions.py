@@ -106,8 +106,8 @@ def test_a_policy_of_poses_trains_and_keeps_its_robot(folder: Path, tmp_path: Pa
 class MotionEnvs(InlineEnvs):
     """Environments in which an action is a motion of three frames."""
 
-    def start(self, worker: int, job: Job) -> None:
-        super().start(worker, job)
+    def start(self, worker: int, job: Job, **how: Any) -> None:
+        super().start(worker, job, **how)
         env = self.made[job]
         joints = env.step
 
@@ -127,12 +127,14 @@ def test_a_rollout_of_motions_remembers_every_frame_and_asks_after_each_motion()
     assert record.outcome == "timeout" and record.steps % 3 == 0 and record.action_space == "waypoint"
     assert record.extra["chunks"] == record.steps // 3, "one motion of a chunk is executed, then the policy is asked"
     assert {action[6] for action in envs.made[job].actions} <= {-1.0, 1.0}, "the gripper is opened or closed, no less"
+    (drawn,) = roll(policy, [job], MotionEnvs(robot=policy.embodiment), max_steps=FACTS.max_steps, draw="all")
+    assert drawn.extra["actions_sha256"] == record.extra["actions_sha256"]
 
 
 def test_a_pose_out_of_reach_is_the_policys_failure() -> None:
     class OutOfReach(InlineEnvs):
-        def start(self, worker: int, job: Job) -> None:
-            super().start(worker, job)
+        def start(self, worker: int, job: Job, **how: Any) -> None:
+            super().start(worker, job, **how)
             refused = {"status": "error", "error_message": "IK failed"}
             self.made[job].step = lambda action: ({}, 0.0, True, False, refused)  # type: ignore[method-assign]
 

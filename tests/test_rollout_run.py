@@ -207,7 +207,7 @@ def test_impossible_settings_are_refused_by_name() -> None:
 
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
-        def start(self, worker, job):
+        def start(self, worker, job, **how):
             from mme_vla.envs.vector.jobs import Reply
 
             self._replies.append(Reply.of_failure(worker, job, True, self.kind, "no scene"))

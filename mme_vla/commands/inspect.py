@@ -69,7 +69,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _plain(section))
-    settings.add_row("tokenizer", policy.require_processor().words_from)
+    settings.add_row("words", policy.require_processor().words_from)
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
@@ -80,9 +80,11 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     stats = policy.require_processor().stats
     if stats is not None:
         numbers = _table("normalisation", "", *(str(i + 1) for i in range(max(len(stats.state), len(stats.actions)))))
-        for name, of in (("state", stats.state), ("action delta", stats.actions)):
-            for quantile in ("q01", "q99"):
-                numbers.add_row(f"{name} {quantile}", *(f"{x:.3f}" for x in getattr(of, quantile)))
+        action = "action delta" if policy.embodiment.action.relative else "action"
+        for name, of in (("state", stats.state), (action, stats.actions)):
+            for bound in ("min", "q01", "q99", "max"):
+                if getattr(of, bound) is not None:  # extremes are kept where a policy normalises by them
+                    numbers.add_row(f"{name} {bound}", *(f"{x:.3f}" for x in getattr(of, bound)))
         console.print(numbers)
 
 

@@ -3,13 +3,15 @@
 import multiprocessing
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from omegaconf import OmegaConf
 
 from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.recorded import Job, Wanted
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, read_json, write_json
@@ -21,8 +23,15 @@ if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import Recording
 
 
+KEYS = ("frames", "memory")
+FAILED = "the demonstration did not end in success"
+
+
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
+
+    Where which frames are drawn depends on the demonstration, it is made twice: once without a look, which says what
+    these frames are, and again with pictures of them.
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
@@ -37,17 +46,28 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     failures: dict[int, str] = {}
     draft = folder / f"{job.name}.writing"
     for seed in range(job.seed, job.seed + job.retries):
+        scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
+        blind: Recording | None = None
         try:
-            task = make_task(job.task, render=True, seed=seed, difficulty=job.difficulty, recovery=job.recovery)
+            drawing = None if job.frames is None else job.frames.beforehand()
+            if job.frames is not None and drawing is None:
+                blind = _unseen(job.task, scene)
+                if not blind.success:
+                    failures[seed] = blind.error or FAILED
+                    continue
+                drawing = job.frames.drawing(blind.frames)
+            task = make_task(job.task, render=True, **scene)
         except SceneError as error:
             failures[seed] = str(error)
             continue
-        writer = EpisodeWriter(draft, job.episode, task)
+        writer = EpisodeWriter(draft, job.episode, task, job.frames)
         try:
-            result: Recording = Recorder(task, on_step=writer.add).record()
+            result: Recording = Recorder(task, on_step=writer.add, drawing=drawing).record()
         finally:
             writer.close()
             task.close()
+        if blind is not None and (blind.steps, blind.stored) != (result.steps, result.stored):
+            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when drawn.")
         if result.success:
             draft.rename(folder / f"{job.name}.h5")
             if previews is not None:
@@ -58,13 +78,24 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             done = {"task": job.task, "episode": job.episode, "seed": seed, **counts, "failed_seeds": failures}
             write_json(folder / f"{job.name}.json", done, indent=None)  # last: what it tells of is there
             return done
-        failures[seed] = result.error or "the demonstration did not end in success"
+        failures[seed] = result.error or FAILED
     draft.unlink(missing_ok=True)
     last = list(failures.items())[-1]
     raise UserError(
         f"{job.task} episode {job.episode}: none of the seeds {job.seed} … {last[0]} succeeded; the last: {last[1]}. "
         "Raise retries, or leave this episode out."
     )
+
+
+def _unseen(task: str, scene: dict[str, Any]) -> "Recording":
+    """The same demonstration without pictures, its steps in memory."""
+    from mme_vla.envs.recording.recorder import Recorder
+
+    env = make_task(task, render=False, **scene)
+    try:
+        return Recorder(env, render=False).record()
+    finally:
+        env.close()
 
 
 def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None) -> list[dict[str, Any]]:
@@ -114,9 +145,22 @@ def plan(cfg: "DictConfig") -> list[Job]:
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
+    frames = _chosen_frames(cfg)
     return [
-        Job(s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None, cfg.retries) for s in specs
+        Job(s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None, cfg.retries, frames)
+        for s in specs
     ]
+
+
+def _chosen_frames(cfg: "DictConfig") -> FrameChoice | None:
+    given: Any
+    memory: Any
+    given, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
+    if given == "all":
+        if memory is not None:
+            raise UserError("frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
+        return None
+    return FrameChoice(given, memory)
 
 
 def run(cfg: "DictConfig") -> None:
@@ -156,7 +200,7 @@ def run(cfg: "DictConfig") -> None:
 
 def _claim(work: Path, jobs: Sequence[Job]) -> None:
     """Make `work` the folder of these episodes, or recognise it as such."""
-    if not claim_plan(work, [asdict(job) for job in jobs]):
+    if not claim_plan(work, [job.plan for job in jobs]):
         raise UserError(
             f"{work} holds an interrupted recording of other episodes. Repeat that command to finish it, choose "
             "another output, or remove that folder yourself."

@@ -10,6 +10,8 @@ from mme_vla.embodiment import Camera, Embodiment
 from mme_vla.errors import UserError, brief, listed
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
+DRAWN = "_drawn"
+"""After a camera's name: the column that says which frames it was drawn at, where not at all."""
 _USUAL = {"state": ("observation.state",), "action": ("action", "actions")}
 
 
@@ -63,6 +65,7 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     _check_width(root, "state", state, features, robot.state.width, robot)
     _check_width(root, "action", action, features, robot.action.width, robot)
     tables = ["episode_index", *state, *action, *(name for name in OPTIONAL if name in features)]
+    tables += [f"{name}{DRAWN}" for name in cameras if f"{name}{DRAWN}" in features]
     tables += [column for column in cameras.values() if features[column]["dtype"] == "image"]
     return Columns(cameras, state, action, tuple(dict.fromkeys(tables)))
 

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
+from mme_vla.data.columns import DRAWN
+from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, any_chosen_frames, open_episode, pose_columns
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries
-from mme_vla.embodiment.robomme import ARM_JOINTS, POSE
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
@@ -35,6 +36,8 @@ class ConvertOptions:
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
     poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
+    partly: say in two more columns which frames were drawn; `convert` does where an episode was recorded at a choice of
+        frames. The pictures of the others repeat an earlier one, and readers refuse them.
     """
 
     images: str = "video"
@@ -44,6 +47,7 @@ class ConvertOptions:
     pix_fmt: str = "yuv444p"
     gop: int = 8
     poses: tuple[str, ...] = ()
+    partly: bool = False
 
     def __post_init__(self) -> None:
         if self.images not in ("video", "png"):
@@ -68,6 +72,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
         **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
+        **{f"{c}{DRAWN}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
     }
 
 
@@ -83,7 +88,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     """
     if not episodes:
         raise UserError("There is no episode to convert.")
-    options = replace(options or ConvertOptions(), poses=pose_columns(episodes))
+    options = replace(options or ConvertOptions(), poses=pose_columns(episodes), partly=any_chosen_frames(episodes))
     plan = _plan(episodes, options)
     partial = _work_folder(output)
     if _finished(output, plan) and not partial.exists():
@@ -113,7 +118,7 @@ def _work_folder(output: Path) -> Path:
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
     """The options as a plan holds them; the poses stand beside them there, as plans from before had none."""
-    return {key: value for key, value in asdict(options).items() if key != "poses"}
+    return {key: value for key, value in asdict(options).items() if key not in ("poses", "partly")}
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
@@ -198,6 +203,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
             "goals": episode.goals,
             "length": episode.length,
             "exec_start_idx": episode.exec_start,
+            **({"frames": episode.frames} if episode.frames is not None else {}),
         }
     (draft / SIDE_FILE).write_text(json.dumps(side))
     draft.rename(part)
@@ -238,6 +244,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 **{name: rows[step] for name, rows in tool.items()},
                 **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
                 **frame.subgoals,
+                **{f"{c}{DRAWN}": np.array([c in frame.drawn]) for c in CAMERAS if options.partly},
                 "task": goal,
             }
         )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.columns import find_columns, width_of
+from mme_vla.data.columns import DRAWN, find_columns, width_of
 from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
@@ -94,6 +94,9 @@ class EpisodeSource:
         for vectors in self._vectors_of.values():
             for name, width in vectors.items():
                 check_vectors(self.root, self._table, name, width)
+        self._drawn = {
+            name: self._column(f"{name}{DRAWN}").astype(bool) for name in self.columns if f"{name}{DRAWN}" in columns
+        }
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
     def __len__(self) -> int:
@@ -164,10 +167,29 @@ class EpisodeSource:
         return self._vectors("action", episode, start, stop)
 
     def decisions(self, episode: int) -> Sequence[int] | np.ndarray:
-        """The frames at which the robot decides on actions: all of the execution, or those before a motion begins."""
-        if self.robot.action.frames is None:
-            return self._motions_of(episode).decisions
-        return range(int(self.exec_starts[episode]), int(self.lengths[episode]))
+        """The frames at which the robot decides on actions: all of the execution, or those before a motion begins.
+
+        Of a recording that was drawn at a choice of frames, those of them that every camera shows.
+        """
+        first, length = int(self.exec_starts[episode]), int(self.lengths[episode])
+        motions = self.robot.action.frames is None
+        decided = self._motions_of(episode).decisions if motions else range(first, length)
+        if not self._drawn:
+            return decided
+        seen = np.logical_and.reduce([self.drawn(episode, name) for name in self.columns])
+        decided = np.asarray(decided)
+        return decided[seen[decided]]
+
+    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+        """Which frames of an episode show what was seen, bool [t]; by default of the camera that feeds memory.
+
+        All, unless the dataset was recorded at a choice of frames; the pictures of others are placeholders.
+        """
+        camera = self.robot.memory_camera if camera is None else camera
+        start, length = int(self._starts[episode]), int(self.lengths[episode])
+        if camera not in self._drawn:
+            return np.ones(length, bool)
+        return self._drawn[camera][start : start + length]
 
     def action_chunk(self, episode: int, start: int, horizon: int, offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """The chunk decided at frame `start`, the last action repeated past the episode's end.
@@ -211,7 +233,8 @@ class EpisodeSource:
         """Decode pictures [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory.
 
         Raises:
-            UserError: no such camera, a frame outside the episode, or a damaged or missing video.
+            UserError: no such camera, a frame outside the episode or one that was not drawn, or a damaged or missing
+                video.
         """
         indices = np.asarray(indices, np.int64)
         length = int(self.lengths[episode])
@@ -220,6 +243,11 @@ class EpisodeSource:
         camera = self.robot.memory_camera if camera is None else camera
         if camera not in self.columns:
             raise UserError(f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
+        if not (drawn := self.drawn(episode, camera)[indices]).all():
+            raise UserError(
+                f"{self.name}, episode {episode}: {camera} was not drawn at frames {indices[~drawn].tolist()[:5]}. It "
+                "was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
+            )
         if camera in self._videos:
             path, offset = self._videos[camera].locate(episode)
             return self._reader.read(path, offset + indices / self.fps, self.fps)

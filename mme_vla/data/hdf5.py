@@ -1,14 +1,17 @@
 """Reading the official demonstration files, `record_dataset_<Task>.h5`, one episode at a time."""
 
+import json
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError, brief
 from mme_vla.files import decoding, require_file
 
@@ -16,9 +19,12 @@ SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grou
 _REMEDY = "Download or copy the file again."
 POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
 """Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
+FRAMES = "setup/frames"
+"""Where a file keeps the choice of frames it was recorded at, as JSON, if not all were drawn."""
+_PICTURES = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
 _REQUIRED = (
-    "obs/front_rgb", "obs/wrist_rgb", "obs/joint_state", "obs/gripper_state", "action/joint_action",
-    "info/is_video_demo", "info/is_completed", *(f"info/{name}" for name in SUBGOALS),
+    "obs/joint_state", "obs/gripper_state", "action/joint_action", "info/is_video_demo", "info/is_completed",
+    *(f"info/{name}" for name in SUBGOALS),
 )  # fmt: skip
 
 
@@ -43,6 +49,8 @@ class RawFrame:
     action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
     is_demo: the step belongs to the conditioning video.
     subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
+    drawn: the cameras that were drawn at this step; of the others `front` and `wrist` repeat an earlier picture (the
+        first one, before there is any).
     """
 
     front: np.ndarray
@@ -51,6 +59,7 @@ class RawFrame:
     action: np.ndarray
     is_demo: bool
     subgoals: dict[str, str]
+    drawn: frozenset[str] = frozenset(CAMERAS)
 
 
 def find_files(inputs: Sequence[str | Path]) -> list[Path]:
@@ -95,6 +104,15 @@ def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
     return tuple(name for name in POSE_ACTIONS if name in found)
 
 
+def any_chosen_frames(refs: Sequence[EpisodeRef]) -> bool:
+    """Whether one of these episodes was drawn at a choice of its frames only."""
+    for file in dict.fromkeys(ref.file for ref in refs):
+        with _open(file) as handle:
+            if any(f"{ref.group}/{FRAMES}" in handle for ref in refs if ref.file == file):
+                return True
+    return False
+
+
 class RawEpisode:
     """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
 
@@ -110,7 +128,9 @@ class RawEpisode:
             )
         self.length = len(steps)
         with decoding(f"{ref.file} {ref.group}", "an episode", _REMEDY):
-            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in _REQUIRED))
+            # A recording at a chosen list of frames has pictures at these alone.
+            pictures = () if FRAMES in group else _PICTURES.values()
+            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*pictures, *_REQUIRED)))
             missing = [name for name in needed if name not in group]
         if missing:
             raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
@@ -138,7 +158,13 @@ class RawEpisode:
             )
         return found
 
-    def _picture(self, step: int, name: str) -> np.ndarray:
+    def _picture(self, step: int, camera: str) -> np.ndarray:
+        name = _PICTURES[camera]
+        if self.frames is not None and not self.drawn[camera][step]:
+            raise UserError(
+                f"{self.ref.file} {self.ref.group}: {camera} was not drawn at step {step}; the episode was recorded "
+                f"with frames={self.frames['at']}."
+            )
         found = np.asarray(self._step(step, name))
         if found.dtype != np.uint8 or found.ndim != 3 or found.shape[-1] != 3:
             raise UserError(
@@ -188,6 +214,25 @@ class RawEpisode:
     def __len__(self) -> int:
         return self.length
 
+    @cached_property
+    def frames(self) -> dict[str, Any] | None:
+        """The choice of frames it was recorded at; None for one that was drawn whole."""
+        if FRAMES not in self._group:
+            return None
+        with decoding(f"{self.ref.file} {self.ref.group}/{FRAMES}", "JSON", _REMEDY):
+            found: dict[str, Any] = json.loads(self._text(self._value(FRAMES)))
+            return found
+
+    @cached_property
+    def drawn(self) -> dict[str, np.ndarray]:
+        """Which steps each camera shows, bool [t]."""
+        if self.frames is None:
+            return {camera: np.ones(self.length, bool) for camera in CAMERAS}
+        return {
+            camera: np.array([f"timestep_{k}/{name}" in self._group for k in range(self.length)])
+            for camera, name in _PICTURES.items()
+        }
+
     def subgoals(self) -> Iterator[dict[str, str]]:
         """The four texts of every step, as in `RawFrame`, without reading pictures."""
         subgoals: dict[str, str] = {}
@@ -212,30 +257,51 @@ class RawEpisode:
             UserError: a step has no 7 numbers, or none that are finite where there is no motion to take them from.
         """
         steps = [self._numbers(k, POSE_ACTIONS[column], 7, finite=False)[:7] for k in range(self.length)]
-        rows = np.stack(steps).astype(np.float32)
-        for part in (slice(0, self.exec_start), slice(self.exec_start, self.length)):
-            unknown = np.count_nonzero(np.isfinite(rows[part]), axis=1) < rows.shape[1]
-            if part.stop > part.start and unknown.all():
-                rows[part] = self._numbers(part.stop - 1, POSE_ACTIONS["ee_pose_actions"], 7)[:7]
-            elif unknown.any():
-                rows[part][unknown] = rows[part][~unknown][0]
-        return rows
+        return known_poses(
+            np.stack(steps), self.exec_start, lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7)[:7]
+        )
 
     def front(self, step: int) -> np.ndarray:
         """The front picture of one step, [H, W, 3] uint8."""
-        return self._picture(step, "obs/front_rgb")
+        return self._picture(step, "front")
 
     def __iter__(self) -> Iterator[RawFrame]:
+        for camera, drawn in self.drawn.items():
+            if not drawn.any():
+                raise UserError(f"{self.ref.file} {self.ref.group} has no picture of the camera {camera!r}. {_REMEDY}")
+        held = {camera: self._picture(int(drawn.argmax()), camera) for camera, drawn in self.drawn.items()}
         for k, subgoals in enumerate(self.subgoals()):
             fingers = self._numbers(k, "obs/gripper_state", 1)
+            now = frozenset(camera for camera, drawn in self.drawn.items() if drawn[k])
+            held |= {camera: self._picture(k, camera) for camera in now}
             yield RawFrame(
-                front=self.front(k),
-                wrist=self._picture(k, "obs/wrist_rgb"),
+                **held,
+                drawn=now,
                 state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers[:1]]).astype(np.float32),
                 action=self._numbers(k, "action/joint_action", 8),
                 is_demo=k < self.exec_start,
                 subgoals=subgoals,
             )
+
+
+def known_poses(noted: np.ndarray, exec_start: int, reached: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Poses of every step from those that were noted; see `RawEpisode.pose_actions`.
+
+    Args:
+        noted: [t, 7], NaN where there was none yet. exec_start: the first execution step.
+        reached: the pose [7] that a step's action asks for, by its number.
+
+    Returns:
+        [t, 7] float32.
+    """
+    rows = noted.astype(np.float32)
+    for part in (slice(0, exec_start), slice(exec_start, len(rows))):
+        unknown = np.count_nonzero(np.isfinite(rows[part]), axis=1) < rows.shape[1]
+        if part.stop > part.start and unknown.all():
+            rows[part] = reached(part.stop - 1)
+        elif unknown.any():
+            rows[part][unknown] = rows[part][~unknown][0]
+    return rows
 
 
 @contextmanager

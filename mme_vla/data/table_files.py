@@ -177,7 +177,7 @@ def _check_schema(file: Path, columns: Sequence[str], features: dict[str, Any]) 
             right = inner is not None and (pa.types.is_string(inner) or pa.types.is_large_string(inner))
         elif len(features[name]["shape"]) == 1 and features[name]["shape"][0] > 1:
             right = found is not None and _is_list(found) and _is_number(inner)
-        elif name not in _WHOLE:
+        elif name not in _WHOLE and features[name]["dtype"] != "bool":
             right = inner is not None and _is_number(inner)
         else:
             right = inner is not None and (pa.types.is_integer(inner) or pa.types.is_boolean(inner))

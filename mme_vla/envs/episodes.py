@@ -53,17 +53,11 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
             alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
             raise UserError(f"episodes={episodes} asks for the first {episodes}; {what} has {count}.{alone}")
         return list(range(episodes))
-    if isinstance(episodes, str):
-        parts: list[Any] = episodes.split(",")
-    elif isinstance(episodes, Sequence):
-        parts = list(episodes)
-    else:
-        raise UserError(f"episodes={episodes!r} is not understood; write {GRAMMAR}.")
-    spans = [_span(part, episodes) for part in parts]
-    for span in spans:
+    found = spans(episodes, "episodes", GRAMMAR)
+    for span in found:
         if span.stop > count:
             raise UserError(f"There is no episode {span.stop - 1} in {what}, which has {count}: 0 to {count - 1}.")
-    numbers = [number for span in spans for number in span]
+    numbers = [number for span in found for number in span]
     if not numbers or len(set(numbers)) < len(numbers):
         raise UserError(f"episodes={episodes} must name each episode once, and at least one.")
     return numbers
@@ -100,12 +94,30 @@ def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     return given if isinstance(given, str) else [str(name) for name in given]
 
 
-def _span(part: Any, episodes: Any) -> range:
+def spans(given: Any, key: str, grammar: str) -> list[range]:
+    """Read numbers and ranges: text such as `0-9` or `0-3,7`, or a list of such.
+
+    Args:
+        key: what they were given as, and `grammar` what may stand there, for messages.
+
+    Raises:
+        UserError: another form.
+    """
+    if isinstance(given, str):
+        parts: list[Any] = given.split(",")
+    elif isinstance(given, Sequence):
+        parts = list(given)
+    else:
+        raise UserError(f"{key}={given!r} is not understood; write {grammar}.")
+    return [_span(part, given, key, grammar) for part in parts]
+
+
+def _span(part: Any, given: Any, key: str, grammar: str) -> range:
     """The numbers of one part: a number, or `first-last`, both included."""
     found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
     if found is None or isinstance(part, bool | float):
-        raise UserError(f"episodes={episodes!r} is not understood; write {GRAMMAR}.")
+        raise UserError(f"{key}={given!r} is not understood; write {grammar}.")
     first, last = int(found[1]), int(found[2] or found[1])
     if first > last:
-        raise UserError(f"episodes={episodes}: the range {part} ends before it begins.")
+        raise UserError(f"{key}={given}: the range {part} ends before it begins.")
     return range(first, last + 1)

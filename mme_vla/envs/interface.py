@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
 from mme_vla.envs.robot.control import PlanningError
@@ -46,6 +47,8 @@ class _Run:
     """Those that the present call hands out."""
     newest: dict[str, Any] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
+    returned: int = 0
+    """Frames handed out since the reset."""
     count: int = 0
     """Control steps that count towards the limit."""
     terminated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
@@ -68,6 +71,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.
+        drawing: which frames have pictures, from the next call on; None for all. The others' are None in the lists.
 
     Raises:
         UserError: an unknown action space, or a limit that is no positive integer.
@@ -89,6 +93,7 @@ class RoboMMEEnv(gymnasium.Env):
         self.include = include or Include()
         self.max_steps = max_steps
         self.on_frame: FrameHook | None = None
+        self.drawing: Drawing | None = None
         self.render_mode = "rgb_array" if render else None
         self.action_space = self._space.space(task.stick)
         self._keys = frame_keys(self.include, render)
@@ -173,7 +178,7 @@ class RoboMMEEnv(gymnasium.Env):
         return observation, torch.zeros(()), run.terminated, run.truncated, dict(run.info)
 
     def render(self) -> np.ndarray | None:
-        """The newest front picture [256, 256, 3], or None without rendering or before the first reset."""
+        """The newest front picture [256, 256, 3]; None if it was not drawn, or before the first reset."""
         self._open_task()
         return None if self._run is None else self._run.newest.get("front_rgb")
 
@@ -202,7 +207,11 @@ class RoboMMEEnv(gymnasium.Env):
         self._observer.follow()
         if run.in_video and run.shown.text == NO_RECORD:
             return {}  # neither rendered nor returned
-        frame = run.newest = self._observer.frame(info)
+        cameras: tuple[str, ...] = tuple(CAMERAS)
+        if self.drawing is not None:
+            cameras = self.drawing.cameras(run.returned, newest=not run.in_video and not run.control.demonstrator.left)
+        frame = run.newest = self._observer.frame(info, cameras)
+        run.returned += 1
         run.info = self._info(run, info)
         run.frames.append(frame)
         if self.on_frame is not None:
@@ -253,14 +262,14 @@ class RoboMMEEnv(gymnasium.Env):
         info: dict[str, Any] = {
             "task_goal": list(task.goals()),
             "simple_subgoal_online": shown.text,
-            "grounded_subgoal_online": self._grounding.update(
-                shown, self._observer.segmentation if self._render else None
-            ),
             "status": self._status(run, bool(success), bool(fail)),
             "success": success,
             "fail": fail,
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
         }
+        if self.drawing is None or self.drawing.grounded:
+            look = self._observer.segmentation if self._render else None
+            info["grounded_subgoal_online"] = self._grounding.update(shown, look)
         if self.include.available_multi_choices or self._space.name == "multi_choice":
             info["available_multi_choices"] = [
                 {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}

@@ -3,8 +3,9 @@
 A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -105,6 +106,7 @@ class Observer:
         self.render = render
         self._angles = AngleTrack()
         self._eef = np.zeros(6)
+        self._taken: set[str] = set()
 
     def start(self) -> None:
         """Begin an episode."""
@@ -116,8 +118,13 @@ class Observer:
         pose = self.task.tcp_pose
         self._eef = np.concatenate([pose.p, self._angles.follow(pose.q)]).astype(np.float64)
 
-    def frame(self, info: dict[str, Any]) -> dict[str, Any]:
-        """The present moment; `info` is what the task has just evaluated."""
+    def frame(self, info: dict[str, Any], cameras: Collection[str] = tuple(SENSORS)) -> dict[str, Any]:
+        """The present moment; `info` is what the task has just evaluated.
+
+        Args:
+            cameras: those that take a picture; the others' are None.
+        """
+        self._taken = set()
         qpos = self.task.qpos
         frame: dict[str, Any] = {
             "joint_state": qpos[:ARM_JOINTS].astype(np.float32),
@@ -126,21 +133,25 @@ class Observer:
         }
         if self.include.maniskill_obs:
             frame["maniskill_obs"] = type(self.task).get_obs(self.task, info)
+            self._taken |= set(SENSORS)
         elif self.render:
-            self._take_pictures()
+            self._take_pictures(cameras)
         for name, camera in SENSORS.items():
             if self.render:
                 depth = getattr(self.include, f"{name}_depth")
-                images = self._read(camera, rgb=True, depth=depth)
-                frame[f"{name}_rgb"] = images["rgb"]
+                seen = name in cameras
+                images = self._read(camera, rgb=True, depth=depth) if seen else {}
+                frame[f"{name}_rgb"] = images.get("rgb")
                 if depth:
-                    frame[f"{name}_depth"] = images["depth"].astype(np.int16)
+                    frame[f"{name}_depth"] = images["depth"].astype(np.int16) if seen else None
             if getattr(self.include, f"{name}_camera_extrinsic"):
                 frame[f"{name}_camera_extrinsic"] = self.extrinsic(name)
         return frame
 
     def segmentation(self) -> np.ndarray:
-        """Object ids [256, 256] of the front picture that was taken last; nothing is rendered for it."""
+        """Object ids [256, 256] of the present front picture, which is taken if the frame has none."""
+        if "front" not in self._taken:
+            self._take_pictures(["front"])
         return self._read(SENSORS["front"], segmentation=True)["segmentation"][..., 0]
 
     def extrinsic(self, name: str) -> np.ndarray:
@@ -150,11 +161,14 @@ class Observer:
     def _wrist_pose(self) -> "sapien.Pose":
         return self.task.agent.robot.links_map["camera_link"].pose.sp
 
-    def _take_pictures(self) -> None:
+    def _take_pictures(self, cameras: Collection[str]) -> None:
+        if not cameras:
+            return
         scene = self.task.scene
         scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        for camera in SENSORS.values():
-            scene.sensors[camera].capture()
+        for name in cameras:
+            scene.sensors[SENSORS[name]].capture()
+        self._taken |= set(cameras)
 
     def _read(
         self, camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
@@ -177,6 +191,11 @@ def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:
 
 def front_extrinsic() -> np.ndarray:
     """World-to-camera matrix of the front camera, float32 [3, 4]; it never moves."""
+    return _front_extrinsic().copy()
+
+
+@cache
+def _front_extrinsic() -> np.ndarray:
     forward = _FRONT_TARGET - _FRONT_EYE
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])

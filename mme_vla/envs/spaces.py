@@ -24,6 +24,7 @@ from scipy.spatial.transform import Rotation
 from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
 from mme_vla.envs.choices import nearest_to_pixel
 from mme_vla.envs.grounding import project
+from mme_vla.envs.robot.control import GRIPPER_STEPS
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
@@ -108,13 +109,15 @@ class Waypoint(ActionSpace):
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
         numbers = _pose_numbers(action, stick)
-        control.demonstrator.move_to(_pose(numbers))
-        if stick:
-            return
-        if numbers[6] == -1:
-            control.demonstrator.close()
-        elif numbers[6] == 1:
-            control.demonstrator.open()
+        robot = control.demonstrator
+        grip = None if stick else {-1.0: robot.close, 1.0: robot.open}.get(numbers[6])
+        robot.and_then = 0 if grip is None else GRIPPER_STEPS
+        try:
+            robot.move_to(_pose(numbers))
+        finally:
+            robot.and_then = 0
+        if grip is not None:
+            grip()
 
 
 class MultiChoice(ActionSpace):

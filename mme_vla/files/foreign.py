@@ -17,13 +17,18 @@ def require_file(path: Path, what: str = "a file") -> Path:
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
-        raise UserError(f"{path} is missing; expected {what}.") from None
+        raise UserError(f"{_shown(path)} is missing; expected {what}.") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{path} cannot be read as {what}: {reason}.") from None
+        raise UserError(f"{_shown(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
     if not stat.S_ISREG(mode):
-        raise UserError(f"{path} is not a file; expected {what}.")
+        raise UserError(f"{_shown(path)} is not a file; expected {what}.")
     return path
+
+
+def _shown(path: Path) -> str:
+    """A path in a message; a stranger's file may have given it a name of any length."""
+    return brief(str(path), 300, quote=False)
 
 
 @contextmanager

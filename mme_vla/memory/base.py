@@ -64,6 +64,24 @@ class Memory(nn.Module):
         """
         raise NotImplementedError
 
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        """Say which frames `select` may choose from, or the scorer look at, when it is asked at these steps.
+
+        What is not among them need not be drawn in a simulation, nor encoded. By default all that is stored or scored.
+
+        Args:
+            steps: current frames, video included. exec_start: as in `History`.
+
+        Returns:
+            int64 [n], ascending, each once.
+        """
+        length = int(max(steps, default=-1)) + 1
+        return every_one([self.storage.kept_frames(length), self.frames_scored(length)])
+
+    def frames_scored(self, length: int) -> np.ndarray:
+        """Say which of the first `length` frames the scorer has to be shown: by default all, where there is one."""
+        return np.arange(0 if self.make_scorer() is None else length)
+
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].
 
@@ -115,6 +133,11 @@ class Memory(nn.Module):
             histories: one per episode. streams: what `start_stream` gave each of them; updated in place.
         """
         return self(stack_history([self.recall(history, len(history) - 1) for history in histories]))
+
+
+def every_one(lists: Sequence[np.ndarray]) -> np.ndarray:
+    """All frames of some lists, ascending, each once; int64 [n]."""
+    return np.unique(np.concatenate(lists)) if lists else np.zeros(0, np.int64)
 
 
 def whole_frames(frames: np.ndarray, grid: int) -> np.ndarray:

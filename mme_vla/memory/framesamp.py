@@ -1,11 +1,12 @@
 """FrameSamp: whole frames, evenly spaced over video and execution alike (paper, section 4.2)."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import whole_frames
+from mme_vla.memory.base import every_one, whole_frames
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.perceptual import PerceptualMemory
 from mme_vla.registry import MEMORIES
@@ -35,6 +36,9 @@ class FrameSamp(PerceptualMemory):
             )
         super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
         self.frames = budget // grid**2
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return every_one([evenly_spaced_frames(int(step), self.frames) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         return whole_frames(evenly_spaced_frames(step, self.frames), self.storage.grid)

@@ -106,7 +106,8 @@ class History:
             lost = sorted(set(np.asarray(frames).tolist()) - set(kept.tolist()))
             raise UserError(
                 f"The history holds no tokens of frames {lost[:5]}: it has seen {len(self)} frames and keeps frame 0 "
-                f"and every {self.spec.keep_every}th. The memory selects frames that its StorageSpec does not keep."
+                f"and every {self.spec.keep_every}th, as far as they were drawn. The memory selects frames that its "
+                "StorageSpec does not keep, or that its `frames_read` does not name and nobody drew."
             )
         return rows
 
@@ -167,18 +168,36 @@ class OnlineHistory(History):
             return FrameScores.empty(self.spec.grid**2)
         return FrameScores(np.asarray(self._score_frames, np.int64), np.stack(self._score_values))
 
-    def wanted(self, count: int) -> np.ndarray:
-        """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`."""
-        kept = self.spec.kept_frames(self._length + count)
-        return kept[kept >= self._length] - self._length
+    def wanted(self, count: int, drawn: np.ndarray | None = None) -> np.ndarray:
+        """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`.
 
-    def append(self, frames: Sequence[np.ndarray] | np.ndarray, tokens: Tensor) -> None:
-        """Add frames [t, H, W, 3] uint8 in order, with the tokens [wanted, patches, d_vision] of the wanted ones."""
-        wanted = self.wanted(len(frames))
+        Args:
+            drawn: offsets of those that have a picture; by default all.
+        """
+        kept = self.spec.kept_frames(self._length + count)
+        kept = kept[kept >= self._length] - self._length
+        return kept if drawn is None else np.intersect1d(kept, drawn)
+
+    def append(
+        self,
+        frames: Sequence[np.ndarray] | np.ndarray,
+        tokens: Tensor,
+        drawn: np.ndarray | None = None,
+        count: int | None = None,
+    ) -> None:
+        """Add frames in order.
+
+        Args:
+            frames: pictures [n, H, W, 3] uint8. tokens: of the wanted ones, [wanted, patches, d_vision].
+            drawn: offsets [n] of the pictures among the frames, of which there are `count`; by default they are all.
+        """
+        count = len(frames) if count is None else count
+        wanted, numbers = self.wanted(count, drawn), np.arange(count) if drawn is None else drawn
         if len(tokens) != len(wanted):
             raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
         if self._scorer is not None:
-            rows = [(self._length + i, self._scorer(self._length + i, frame)) for i, frame in enumerate(frames)]
+            shown = zip((numbers + self._length).tolist(), frames, strict=True)
+            rows = [(number, self._scorer(number, frame)) for number, frame in shown]
             self._score_frames += [frame for frame, values in rows if values is not None]
             self._score_values += [np.asarray(values, np.float32) for _, values in rows if values is not None]
         if len(tokens):
@@ -186,7 +205,7 @@ class OnlineHistory(History):
             assert self._tokens is not None
             self._tokens[len(self._kept) : len(self._kept) + len(tokens)] = tokens
             self._kept.extend((wanted + self._length).tolist())
-        self._length += len(frames)
+        self._length += count
 
     def _grow(self, needed: int, like: Tensor) -> None:
         capacity = 0 if self._tokens is None else len(self._tokens)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, every_one
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -58,6 +58,12 @@ class JoinedMemory(Memory):
             for member, seen in zip(self.memories, self._views(history), strict=True)
         ]
         return np.unique(np.concatenate(chosen), axis=0)
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        return every_one([member.frames_read(steps, exec_start) for member in self.memories])
+
+    def frames_scored(self, length: int) -> np.ndarray:
+        return every_one([member.frames_scored(length) for member in self.memories])
 
     def make_scorer(self) -> FrameScorer | None:
         for member in self.memories:

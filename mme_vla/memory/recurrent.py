@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, token_positions, whole_frames
+from mme_vla.memory.base import Memory, every_one, token_positions, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.sampling import jittered, recurrent_frames
@@ -132,6 +132,10 @@ class RecurrentMemory(Memory):
         """Frames read at `step`, ascending; the last is `step`."""
         frames = recurrent_frames(step, history.exec_start, self.max_steps, self.max_video, self.stride)
         return frames if rng is None or not self.jitter else jittered(frames, history.exec_start, self.jitter, rng)
+
+    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
+        limits = (self.max_steps, self.max_video, self.stride)
+        return every_one([recurrent_frames(int(step), exec_start, *limits) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         return whole_frames(self.frames(history, step, rng), self.storage.grid)

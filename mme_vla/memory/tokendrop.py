@@ -85,6 +85,9 @@ class TokenDrop(PerceptualMemory):
     def make_scorer(self) -> ChangeScorer:
         return ChangeScorer(self.storage.grid, self.stride)
 
+    def frames_scored(self, length: int) -> np.ndarray:
+        return self.storage.kept_frames(length)
+
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         scores = history.scores.until(step) if self.causal else history.scores
         return most_changed(ranked_patches(scores, self.storage.grid**2, self.candidates), step, self.budget)

@@ -130,6 +130,19 @@ class Policy(Saved):
         """A normalised chunk [n, h, a] for what `observation` saw, through what the episodes remember."""
         raise NotImplementedError
 
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """Which frames of the memory camera are looked at, beside the current ones, when acting at these steps.
+
+        A simulation draws no others. By default None: every frame of every camera may be.
+
+        Args:
+            steps: [n] current frames, video included. exec_start: the first execution frame.
+
+        Returns:
+            int64 [n], ascending, each once; or None.
+        """
+        return None
+
     def encode_frames(self, frames: np.ndarray) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them.
 

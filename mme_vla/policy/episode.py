@@ -1,6 +1,6 @@
 """One running episode: all streaming state lives here, never on the policy."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -43,7 +43,7 @@ class Episode:
     def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
         self._policy = policy
         self._generator = torch.Generator().manual_seed(seed)
-        self._seen: list[tuple[Tensor, Tensor]] = []
+        self._seen: list[tuple[Tensor | None, Tensor]] = []  # None: that frame was not drawn
         """Pictures and states of the frames that the policy sees at once, the current one last."""
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
@@ -64,11 +64,15 @@ class Episode:
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
+        drawn: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames in order, each once, the current one last; the conditioning video comes first.
 
         Args:
             frames: of every camera by its name (`front` and `wrist`), each [t, H, W, 3] uint8.
+            drawn: of every camera the places, ascending, among the t frames that `frames` shows, where not all were
+                drawn. `act` needs the last one of every camera; of the others a memory needs what its `frames_read`
+                names.
             states: [t, s].
             is_demo: whether the frames belong to the conditioning video; one bool, or [t].
             actions: [t, w] absolute actions that led to these frames. By default they are the first t of the last
@@ -83,7 +87,7 @@ class Episode:
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count, width = len(states) if states.ndim else 0, self._robot.state.width
-        even = all(len(view) == count for view in views.values())
+        even = all(len(view) == (count if drawn is None else len(drawn[name])) for name, view in views.items())
         if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in views.items())
             raise UserError(
@@ -98,11 +102,12 @@ class Episode:
         # Of the frames that the window has room for, those of the execution; the current one in any case.
         recent = range(max(count - processor.window, 0) if processor.consecutive else count - 1, count)
         seen = [
-            (processor.images([view[i] for view in views.values()]), torch.from_numpy(states[i].copy()))
+            (self._pictures(views, drawn, i), torch.from_numpy(states[i].copy()))
             for i in recent
             if i == count - 1 or not demo[i]
         ]
-        self._take(views[self._robot.memory_camera], demo, executed)
+        camera = self._robot.memory_camera
+        self._take(views[camera], demo, executed, None if drawn is None else np.asarray(drawn[camera], np.int64))
         self._see(seen)
 
     def remember(
@@ -157,11 +162,14 @@ class Episode:
             raise UserError("A conditioning-video frame came after the first execution frame; the video goes first.")
         return demo, self._executed_now(int((~demo).sum()), actions)
 
-    def _take(self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
+    def _take(
+        self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray, drawn: np.ndarray | None = None
+    ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            wanted = self.history.wanted(len(frames))
-            self.history.append(frames, self._policy.encode_frames(frames[wanted]))
+            wanted = self.history.wanted(len(demo), drawn)
+            places = wanted if drawn is None else np.searchsorted(drawn, wanted)
+            self.history.append(frames, self._policy.encode_frames(frames[places]), drawn, len(demo))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().past_actions
@@ -169,7 +177,7 @@ class Episode:
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
-        self.frames_seen += len(frames)
+        self.frames_seen += len(demo)
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -189,9 +197,13 @@ class Episode:
 
     @property
     def images(self) -> Tensor:
-        """The current views [v, 3, s, s] uint8."""
+        """The current views [v, 3, s, s] uint8.
+
+        Raises:
+            UserError: no frame was seen yet, or the current one was not drawn.
+        """
         self._require_observation()
-        return self._seen[-1][0]
+        return self._drawn(self._seen[-1][0])
 
     @property
     def state(self) -> Tensor:
@@ -204,11 +216,14 @@ class Episode:
         """Views [t, v, 3, s, s] uint8 and states [t, s] of the frames that the policy sees at once, the current last.
 
         Where fewer frames of the execution have been seen, the oldest stands for those before it.
+
+        Raises:
+            UserError: no frame was seen yet, or one of these was not drawn.
         """
         self._require_observation()
         missing = self._policy.require_processor().window - len(self._seen)
         seen = [self._seen[0]] * missing + self._seen
-        return torch.stack([images for images, _ in seen]), torch.stack([state for _, state in seen])
+        return torch.stack([self._drawn(images) for images, _ in seen]), torch.stack([state for _, state in seen])
 
     @property
     def prompt(self) -> Any:
@@ -252,9 +267,26 @@ class Episode:
         """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
         return self._policy.sample_draws(self._generator)
 
-    def _see(self, seen: list[tuple[Tensor, Tensor]]) -> None:
+    def _pictures(
+        self, views: Mapping[str, np.ndarray], drawn: Mapping[str, np.ndarray] | None, frame: int
+    ) -> Tensor | None:
+        """One of the frames given as the network takes it; None where a camera did not show it."""
+        if drawn is None:
+            shown = [view[frame] for view in views.values()]
+        elif all(frame in drawn[name] for name in views):
+            shown = [view[int(np.searchsorted(drawn[name], frame))] for name, view in views.items()]
+        else:
+            return None
+        return self._policy.require_processor().images(shown)
+
+    def _drawn(self, images: Tensor | None) -> Tensor:
+        if images is None:
+            raise UserError("The current frame was not drawn: observe() a picture of every camera before act().")
+        return images
+
+    def _see(self, seen: Sequence[tuple[Tensor | None, Tensor]]) -> None:
         """Take what is new into the window."""
-        self._seen = (self._seen + seen)[-self._policy.require_processor().window :]
+        self._seen = [*self._seen, *seen][-self._policy.require_processor().window :]
 
     def _require_observation(self) -> None:
         if not self._seen:

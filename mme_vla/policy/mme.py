@@ -248,6 +248,10 @@ class MMEPolicy(Policy):
         with self.autocast():
             return self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
 
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
+        """What the memory reads; nothing without one."""
+        return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
+
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
         storage, width = self.require_memory().storage, self.backbone.vision_width

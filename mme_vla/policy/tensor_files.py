@@ -107,7 +107,8 @@ def check_header(file: Path) -> None:
         with file.open("rb") as opened:
             header = int.from_bytes(opened.read(8), "little")
     except OSError as error:
-        raise UserError(f"{file} cannot be read as a safetensors file: {error.strerror or error}.") from None
+        shown = brief(str(file), 300, quote=False)  # an index may give a name of any length
+        raise UserError(f"{shown} cannot be read as a safetensors file: {error.strerror or error}.") from None
     if header > min(_HEADER_LIMIT, about.st_size - 8):
         raise UserError(
             f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "

@@ -1,6 +1,6 @@
 """A predictor in the background: the policy acts on with the last subgoal until the next one is there."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from typing import Any
 
@@ -20,17 +20,22 @@ class BackgroundEpisode(SubgoalEpisode):
         self.inner = inner
         self.answered = False
         self.fresh = False
-        self._news: list[tuple[np.ndarray, Mapping[str, Any] | None]] = []
+        self._news: list[Callable[[], None]] = []
+
+    def skip(self, count: int) -> None:
+        """Let frames pass, see `SubgoalEpisode`."""
+        super().skip(count)
+        self._news.append(lambda: self.inner.skip(count))
 
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
         """Take frames, see `SubgoalEpisode`."""
         super().observe(frames, info)
-        self._news.append((frames, info))
+        self._news.append(lambda: self.inner.observe(frames, info))
 
     def catch_up(self) -> SubgoalEpisode:
         """Hand on what was seen meanwhile; only while no model answers for this episode."""
-        for frames, info in self._news:
-            self.inner.observe(frames, info)
+        for tell in self._news:
+            tell()
         self._news.clear()
         return self.inner
 
@@ -49,6 +54,7 @@ class BackgroundPredictor(SubgoalPredictor):
     def __init__(self, inner: SubgoalPredictor) -> None:
         super().__init__(inner.kind, inner.interval)
         self.inner, self.usage, self.settings = inner, inner.usage, inner.settings
+        self.sees_video, self.sees_passing = inner.sees_video, inner.sees_passing
         self._asked: list[BackgroundEpisode] = []
         self._answers: Future[list[Subgoal]] | None = None
 

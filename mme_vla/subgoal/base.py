@@ -82,6 +82,13 @@ class SubgoalEpisode:
         self.asked_step: int | None = None
         self._frame: np.ndarray | None = None
 
+    def skip(self, count: int) -> None:
+        """Let execution frames pass that were not drawn, before the next `observe`.
+
+        Only where nobody looks at them (`SubgoalPredictor.sees_passing`).
+        """
+        self.frames_seen += count
+
     def observe(self, frames: np.ndarray, info: Mapping[str, Any] | None = None) -> None:
         """Take execution frames [n, H, W, 3] uint8 in order, each once, the current one last.
 
@@ -125,6 +132,11 @@ class SubgoalPredictor:
 
     settings: the options that `build_predictor` built it from, as plain values; empty for one built otherwise.
     """
+
+    sees_video = True
+    """Whether `start_episode` has to be given the pictures of a conditioning video."""
+    sees_passing = True
+    """Whether frames are looked at besides those at which `predict` is called."""
 
     def __init__(self, kind: str = "grounded", interval: int = 1) -> None:
         if kind not in KINDS:

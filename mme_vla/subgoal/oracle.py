@@ -17,6 +17,8 @@ class Oracle(SubgoalPredictor):
     stays, as in training.
     """
 
+    sees_video = sees_passing = False
+
     def answer(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
         """Look the texts up.
 

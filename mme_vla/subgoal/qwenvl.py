@@ -70,6 +70,8 @@ class QwenVL(VLMPredictor):
         hold: keep the first subgoals of three tasks for a fixed time, as released.
     """
 
+    sees_passing = False
+
     def __init__(self, kind: str = "grounded", interval: int = 1, hold: bool = True, **options: Any) -> None:
         super().__init__(kind, interval, **options)
         self.hold = hold

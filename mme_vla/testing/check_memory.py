@@ -65,6 +65,13 @@ class Episode:
         self.extend(history, piece, self.length if until is None else until)
         return history
 
+    def sparse(self, drawn: np.ndarray, until: int) -> OnlineHistory:
+        """The first `until` frames, of which only some have a picture."""
+        history = OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start)
+        tokens = self.tokens[history.wanted(until, drawn)]
+        history.append(self.pictures[drawn], tokens, drawn, until)
+        return history
+
     def extend(self, history: OnlineHistory, piece: int, until: int) -> None:
         """Deliver the frames that a history lacks, up to `until`."""
         for start in range(len(history), until, piece):
@@ -94,6 +101,10 @@ def check_selection(memory: Memory, frames: int) -> None:
         assert np.array_equal(chosen, again), "without rng, select must make the same choice every time."
         short = memory.select(episode.cached(step + 1), step)
         assert np.array_equal(chosen, short), f"what comes after step {step} changed what select chose there."
+        read = memory.frames_read([step], episode.exec_start)
+        assert set(chosen[:, 0].tolist()) <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
+        sparse = memory.select(episode.sparse(read, step + 1), step)
+        assert np.array_equal(chosen, sparse), f"at step {step} select differs where only frames_read was drawn."
     for piece in (1, 16, 23):
         history = episode.online(piece)
         offline = memory.select(whole, frames - 1)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, missing_extra
-from mme_vla.files import inside, read_text
+from mme_vla.files import inside, read_text, require_file
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 _ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
@@ -61,6 +61,8 @@ def read_orbax(params: Path, fits: Callable[[Mapping[str, Tensor]], None] | None
     for place in params.rglob("*"):
         if place.is_symlink():
             inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
+        if not place.is_dir():  # tensorstore would wait for a pipe without end
+            require_file(place, "a part of an Orbax checkpoint")
     ocdbt = (params / MANIFEST).is_file()
     try:
         arrays = _list_arrays(ts, params, ocdbt)

@@ -47,11 +47,11 @@ def add_noise(schedule: Schedule, chunk: Tensor, noise: Tensor, step: Tensor) ->
     return noisy
 
 
-def denoise_once(schedule: Schedule, predicted: Tensor, step: int, x: Tensor, fresh: Tensor) -> Tensor:
-    """One step of the way back, from the predicted noise and, but for the last one, fresh noise of the same shape."""
+def denoise_once(schedule: Schedule, predicted: Tensor, step: int, x: Tensor, fresh: Tensor | None) -> Tensor:
+    """One step of the way back, from the predicted noise and fresh noise of the same shape, which step 0 needs not."""
     steps = torch.full((len(x),), step, device=x.device)
     mean: Tensor = schedule.batch_step_no_noise(predicted, steps, x)
-    if step == 0:
+    if step == 0 or fresh is None:
         return mean
     variance: Tensor = schedule._get_variance(step)
     return mean + variance.to(x) ** 0.5 * fresh
@@ -77,5 +77,5 @@ def sample(
     x = start
     for i, step in enumerate(schedule.timesteps.tolist()):
         predicted = predict(x, torch.full((len(x),), step, device=x.device))
-        x = denoise_once(schedule, predicted, step, x, fresh[:, min(i, fresh.shape[1] - 1)])
+        x = denoise_once(schedule, predicted, step, x, fresh[:, i] if step else None)
     return x

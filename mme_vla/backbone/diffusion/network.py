@@ -7,6 +7,7 @@ from torch.utils.checkpoint import checkpoint
 from mme_vla.backbone.diffusion.keypoints import keypoint_pool, picture_encoder
 from mme_vla.backbone.diffusion.sizes import DiffusionSizes
 from mme_vla.backbone.diffusion.unet import ConditionalUnet1d
+from mme_vla.backbone.pi05.backbone import initialise
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 
 
@@ -30,6 +31,7 @@ class DiffusionNetwork(nn.Module):
         # The tower comes first: with one seed it is the same whatever else is built, and so is a cache made by it.
         if tower:
             self.vision = VisionTower(sizes.memory_tower, sizes.memory_width)
+            initialise(self.vision)
         self.image_encoder = picture_encoder()
         self.image_pool = keypoint_pool(sizes.keypoints)
         self.text_proj = nn.Sequential(

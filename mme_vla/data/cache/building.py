@@ -11,7 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.data.cache.store import DTYPES, FINGERPRINT, check_fingerprint, score_file, sum_file, token_file
+from mme_vla.data.cache.store import (
+    DTYPES,
+    FINGERPRINT,
+    check_fingerprint,
+    kept_frames,
+    score_file,
+    sum_file,
+    token_file,
+)
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
@@ -89,8 +97,7 @@ def estimate(
     source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
 ) -> Estimate:
     """Measure a few batches of the first episode and extrapolate to the dataset."""
-    spec = memory.storage
-    kept = sum(len(spec.kept_frames(int(length))) for length in source.lengths)
+    kept = sum(len(kept_frames(source, episode, memory.storage)) for episode in range(len(source)))
     chunk = next(_chunks(source, 0, memory, batch_size))
     encode(chunk.kept_pictures[:1])  # the first call pays for warming up
     started = time.perf_counter()
@@ -117,12 +124,12 @@ class _Chunk:
 
 def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
     spec, length, scorer = memory.storage, int(source.lengths[episode]), memory.make_scorer()
-    kept = spec.kept_frames(length)
+    kept, scored = kept_frames(source, episode, memory.storage), memory.frames_scored(length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
     for start in range(0, length, span):
         stop = min(start + span, length)
         here = kept[(kept >= start) & (kept < stop)]
-        wanted = np.arange(start, stop) if scorer is not None else here
+        wanted = np.union1d(here, scored[(scored >= start) & (scored < stop)])
         if not len(wanted):
             continue
         pictures = source.frames(episode, wanted)
@@ -159,6 +166,8 @@ def _build_episode(
                 raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.kept_pictures)} frames")
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
+    if not rows:
+        raise UserError(f"{source.name}, episode {episode}: none of the frames that the memory stores was drawn.")
     drafts: dict[Path, Path] = {}
     if memory.storage.scorer:
         stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)

@@ -75,6 +75,12 @@ def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) ->
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
 
+def kept_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
+    """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were drawn."""
+    kept = spec.kept_frames(int(source.lengths[episode]))
+    return kept[source.drawn(episode)[kept]]
+
+
 def token_file(folder: Path, episode: int) -> Path:
     """Tokens of an episode, [kept frames, patches, d]."""
     return folder / f"episode_{episode:06d}.npy"
@@ -111,7 +117,7 @@ class VisionCache:
         """
         check_fingerprint(folder, expected, command)
         self.folder, self.spec = folder, StorageSpec(**expected["storage"])
-        self._lengths, self._exec_starts = source.lengths, source.exec_starts
+        self._source, self._lengths, self._exec_starts = source, source.lengths, source.exec_starts
         self._dtype, self._command = DTYPES[expected["dtype"]], command
         files = (token_file, score_file) if self.spec.scorer else (token_file,)
         missing = [e for e in range(len(source)) if not all(file(folder, e).is_file() for file in files)]
@@ -139,7 +145,7 @@ class VisionCache:
             self._histories[episode] = CachedHistory(
                 self.spec,
                 self._tokens(episode),
-                self.spec.kept_frames(length),
+                kept_frames(self._source, episode, self.spec),
                 length,
                 self._scores(episode),
                 int(self._exec_starts[episode]),
@@ -168,7 +174,7 @@ class VisionCache:
 
     def _tokens(self, episode: int) -> np.ndarray:
         path = token_file(self.folder, episode)
-        rows = len(self.spec.kept_frames(int(self._lengths[episode])))
+        rows = len(kept_frames(self._source, episode, self.spec))
         with decoding(require_file(path), "tokens of a vision cache", self._remedy):
             tokens = np.lib.format.open_memmap(path, mode="r")
         if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:

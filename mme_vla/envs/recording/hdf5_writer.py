@@ -13,6 +13,7 @@ from mme_vla.envs.observations import INTRINSIC
 from mme_vla.files import remove_drafts, write_atomically
 
 if TYPE_CHECKING:
+    from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
@@ -26,16 +27,20 @@ class EpisodeWriter:
         path: of the new file.
         index: of the episode.
         task: what is demonstrated; its seed, difficulty, goals and options go into `setup`.
+        frames: the choice of frames that are drawn, where not all are.
     """
 
-    def __init__(self, path: Path, index: int, task: "Task") -> None:
+    def __init__(self, path: Path, index: int, task: "Task", frames: "FrameChoice | None" = None) -> None:
         self._file = h5py.File(path, "w")
         self._episode = self._file.create_group(f"episode_{index}")
         self._steps = 0
         choices = [{"label": c.label, "action": c.action, "need_parameter": c.needs_point} for c in task.choices()]
         setup = self._episode.create_group("setup")
         setup["seed"] = np.int64(task.seed)
-        for name, text in (("difficulty", task.difficulty), ("available_multi_choices", json.dumps(choices))):
+        texts = {"difficulty": task.difficulty, "available_multi_choices": json.dumps(choices)}
+        if frames is not None:
+            texts["frames"] = json.dumps(frames.to_dict())
+        for name, text in texts.items():
             setup.create_dataset(name, data=text, dtype=h5py.string_dtype())
         setup.create_dataset("task_goal", data=task.goals(), dtype=h5py.string_dtype())
         for camera in CAMERAS:

@@ -1,10 +1,11 @@
 """What a recording is to leave behind: a LeRobot dataset, official files, or both; and what of it is there already."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.errors import UserError
 from mme_vla.files import read_json
 
@@ -22,15 +23,29 @@ class Job:
     difficulty: str
     recovery: str | None
     retries: int
+    frames: FrameChoice | None = None
+    """At which frames it is drawn; None: at all."""
 
     @property
     def name(self) -> str:
         """Of the episode's files."""
         return f"{self.task}-{self.episode:04d}"
 
-    def made(self, seed: int | None, difficulty: str | None) -> bool:
-        """Whether an episode of this seed and difficulty can be what this job records."""
-        return seed is not None and self.seed <= seed < self.seed + self.retries and difficulty == self.difficulty
+    @property
+    def plan(self) -> dict[str, Any]:
+        """What decides the result; plans from before frames could be chosen do not speak of them."""
+        plan = asdict(self) | {"frames": self.drawn_at}
+        return plan if self.frames is not None else {k: v for k, v in plan.items() if k != "frames"}
+
+    @property
+    def drawn_at(self) -> dict[str, Any] | None:
+        """The choice of frames in plain values."""
+        return None if self.frames is None else self.frames.to_dict()
+
+    def made(self, seed: int | None, difficulty: str | None, frames: Any) -> bool:
+        """Whether an episode of this seed and difficulty, drawn at these frames, can be what this job records."""
+        right = seed is not None and self.seed <= seed < self.seed + self.retries
+        return right and difficulty == self.difficulty and frames == self.drawn_at
 
 
 @dataclass(frozen=True)
@@ -105,7 +120,7 @@ class Wanted:
             return False
         for ref in refs:
             with open_episode(ref) as episode:
-                if not jobs[ref.index].made(episode.seed, episode.difficulty):
+                if not jobs[ref.index].made(episode.seed, episode.difficulty, episode.frames):
                     return False
         return True
 
@@ -120,5 +135,8 @@ class Wanted:
         return (
             side.get("plan", {}).get("options") == planned_options(options)
             and [(e.get("task"), e.get("source_episode")) for e in found] == [(j.task, j.episode) for j in self.jobs]
-            and all(job.made(e.get("seed"), e.get("difficulty")) for job, e in zip(self.jobs, found, strict=True))
+            and all(
+                job.made(e.get("seed"), e.get("difficulty"), e.get("frames"))
+                for job, e in zip(self.jobs, found, strict=True)
+            )
         )

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.embodiment.robomme import ARM_JOINTS, POSE
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
+from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding, project
 from mme_vla.envs.observations import AngleTrack, Include, Observer
 from mme_vla.envs.recording.demonstration import demonstrate
@@ -69,13 +70,19 @@ class Recorder:
     Args:
         task: created with the observation mode `none`.
         render: take pictures; without them frames hold states, actions and plain texts only.
+        drawing: which stored steps are drawn, counted from 0, by which cameras; `obs` of the others has no pictures.
+            By default all. Where a text needs a pixel, the front camera looks all the same.
         on_step: takes each stored step; by default they are collected in `Recording.frames`.
     """
 
     def __init__(
-        self, task: "Task", render: bool = True, on_step: Callable[[RecordedStep], None] | None = None
+        self,
+        task: "Task",
+        render: bool = True,
+        on_step: Callable[[RecordedStep], None] | None = None,
+        drawing: Drawing | None = None,
     ) -> None:
-        self._task, self._render, self._on_step = task, render, on_step
+        self._task, self._render, self._on_step, self._drawing = task, render, on_step, drawing
         pictures = {"include_front_depth": render, "include_wrist_depth": render}
         poses = {"include_front_camera_extrinsic": True, "include_wrist_camera_extrinsic": True}
         self._observer = Observer(task, Include.from_options(pictures | poses), render)
@@ -146,7 +153,10 @@ class Recorder:
         self._in_video = video
 
     def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
-        frame = self._observer.frame(evaluated)
+        number, drawing = self._result.stored, self._drawing
+        cameras = CAMERAS if drawing is None else drawing.cameras(number, newest=False)
+        frame = self._observer.frame(evaluated, cameras)
+        frame = {name: value for name, value in frame.items() if value is not None}
         closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
         return frame | {"eef_state": frame["eef_state"].astype(np.float32), "is_gripper_close": closed}
 

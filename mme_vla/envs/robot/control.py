@@ -52,6 +52,10 @@ class RobotControl:
         self.arm = Arm(env.agent)
         self.gripper = OPEN
         """The command the gripper was last given; motions keep it."""
+        self.left = 0
+        """Steps that are known to follow the present one: those left of a motion or a grip, and `and_then`."""
+        self.and_then = 0
+        """Steps that follow the motion under way, where who asked for it knows of any."""
         self._step = step
         self._on_waypoint = on_waypoint
 
@@ -75,7 +79,9 @@ class RobotControl:
 
     def follow(self, targets: Iterable[np.ndarray]) -> None:
         """Perform one control step for each row of joint targets [7]."""
-        for joints in targets:
+        rows = list(targets)
+        for done, joints in enumerate(rows, 1):
+            self.left = len(rows) - done + self.and_then
             self._command(joints)
 
     def announce(self, pose: sapien.Pose, gripper: float | None) -> None:
@@ -148,7 +154,8 @@ class RobotControl:
             return
         self.gripper = command
         held = self.env.qpos
-        for _ in range(GRIPPER_STEPS):
+        for done in range(1, GRIPPER_STEPS + 1):
+            self.left = GRIPPER_STEPS - done
             self._command(held)
 
     def _command(self, joints: np.ndarray) -> None:

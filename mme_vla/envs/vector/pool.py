@@ -114,8 +114,11 @@ class VecEnv:
         self.start(worker, job)
         return job
 
-    def start(self, worker: int, job: Job) -> None:
+    def start(self, worker: int, job: Job, **how: Any) -> None:
         """Let a worker begin an episode; its reply carries the first observation.
+
+        Args:
+            how: arguments of the environment's `reset`.
 
         Raises:
             UserError: the environments are closed, or the worker's last reply has not been received.
@@ -123,7 +126,7 @@ class VecEnv:
         state = self._idle(worker)
         state.job, state.resetting = job, True
         arguments = {"task": job.task, "split": job.split, "episode": job.episode}
-        self._command(worker, protocol.RESET, arguments)
+        self._command(worker, protocol.RESET, arguments, how)
 
     def send(self, worker: int, action: Any) -> None:
         """Let a worker perform an action; returns at once.

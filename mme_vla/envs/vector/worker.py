@@ -88,7 +88,7 @@ def serve(connection: Any, block: Any, factory: Callable[..., Any], options: dic
                         env.close()
                         env = None
                     env = factory(**arguments[0], **options)
-                    outcome: Any = env.reset()
+                    outcome: Any = env.reset(**arguments[1])
                 elif command == STEP:
                     outcome = env.step(arguments[0])
                 else:

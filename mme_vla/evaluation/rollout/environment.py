@@ -7,6 +7,7 @@ policy reads, and its report says where the time went.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_state
+from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.make import make_env
 from mme_vla.envs.task_names import STICK_TASKS
 from mme_vla.errors import UserError
@@ -27,7 +29,8 @@ REPORTED = (
 _BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
-"""Every camera by its name: lists of uint8 [H, W, 3]; `state`: float32 [t, s]."""
+"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not asked for; `state`: float32 [t, s].
+"""
 
 
 class RenderClock:
@@ -80,25 +83,32 @@ class ChunkEnv:
         self._max_steps, self._video = max_steps, video
         self._clock = RenderClock()
         self._simulating = self._rendered = 0.0
-        self._steps = 0
+        self._steps = self._returned = 0
         with self._simulation():
             self._env = make()
         self._clock.watch(self._env)
 
-    def reset(self) -> tuple[Observation, dict[str, Any]]:
-        """All frames of the conditioning video, the current one last, and the report."""
+    def reset(self, draw: Drawing | None = None) -> tuple[Observation, dict[str, Any]]:
+        """All frames of the conditioning video, the current one last, and the report.
+
+        Args:
+            draw: the pictures that are asked for; by default all.
+        """
+        self._ask(draw)
         with self._simulation():
             observation, info = self._env.reset()
         frames = _Frames(self._robot.camera_names)
         count = frames.add(observation)
         self._draw(frames, count, demo=count - 1)
+        self._returned = frames.leave(draw, 0)
         return frames.observation(), self._report(info)
 
     def step(self, command: dict[str, Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Execute actions one after the other until they, or the episode, are over.
 
         Args:
-            command: `actions` [n, w]; `subgoal`, the text that stands in the video meanwhile.
+            command: `actions` [n, w]; `subgoal`, the text that stands in the video meanwhile; `draw`, the pictures that
+                are asked for, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
             The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
@@ -107,7 +117,10 @@ class ChunkEnv:
         frames, executed, seen = _Frames(self._robot.camera_names), 0, 0
         terminated = truncated = False
         info: dict[str, Any] = {}
-        for action in np.asarray(command["actions"]):
+        draw: Drawing | None = command.get("draw")
+        actions = np.asarray(command["actions"])
+        for number, action in enumerate(actions, 1):
+            self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
             with self._simulation():
                 observation, _, ended, cut, info = self._env.step(action[: self._numbers])
             terminated, truncated = bool(ended), bool(cut)
@@ -125,6 +138,7 @@ class ChunkEnv:
                 truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
                 break
+        self._returned = frames.leave(draw, self._returned)
         report = self._report(info) | {"executed": executed, "steps": seen}
         if terminated or truncated:
             report |= self._finish_video(report)
@@ -135,6 +149,11 @@ class ChunkEnv:
         if self._video is not None:
             self._video.discard()
         self._env.close()
+
+    def _ask(self, drawing: Drawing | None) -> None:
+        # A film shows everything; and not every environment can leave pictures out.
+        if self._video is None and hasattr(self._env, "drawing"):
+            self._env.drawing = drawing
 
     @contextmanager
     def _simulation(self) -> Iterator[None]:
@@ -175,7 +194,7 @@ class _Frames:
 
     def __init__(self, cameras: Sequence[str]) -> None:
         self._cameras = cameras
-        self._pictures: dict[str, list[np.ndarray]] = {name: [] for name in (*cameras, *CAMERAS)}
+        self._pictures: dict[str, list[np.ndarray | None]] = {name: [] for name in (*cameras, *CAMERAS)}
         self._states: list[np.ndarray] = []
 
     def add(self, observation: dict[str, list[Any]]) -> int:
@@ -189,8 +208,19 @@ class _Frames:
             pictures += observation.get(f"{name}_rgb_list", [_BLIND] * len(joints))
         return len(joints)
 
-    def newest(self, count: int) -> Iterator[tuple[np.ndarray, ...]]:
-        """The last frames, each as its pictures: the robot's cameras in its order, then the benchmark's others."""
+    def leave(self, draw: Drawing | None, first: int) -> int:
+        """Leave out the pictures that were not asked for; from the first frame's number to the one that follows."""
+        stop = first + len(self._states)
+        if draw is not None:
+            for frame in range(first, stop):
+                shown = draw.cameras(frame, newest=frame == stop - 1)
+                for name in self._cameras:
+                    if name not in shown:
+                        self._pictures[name][frame - first] = None
+        return stop
+
+    def newest(self, count: int) -> Iterator[tuple[Any, ...]]:
+        """The last frames before any was left out, each as its pictures: the robot's cameras, then the benchmark's."""
         return zip(*(pictures[len(self._states) - count :] for pictures in self._pictures.values()), strict=True)
 
     def observation(self) -> Observation:

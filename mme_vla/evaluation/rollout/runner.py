@@ -17,6 +17,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.vector.jobs import Job, Reply
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.rollout.pictures import Pictures
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.running_episode import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -36,7 +37,7 @@ class Environments(Protocol):
     def workers(self) -> int: ...
     @property
     def busy(self) -> bool: ...
-    def start(self, worker: int, job: Job) -> None: ...
+    def start(self, worker: int, job: Job, **how: object) -> None: ...
     def send(self, worker: int, action: object) -> None: ...
     def recv(self, timeout: float | None = None) -> list[Reply]: ...
 
@@ -99,6 +100,7 @@ class Rollout:
 
     def __post_init__(self) -> None:
         self._turns: Turns[RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
+        self._pictures = Pictures(self.policy, self.subgoals, self.settings)
 
     def run(self, jobs: list[Job]) -> None:
         """Run these episodes.
@@ -130,7 +132,7 @@ class Rollout:
         running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace)
         running.worker = worker
         self._running[worker] = running
-        self.envs.start(worker, job)
+        self.envs.start(worker, job, draw=self._pictures.before_video())
 
     def _take(self, reply: Reply) -> None:
         """Deal with what came back from a worker."""
@@ -151,10 +153,26 @@ class Rollout:
             return
         if reply.reward is None:
             self._stillborn = 0
+            if self._draws_again(running, reply):
+                return
             running.begin(reply.observation, reply.info)
         else:
             running.go_on(reply.observation, reply.info)
         self._turns.reading.append(running)
+
+    def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
+        """Let the episode begin once more if pictures of its video are needed that it did not draw."""
+        missing, length = self._pictures.missing(reply.observation), len(reply.observation["state"]) - 1
+        if running.redrawn not in (None, length):
+            raise UserError(
+                f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
+                "again: the environment does not repeat itself. Set draw=all."
+            )
+        if missing is None:
+            return False
+        running.redrawn = length
+        self.envs.start(running.worker, running.job, draw=missing)
+        return True
 
     def _turn(self) -> None:
         begun = time.perf_counter()
@@ -185,7 +203,8 @@ class Rollout:
                 self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
                 continue
             running.chosen(actions)
-            self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal})
+            draw = self._pictures.of_chunk(running.episode.frames_seen, len(actions), running.video_frames)
+            self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         """Record an episode and let its worker begin another."""

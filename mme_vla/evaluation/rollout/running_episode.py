@@ -14,6 +14,8 @@ from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
 
+_NONE = np.zeros((0, 1, 1, 3), np.uint8)
+
 
 def episode_seed(seed: int, task: str, episode: int) -> int:
     """The seed of an episode's noise: of these three alone, so that order, batches and resumption do not matter."""
@@ -49,6 +51,8 @@ class RunningEpisode:
         self.steps = self.chunks = 0
         self.video_frames = 0
         self.video = ""
+        self.redrawn: int | None = None
+        """Frames of the conditioning video, once it is being simulated again for its pictures."""
         self._actions = hashlib.sha256()
         self._robot = policy.embodiment
         self._sent = np.zeros((0, self._robot.action.width), np.float32)
@@ -66,7 +70,8 @@ class RunningEpisode:
         self.episode.goal = goal
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
-            video = np.stack(frames[self._robot.memory_camera][:-1]) if self.video_frames else None
+            seen = self.video_frames and self._subgoals.sees_video
+            video = np.stack(frames[self._robot.memory_camera][:-1]) if seen else None
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
         self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None, info)
 
@@ -96,15 +101,30 @@ class RunningEpisode:
         """Take one piece of the waiting frames into memory."""
         begun = time.perf_counter()
         part = slice(self._at, self._at + self._piece)
-        views = {name: np.stack(self._frames[name][part]) for name in self._robot.camera_names}
+        views, drawn = self._views(part)
         led = self._led
         if led is not None:  # one action a frame; or some motions, all told with the first of their frames
             led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
-        self.episode.observe(views, self._frames["state"][part], self._demo[part], led)
+        some = {} if all(len(places) == len(self._demo[part]) for places in drawn.values()) else {"drawn": drawn}
+        self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
         if self.watched is not None and not self._demo[part][-1]:
-            self.watched.observe(views[self._robot.memory_camera][~self._demo[part]], self._info)
+            camera, demo = self._robot.memory_camera, self._demo[part]
+            shown = views[camera][~demo[drawn[camera]]]
+            if passed := int((~demo).sum()) - len(shown):
+                self.watched.skip(passed)
+            if len(shown):
+                self.watched.observe(shown, self._info)
         self._at = part.stop
         self.thought(time.perf_counter() - begun)
+
+    def _views(self, part: slice) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+        """Pictures of every camera, and their places in this part of the frames."""
+        views, drawn = {}, {}
+        for name in self._robot.camera_names:
+            pictures = self._frames[name][part]
+            drawn[name] = np.array([i for i, picture in enumerate(pictures) if picture is not None], np.int64)
+            views[name] = np.stack([pictures[i] for i in drawn[name]]) if len(drawn[name]) else _NONE
+        return views, drawn
 
     def thought(self, seconds: float) -> None:
         """Add this episode's share of the policy's time."""

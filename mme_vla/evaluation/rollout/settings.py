@@ -12,6 +12,8 @@ from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.rollout.film import KEPT
 from mme_vla.evaluation.suites import MAX_STEPS
 
+DRAWN = ("needed", "all")
+
 
 @dataclass(frozen=True)
 class RolloutSettings:
@@ -24,6 +26,7 @@ class RolloutSettings:
     encode_chunk: frames encoded before other episodes may act.
     retries: how often an episode whose environment failed is tried again before the run goes on without it.
     timeout_s: seconds after which an environment that does not answer is replaced.
+    draw: `needed`: pictures of what the policy and its subgoals look at; `all`: of every frame. Outcomes are the same.
     subgoal_log: whether every subgoal is written down with its picture, where a predictor says them.
     """
 
@@ -39,12 +42,14 @@ class RolloutSettings:
     retries: int = 1
     timeout_s: float = 600.0
     render: bool = True
+    draw: str = "needed"
     video: str = "none"
     subgoal_log: bool = True
 
     def __post_init__(self) -> None:
         for name, value, known in (
             ("split", self.split, SPLITS), ("env", self.env, ENVS), ("video", self.video, KEPT),
+            ("draw", self.draw, DRAWN),
         ):  # fmt: skip
             if value not in known:
                 raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")

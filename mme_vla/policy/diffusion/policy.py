@@ -1,7 +1,7 @@
 """`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or with a memory."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -40,7 +40,7 @@ class DiffusionPolicy(Policy):
     processor: DiffusionProcessor | None
     adapted = ("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3")
     heads = ("final_conv",)
-    PARTS: Mapping[str, str] = {
+    PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"backbone\.vision\.",
         "memory": r"memory\.|integration\.",
         "encoder": r"backbone\.(image_encoder|image_pool)\.",
@@ -235,6 +235,13 @@ class DiffusionPolicy(Policy):
             with torch.no_grad(), self.autocast():
                 memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
         return self.sample_actions(batch, draws, steps, memory)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
+        processor = self.require_processor()
+        if processor.window > 1 and processor.consecutive:
+            return None
+        return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.fields import whole
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import check_sums, inside
@@ -69,7 +70,7 @@ class DiffusionProcessor(PolicyProcessor):
             memory_size: side of the pictures that a memory's vision tower reads.
 
         Raises:
-            UserError: an unknown choice of frames, or a window that is not positive.
+            UserError: an unknown choice of frames, or a size or window that is not positive.
         """
         if frames not in FRAMES:
             raise UserError(f"processor.frames={brief(frames)}. {did_you_mean(str(frames), FRAMES)}")
@@ -77,10 +78,12 @@ class DiffusionProcessor(PolicyProcessor):
             raise UserError(f"processor.window={brief(window)} must be a whole number from 1 to 64.")
         if not isinstance(text, str) or not text:
             raise UserError(f"processor.text={brief(text)} must be clip, hashed, or the folder of a CLIP.")
-        self.picture = (int(picture[0]), int(picture[1]))
+        height, width = picture
+        self.picture = (whole(height, "processor.picture"), whole(width, "processor.picture"))
         self.embodiment = embodiment
-        self.text_name, self.text = text, text_encoder(text, text_dim)
-        self.window, self.consecutive, self.memory_size = window, frames == "consecutive", memory_size
+        self.text_name, self.text = text, text_encoder(text, whole(text_dim, "processor.text_dim"))
+        self.window, self.consecutive = window, frames == FRAMES[0]
+        self.memory_size = whole(memory_size, "processor.memory_size")
         self.stats = stats
 
     @classmethod

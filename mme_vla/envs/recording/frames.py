@@ -1,0 +1,87 @@
+"""Which frames of a demonstration are drawn: those at which something is decided, and those a memory then reads."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.data.hdf5 import known_poses
+from mme_vla.data.waypoints import find_motions
+from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.envs.drawing import Drawing
+from mme_vla.envs.episodes import spans
+from mme_vla.errors import UserError
+from mme_vla.registry import MEMORIES
+
+if TYPE_CHECKING:
+    from mme_vla.envs.recording.recorder import RecordedStep
+    from mme_vla.memory.base import Memory
+
+DECISIONS = "decisions"
+GRAMMAR = "decisions, a number n for every n-th frame of the execution, or numbers and ranges such as [0-9,40]"
+MEMORY_CAMERA = "front"
+_SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of its tokens
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """A list of frames that every demonstration is drawn at; all other steps have no pictures.
+
+    at: the frames that both cameras show. `decisions`: the last frame before each planned motion of the execution,
+        where a waypoint policy acts; n: the execution's first frame and every n-th after it; or numbers and ranges,
+        counted from the episode's first stored frame.
+    memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames.
+
+    Raises:
+        UserError: `at` is none of these.
+    """
+
+    at: str | int | Sequence[int | str]
+    memory: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.at, bool) or (isinstance(self.at, int) and self.at < 1):
+            raise UserError(f"frames={self.at!r} is not understood; write all, {GRAMMAR}.")
+        if self.at != DECISIONS and not isinstance(self.at, int):
+            spans(self.at, "frames", f"all, {GRAMMAR}")
+        if self.memory is not None:
+            _build(self.memory)
+
+    def beforehand(self) -> Drawing | None:
+        """What is drawn, where no demonstration has to be seen for it: numbers that no memory adds to; else None."""
+        if isinstance(self.at, int) or self.at == DECISIONS or self.memory is not None:
+            return None
+        numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
+        return Drawing(dict.fromkeys(CAMERAS, numbers), now=())
+
+    def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
+        """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
+        video = sum(step.info["is_video_demo"] for step in steps)
+        shown = self._shown(steps, video)
+        frames = {camera: frozenset(shown) for camera in CAMERAS}
+        if self.memory is not None:
+            read = _build(self.memory).frames_read(np.array(shown, np.int64), video)
+            frames[MEMORY_CAMERA] |= frozenset(read.tolist())
+        return Drawing(frames, now=())
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, fit for JSON."""
+        return {"at": self.at if isinstance(self.at, str | int) else list(self.at), "memory": self.memory}
+
+    def _shown(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
+        if isinstance(self.at, int):
+            return list(range(video, len(steps), self.at))
+        if self.at == DECISIONS:
+            noted = np.stack([step.action["waypoint_action"] for step in steps])
+            poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
+            found: list[int] = find_motions(poses[video:], video).decisions.tolist()
+            return found
+        return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
+
+
+def _build(section: Mapping[str, Any]) -> "Memory":
+    import mme_vla.memory  # noqa: F401  (registers what ships)
+
+    memory: Memory = MEMORIES.build(section, d_vision=_SOME_WIDTH, width=_SOME_WIDTH)
+    return memory
