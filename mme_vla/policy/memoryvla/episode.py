@@ -38,19 +38,22 @@ class MemoryVlaEpisode(Episode):
         """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
         self._due: np.ndarray | None = None
 
-    def _take(self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray) -> None:
+    def _take(
+        self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray, drawn: np.ndarray | None = None
+    ) -> None:
         if self.asked is not None:
             self.banks = self._writer.core.store(self.banks, *self.asked)
             self.asked = None
         moments = []
-        for i, frame in enumerate(frames):
+        pictures = dict(zip(range(len(demo)) if drawn is None else drawn.tolist(), frames, strict=True))
+        for i in range(len(demo)):
             if self._due is not None and demo[i]:  # a later frame of the video shows that it was not the last one
                 moments.append(self._due)
             if self._due is not None and (demo[i] or not self._video_over):
                 self._due = None
             if demo[i] and (self.frames_seen + i) % VIDEO_STRIDE == 0:
-                self._due = frame.copy()
-        super()._take(frames, demo, executed)
+                self._due = pictures[i].copy()
+        super()._take(frames, demo, executed, drawn)
         if moments:
             self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
 
