@@ -94,13 +94,15 @@ class Registry[T]:
 
 MEMORIES: Registry[Any] = Registry("memory")
 INTEGRATIONS: Registry[Any] = Registry("integration")
-BACKBONES: Registry[Any] = Registry("backbone")
+BACKBONES: Registry[Any] = Registry("backbone", {"openvla": "mme_vla.backbone.openvla.backbone"})
 POLICIES: Registry[Any] = Registry(
     "policy",
     {
         "mme": "mme_vla.policy.mme",
         "diffusion_policy": "mme_vla.policy.diffusion.policy",
         "sam2act_plus": "mme_vla.policy.sam2act.waypoint_policy",
+        "openvla": "mme_vla.policy.openvla",
+        "memoryvla": "mme_vla.policy.memoryvla.policy",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
@@ -109,6 +111,8 @@ PROCESSORS: Registry[Any] = Registry(
         "pi05": "mme_vla.processing.processor",
         "diffusion_policy": "mme_vla.policy.diffusion.processing",
         "sam2act_plus": "mme_vla.policy.sam2act.cloud_processing",
+        "openvla": "mme_vla.processing.openvla",
+        "memoryvla": "mme_vla.policy.memoryvla.processing",
     },
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")

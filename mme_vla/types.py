@@ -84,6 +84,7 @@ class Batch(TensorStruct):
     actions: [b, h, a]; normalised, padded chunk. None when sampling.
     action_mask: [b, h] bool; steps that count in the loss. None counts all.
     state: [b, s]; raw state of the robot, never read by the network: it anchors relative actions.
+    proprio: [b, s]; normalised state, for the networks that read it.
     """
 
     images: Tensor
@@ -94,6 +95,7 @@ class Batch(TensorStruct):
     actions: Tensor | None = None
     action_mask: Tensor | None = None
     state: Tensor | None = None
+    proprio: Tensor | None = None
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.

@@ -105,6 +105,13 @@ ALIKE = {
     "settings": "what a command may be told",
     "progress": "the bar a person sees",
     "episodes": "the episodes there are: of the benchmark, of a dataset",
+    "sizes": "what a network is built to",
+    "backbone": "the network of its folder",
+    "policy": "the policy of its folder",
+    "processing": "what stands between raw data and the policy of its folder",
+    "episode": "an episode as its policy knows it",
+    "openvla": "OpenVLA in this room: policy, processor, checkpoints, names",
+    "memoryvla": "MemoryVLA in this room: checkpoints, names",
 }
 WRITING, READING = {"remember", "look", "observe"}, {"select", "recall", "encode", "gather"}
 

@@ -101,13 +101,24 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(chosen)]).astype(np.int64)
         self._episode = np.concatenate([np.asarray(part, np.int64) for part in chosen])
         pairs = zip(self._source, self._episode, strict=True)
-        self._ends = np.cumsum([len(sources[s].decisions(int(e))) for s, e in pairs], dtype=np.int64)
-        if not len(self):
+        self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
+        if not self.steps:
             raise UserError("The data hold no execution step of this robot.")
 
     def __len__(self) -> int:
+        """Number of items: one a step."""
+        return self.steps
+
+    @property
+    def steps(self) -> int:
         """Number of steps at which the robot decides: all of the execution, or those before a planned motion."""
         return int(self._ends[-1]) if len(self._ends) else 0
+
+    def decisions(self, source: int, episode: int) -> Any:
+        """Frames of an episode at which the robot decides, without those that lack a full chunk where that counts."""
+        decisions = self.sources[source].decisions(episode)
+        short = self.processor.horizon - 1 if self.processor.full_chunks_only else 0
+        return decisions[: max(len(decisions) - short, 0)]
 
     @property
     def total_frames(self) -> int:
@@ -120,16 +131,19 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     def locate(self, index: int) -> tuple[int, int, int]:
         """Return (source, episode, frame) of an item."""
-        if not 0 <= index < len(self):
-            raise IndexError(f"item {index} of {len(self)}")
+        if not 0 <= index < self.steps:
+            raise IndexError(f"step {index} of {self.steps}")
         at = int(np.searchsorted(self._ends, index, side="right"))
         source, episode = int(self._source[at]), int(self._episode[at])
-        decisions = self.sources[source].decisions(episode)
+        decisions = self.decisions(source, episode)
         return source, episode, int(decisions[len(decisions) - (int(self._ends[at]) - index)])
 
     def step(self, index: int) -> Step:
-        """Return what is recorded of an item, unprocessed."""
-        s, episode, frame = self.locate(index)
+        """Return what is recorded of a step, unprocessed."""
+        return self.step_at(*self.locate(index))
+
+    def step_at(self, s: int, episode: int, frame: int) -> Step:
+        """Return what is recorded of a frame of an episode of the s-th source, unprocessed."""
         source = self.sources[s]
         actions, recorded = source.action_chunk(episode, frame, self.processor.horizon, self.action_offset)
         return Step(
@@ -149,6 +163,10 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         most = self.processor.past_actions
         return self.sources[step.source].past_actions(step.episode, step.index, most, self.action_offset)
 
+    def observation(self, index: int) -> dict[str, Any]:
+        """Return the item whose last step is `index`, as it would be met when acting."""
+        return self[index]
+
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
@@ -167,7 +185,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     def _sample(self, step: Step, subgoal: str | None) -> Sample:
         """A step with the frames of its window; before the episode's first frame that one is repeated."""
-        source, cameras = self.sources[step.source], self.processor.embodiment.camera_names
+        source, cameras = self.sources[step.source], self.processor.cameras
         window = np.arange(step.index - self.processor.window + 1, step.index + 1).clip(min=0)
         first = int(window[0])
         states = source.states(step.episode, first, step.index + 1)

@@ -9,7 +9,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import NormStats, RunningStats
+from mme_vla.processing.normalisers import ExactStats, NormStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 
@@ -23,6 +23,8 @@ def compute_norm_stats(
     robot: Embodiment = ROBOMME_JOINT,
     every: bool = False,
     extremes: bool = False,
+    exact: bool = False,
+    video: bool = False,
 ) -> NormStats:
     """Mean, deviation and 1 % / 99 % quantiles of states and of action chunks as they are predicted.
 
@@ -35,17 +37,19 @@ def compute_norm_stats(
         horizon, action_offset: as in training; chunk step i of observation k is action k + offset + i.
         seed: of the order. robot: says which numbers of an action are relative to the state.
         every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
+        exact: quantiles of all rows at once (linear interpolation), not of their histogram.
+        video: count the conditioning video's steps too.
 
     Raises:
         UserError: fewer than two execution steps.
     """
-    steps = _execution_steps(sources, episodes)
+    steps = _counted_steps(sources, episodes, video)
     if len(steps) < 2:
         raise UserError(f"Normalisation statistics need at least two execution steps; the data have {len(steps)}.")
     if not every:
         np.random.default_rng(seed).shuffle(steps)
     batches = -(-len(steps) // BATCH) if every else max(len(steps) // BATCH, 1)
-    states, actions = RunningStats(), RunningStats()
+    states, actions = (ExactStats() if exact else RunningStats() for _ in range(2))
     with progress("statistics", batches, unit="batches") as advance:
         for i in range(batches):
             rows = [_row(sources, step, horizon, action_offset) for step in steps[i * BATCH : (i + 1) * BATCH]]
@@ -57,12 +61,13 @@ def compute_norm_stats(
     return NormStats(state=states.result(extremes), actions=actions.result(extremes))
 
 
-def _execution_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None) -> np.ndarray:
-    """All (source, episode, step) of the execution phases, int32 [n, 3]."""
+def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:
+    """All (source, episode, step) of the execution phases, or of whole records, int32 [n, 3]."""
     parts: list[np.ndarray] = [np.zeros((0, 3), np.int32)]
     for i, source in enumerate(sources):
         for episode in range(len(source)) if episodes is None else episodes[i]:
-            step = np.asarray(source.decisions(int(episode)), np.int32)
+            every = range(int(source.lengths[int(episode)])) if video else source.decisions(int(episode))
+            step = np.asarray(every, np.int32)
             parts.append(np.stack([np.full_like(step, i), np.full_like(step, episode), step], axis=1))
     return np.concatenate(parts)
 

@@ -64,12 +64,14 @@ class Integration(nn.Module):
             self.beside(memory),
         )  # fmt: skip
 
-    def uses(self) -> frozenset[str]:
-        """Which of a backbone's doors (`Backbone.hosts`) this integration goes through: those it overrides."""
-        base, own = Integration, type(self)
-        doors = ("blocks", "hook", "condition", "beside")
-        used = {door for door in doors if getattr(own, door) is not getattr(base, door)}
-        return frozenset(used | ({"expert"} if self.extra_experts() else set()))
+
+DOORS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
+"""Methods of an integration that go through one of a backbone's doors (`Backbone.hosts`)."""
+
+
+def doors_of(kind: type[Integration]) -> frozenset[str]:
+    """The doors an integration goes through: those it overrides. Asked before it is built to a backbone's sizes."""
+    return frozenset(door for name, door in DOORS.items() if getattr(kind, name) is not getattr(Integration, name))
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
 
 MODES = ("full", "expert_only", "lora")
+INITS: Mapping[str, Any] = {"uniform": True, "gaussian": "gaussian"}  # ours → peft's
 ADAPTER = "default"  # peft's name of the one adapter a policy carries
 
 
@@ -47,6 +48,7 @@ def apply_finetuning(
     rank: int = 16,
     alpha: float = 16.0,
     dropout: float = 0.0,
+    init: str = "uniform",
     targets: Sequence[str] | None = None,
     train: Sequence[str] | None = None,
 ) -> dict[str, int]:
@@ -59,8 +61,9 @@ def apply_finetuning(
             `targets`, and in full what `train` names.
         freeze_vision: leave the vision tower as it is in every mode; needed where a memory reads cached tokens.
         rank, alpha, dropout: of the adapters: W + (alpha / rank)·B·A.
-        targets: linear layers, by the end of their name: `experts.vlm.qkv` is that matrix in every layer. By default
-            those the policy names (`Policy.adapted`).
+        init: how A is drawn: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins at zero.
+        targets: linear layers and convolutions, by the end of their name: `experts.vlm.qkv` is that matrix in every
+            layer. By default those the policy names (`Policy.adapted`).
         train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`. By
             default the memory and the policy's heads.
 
@@ -75,7 +78,7 @@ def apply_finetuning(
     train = ("memory", *policy.heads) if train is None else train
     if mode == "lora":
         in_full = _named(policy, train)  # before anything is changed
-        add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, targets=targets)
+        add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets)
     for name, parameter in policy.named_parameters():
         part = policy.part_of(name)
         if mode == "full":
@@ -93,9 +96,15 @@ def apply_finetuning(
 
 
 def add_adapters(
-    policy: Tunable, *, rank: int, alpha: float, dropout: float = 0.0, targets: Sequence[str] | None = None
+    policy: Tunable,
+    *,
+    rank: int,
+    alpha: float,
+    dropout: float = 0.0,
+    init: str = "uniform",
+    targets: Sequence[str] | None = None,
 ) -> None:
-    """Wrap linear layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
+    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
 
     Raises:
         UserError: peft is not installed, the policy has adapters already, a size that is not positive, or a target that
@@ -107,15 +116,18 @@ def add_adapters(
         raise UserError(
             f"finetune: rank={rank}, alpha={alpha}, dropout={dropout}: need rank ≥ 1, alpha > 0, dropout in [0, 1)."
         )
+    if init not in INITS:
+        raise UserError(f"finetune.init={brief(init)}. {did_you_mean(str(init), INITS)}")
     targets = list(policy.adapted if targets is None else targets)
     chosen = _targets(policy, targets)
     try:
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
         raise missing_extra("LoRA", "vlm") from None
-    config = LoraConfig(r=rank, lora_alpha=alpha, lora_dropout=dropout, target_modules=chosen)  # type: ignore[arg-type]
+    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": chosen, "init_lora_weights": INITS[init]}
+    config = LoraConfig(r=rank, lora_dropout=dropout, **options)
     inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
-    policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "targets": targets}
+    policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}
 
 
 def merge_adapters(policy: Tunable) -> None:
@@ -147,7 +159,9 @@ def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | Non
             if f".lora_A.{ADAPTER}." in name:
                 up, target = tensors[name.replace(".lora_A.", ".lora_B.")], name.replace(f".lora_A.{ADAPTER}.", ".")
                 weight = merged[target]
-                merged[target] = (weight.float() + scale * (up.float() @ down.float())).to(weight.dtype)
+                # A convolution's A is [r, in, k, k] and its B [out, r, 1, 1]: the product of their rows and columns.
+                product = (up.float().flatten(1) @ down.float().flatten(1)).view_as(weight)
+                merged[target] = (weight.float() + scale * product).to(weight.dtype)
     except (KeyError, TypeError, ZeroDivisionError, RuntimeError) as error:
         reason = brief(str(error), 200, quote=False)
         raise UserError(f"A checkpoint's adapters {brief(adapters)} do not fit its weights ({reason}).") from error
@@ -159,8 +173,8 @@ def _has_adapters(policy: Tunable) -> bool:
 
 
 def _targets(policy: Tunable, targets: Sequence[str]) -> list[str]:
-    """Full names of the linear layers that the targets mean (what is the memory's learns in full)."""
-    linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear)]
+    """Full names of the layers that the targets mean (what is the memory's learns in full)."""
+    linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)]
     layers = [name for name in linear if policy.part_of(f"{name}.") != "memory"]
     chosen: list[str] = []
     for target in targets:

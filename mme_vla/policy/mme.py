@@ -15,7 +15,7 @@ from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draw
 from mme_vla.backbone.shape import read_backbone
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
-from mme_vla.integration.base import Integration
+from mme_vla.integration.base import Integration, doors_of
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
@@ -93,13 +93,13 @@ class MMEPolicy(Policy):
         backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # a robot that does not fit is told before anything is built
         chosen = config.get("integration")
-        integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
-        if chosen and (unhosted := integration.uses() - backbone_cls.hosts):
+        if chosen and (unhosted := doors_of(INTEGRATIONS[chosen.get("name")]) - backbone_cls.hosts):
             raise UserError(
                 f"The backbone {config['backbone']['name']!r} has no place for {listed(sorted(unhosted))} of the "
                 f"integration {chosen['name']!r}; it hosts {listed(sorted(backbone_cls.hosts))}. Choose another "
                 "integration or backbone."
             )
+        integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
         experts = integration.extra_experts()
         with nullcontext() if fresh_backbone else torch.device("meta"):
             backbone = backbone_cls(sizes, experts)

@@ -87,17 +87,17 @@ def jitter_colours(pixels: Tensor, brightness: Tensor, contrast: Tensor, hue: Te
         hue: [b] in turns.
     """
     brightness, contrast, hue = (x[:, None, None, None] for x in (brightness, contrast, hue))
-    h, s, value = _rgb_to_hsv(pixels)
+    h, s, value = rgb_to_hsv(pixels)
     value = torch.where(brightness < 0, value * (1 + brightness), value * (1 - brightness) + brightness)
     # A line of slope k through the middle, continued by lines of slope 1/k that end in black and in white.
     k = torch.tan((contrast + 1) * (math.pi / 4))
     knee = k / (2 * (1 + k))
     middle = k * (value - 0.5) + 0.5
     value = torch.where(value < knee, value / k, torch.where(value > 1 - knee, (value - 1) / k + 1, middle))
-    return _hsv_to_rgb(h + hue, s, value)
+    return hsv_to_rgb(h + hue, s, value)
 
 
-def _rgb_to_hsv(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def rgb_to_hsv(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """[b, v, 3, s, s] → hue in turns, saturation, value, each [b, v, s, s]."""
     red, green, blue = pixels.unbind(2)
     value, low = pixels.amax(2), pixels.amin(2)
@@ -112,8 +112,8 @@ def _rgb_to_hsv(pixels: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return (sextant / 6) % 1, saturation, value
 
 
-def _hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
-    """Inverse of `_rgb_to_hsv`: each channel falls from `value` as the hue moves away from it."""
+def hsv_to_rgb(hue: Tensor, saturation: Tensor, value: Tensor) -> Tensor:
+    """Inverse of `rgb_to_hsv`: each channel falls from `value` as the hue moves away from it."""
     channels = []
     for start in (5, 3, 1):
         k = (start + hue * 6) % 6

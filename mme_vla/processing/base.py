@@ -46,12 +46,15 @@ class Counted:
     horizon: chunk steps of each observation that count, relative where the embodiment says so; None for the chunk's.
     every: every execution step once, in the data's order; else in shuffled batches of which an incomplete last one is
         left out, as the released code of π0.5 does.
-    extremes: keep the smallest and the largest value too.
+    extremes: keep the smallest and the largest value too. exact: quantiles of all rows at once, not of their histogram.
+    video: the conditioning video's steps count as well.
     """
 
     horizon: int | None = None
     every: bool = False
     extremes: bool = False
+    exact: bool = False
+    video: bool = False
 
 
 class PolicyProcessor:
@@ -64,6 +67,10 @@ class PolicyProcessor:
     embodiment: Embodiment
     window: int = 1
     """Frames an observation consists of, the current one last; clamped at the episode's start."""
+    full_chunks_only: bool = False
+    """Whether steps with fewer recorded actions ahead of them than a chunk has are left out of training."""
+    group_size: int = 1
+    """Steps of one episode that a training sample holds: more than 1 for policies that are trained on sequences."""
     consecutive: bool = True
     """Whether the frames of the window follow each other in an episode; else they are those at which it was asked."""
     prompt_name: str = "plain"
@@ -77,6 +84,11 @@ class PolicyProcessor:
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
         """Build the processor of a composed configuration, at its backbone's sizes."""
         raise NotImplementedError
+
+    @property
+    def cameras(self) -> Sequence[str]:
+        """The cameras whose pictures an item is made of, in the embodiment's order."""
+        return self.embodiment.camera_names
 
     @property
     def reads_subgoal(self) -> bool:

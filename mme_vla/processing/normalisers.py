@@ -162,6 +162,31 @@ def _range(x: Tensor, stats: QuantileStats, by: str) -> tuple[Tensor, Tensor]:
     return x.new_tensor(low), x.new_tensor(high - low + EPSILON)
 
 
+class ExactStats:
+    """Statistics of all rows at once, which it keeps: quantiles with linear interpolation, as numpy's."""
+
+    def __init__(self) -> None:
+        self._rows: list[np.ndarray] = []
+
+    def update(self, x: np.ndarray) -> None:
+        """Take rows [..., d]."""
+        self._rows.append(np.asarray(x, np.float64).reshape(-1, x.shape[-1]))
+
+    def result(self, extremes: bool = False) -> QuantileStats:
+        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value.
+
+        Raises:
+            UserError: fewer than two rows went in.
+        """
+        count = sum(map(len, self._rows))
+        if count < 2:
+            raise UserError(f"Statistics need at least two rows, got {count}.")
+        rows = np.concatenate(self._rows)
+        q01, q99 = np.quantile(rows, [0.01, 0.99], axis=0)
+        ends = (rows.min(0), rows.max(0)) if extremes else ()
+        return QuantileStats(rows.mean(0), rows.std(0), q01, q99, *ends)
+
+
 class RunningStats:
     """Mean, deviation and quantiles of a stream too long to keep, in one pass.
 

@@ -134,6 +134,34 @@ class PastActions(PromptFormat):
         return [(f"Task: {_one_line(given.goal)}; Past actions: {levels};\nAction: ", True)]
 
 
+@PROMPTS.register("openvla")
+class OpenVla(PromptFormat):
+    """The question that OpenVLA was trained on, the goal in lower case."""
+
+    def pieces(self, given: PromptInput) -> list[Piece]:
+        """Return one text."""
+        return [(f"In: What action should the robot take to {self.language(given)}?\nOut:", True)]
+
+    def language(self, given: PromptInput) -> str:
+        """What the robot is asked to do."""
+        return given.goal.strip().lower()
+
+
+@PROMPTS.register("openvla_subgoal")
+class OpenVlaSubgoal(OpenVla):
+    """The same question with the subgoal behind the goal; the plain one where there is none."""
+
+    reads_subgoal = True
+
+    def language(self, given: PromptInput) -> str:
+        """The goal without its full stop, and the subgoal."""
+        if given.subgoal is None:
+            _warn_once("The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain prompt.")
+            return super().language(given)
+        goal = given.goal.strip().removesuffix(".")
+        return f"{goal}; current subgoal: {given.subgoal.strip()}".lower()
+
+
 def discretize(values: np.ndarray) -> list[int]:
     """Map each normalised number, clipped to [-1, 1], to its level 0…255."""
     edges = np.linspace(-1, 1, BINS + 1)[:-1]

@@ -67,6 +67,28 @@ class Tokenizer:
         """Turn a text into ids, after the beginning-of-sequence token if `bos`."""
         return self._processor.encode(text, add_bos=bos)
 
+    def piece(self, text: str) -> int:
+        """The id of one piece, as the model spells it (`▁` stands for a space).
+
+        Raises:
+            UserError: the model has no such piece.
+        """
+        found = self._processor.piece_to_id(text)
+        if found == self._processor.unk_id():
+            raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
+        return found
+
+    @property
+    def end(self) -> int:
+        """The id that ends a text.
+
+        Raises:
+            UserError: the model has none.
+        """
+        if self._processor.eos_id() < 0:
+            raise UserError(f"Tokenizer {self.spec!r} has no end-of-sequence token, which this policy's prompts need.")
+        return self._processor.eos_id()
+
     def decode(self, ids: list[int]) -> str:
         """Turn ids back into text; special tokens vanish."""
         return self._processor.decode(ids)

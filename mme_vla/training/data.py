@@ -8,6 +8,7 @@ from typing import Any
 from mme_vla.data.cache.ensure import ensure_cache
 from mme_vla.data.cache.store import COMMAND
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.groups import GroupDataset
 from mme_vla.data.keyframe_dataset import KeyframeDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.splits import split_episodes
@@ -59,7 +60,8 @@ def prepare_data(
         counted = processor.counted
         processor.stats = compute_norm_stats(
             sources, split.train, counted.horizon or processor.horizon, offset, seed, policy.embodiment,
-            every=counted.every, extremes=counted.extremes,
+            every=counted.every, extremes=counted.extremes, exact=counted.exact,
+            video=counted.video,
         )  # fmt: skip
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
@@ -83,7 +85,8 @@ def prepare_data(
     def side(episodes: list[Any], jitter: bool) -> TrainingDataset | KeyframeDataset:
         if processor.samples == "keyframes":
             return KeyframeDataset(sources, processor, policy.keyframes, episodes=episodes, seed=seed)
-        return TrainingDataset(
+        kind = GroupDataset if processor.group_size > 1 else TrainingDataset
+        return kind(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
             mask_padding=data["mask_padding"], jitter=jitter, subgoal=subgoal, seed=seed,
         )  # fmt: skip

@@ -66,13 +66,13 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     processor = policy.require_processor()
     horizon = policy.horizon
     source, episode, _ = samples.locate(0)
-    count = len(samples.sources[source].decisions(episode))
+    count = len(samples.decisions(source, episode))
     starts = np.arange(0, count, horizon)
     starts = starts[np.linspace(0, len(starts) - 1, min(chunks, len(starts))).round().astype(int)].tolist()
     predicted = []
     generator = generator_for(seed, "open loop")
     for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
-        batch = processor.collate([samples[i] for i in place])
+        batch = processor.collate([samples.observation(i) for i in place])
         states = torch.from_numpy(np.stack([samples.step(i).state for i in place]))
         draws = stack_draws([policy.sample_draws(generator) for _ in place], policy.device)
         chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()

@@ -21,12 +21,14 @@ class Adapter:
     unread: foreign tensors, or layers of them, that no action reads: dropped when read, zeros when written.
     tied: foreign name → the foreign name it repeats: optional when read, written as a copy.
     derived: foreign constants that follow from the configuration: dropped when read, recomputed when written.
+    fresh: our names that a checkpoint to start from may lack, beside the memory's: heads that are trained anew.
     """
 
     table: NameTable
     unread: list[Unread] = field(default_factory=list)
     tied: Mapping[str, str] = field(default_factory=dict)
     derived: list[Derived] = field(default_factory=list)
+    fresh: frozenset[str] = frozenset()
 
     def needed(self) -> set[str]:
         """Foreign names without which the policy cannot be filled."""

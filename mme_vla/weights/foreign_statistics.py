@@ -12,6 +12,7 @@ from mme_vla.files import check_sums, inside, read_json
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.weights.diffusion_policy import read_diffusion_stats
+from mme_vla.weights.openvla import read_dataset_statistics
 
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FEATURES = {"state": "observation.state", "actions": "action"}
@@ -21,9 +22,9 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     """The statistics in a checkpoint folder, or None where it has none.
 
     Looked for: openpi's `assets/<asset>/norm_stats.json`, `norm_stats.json` itself, Diffusion Policy's `stats.json`,
-    and the file that LeRobot's processor description names as the state of its normaliser. LeRobot's speak of the
-    actions it was trained on: they fit this library's joint deltas if that policy used relative actions with an
-    absolute gripper.
+    OpenVLA-OFT's `dataset_statistics.json` of one dataset, and the file that LeRobot's processor description names as
+    the state of its normaliser. LeRobot's speak of the actions it was trained on: they fit this library's joint deltas
+    if that policy used relative actions with an absolute gripper.
 
     Args:
         folder: the checkpoint (for released runs: the step).
@@ -49,7 +50,7 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
         return NormStats.load(_own(folder, next(iter(files.values()))))
     if (folder / "norm_stats.json").is_file():
         return NormStats.load(_own(folder, folder / "norm_stats.json"))
-    return read_diffusion_stats(folder) or next(_lerobot_stats(folder), None)
+    return read_diffusion_stats(folder) or read_dataset_statistics(folder) or next(_lerobot_stats(folder), None)
 
 
 def stats_files(folder: Path) -> dict[str, Path]:

@@ -18,6 +18,8 @@ from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.weights.adapter import Adapter, memory_parameters
 from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
+from mme_vla.weights.memoryvla import memoryvla_adapter
+from mme_vla.weights.openvla import openvla_adapter
 from mme_vla.weights.ports import port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
 from mme_vla.weights.sam2act_files import sam2act_adapter
@@ -29,6 +31,8 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "released": released_adapter,
     "diffusion_policy": diffusion_adapter,
     "sam2act_plus": sam2act_adapter,
+    "openvla": openvla_adapter,
+    "memoryvla": memoryvla_adapter,
 }
 
 # What a memory adds to π0.5, as our names and the released leaves tell.
@@ -137,6 +141,7 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
         check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
     else:
         of_format = partial_adapter(policy) if found.format == "released" else ADAPTERS[found.format](policy)
+        own |= of_format.fresh
         members = [place for place, _ in members_of(policy.memory)]
 
         def behind(theirs: Mapping[str, Tensor]) -> list[str]:

@@ -12,6 +12,8 @@ from mme_vla.policy.hub import local_folder
 from mme_vla.policy.saving import CONFIG, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
+from mme_vla.weights.memoryvla import is_memoryvla, read_names
+from mme_vla.weights.openvla import is_openvla, with_heads
 from mme_vla.weights.orbax import find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
 from mme_vla.weights.sam2act_files import is_sam2act, plain_sam2act_names
@@ -24,6 +26,8 @@ FORMATS = {
     "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
     "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
     "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
+    "openvla": "OpenVLA, or a merged run of OpenVLA-OFT (safetensors, with .pt files beside)",
+    "memoryvla": "MemoryVLA as its authors train it (.pt)",
 }
 
 
@@ -41,6 +45,7 @@ class OwnNames:
 OWN_NAMES = {
     "diffusion_policy": OwnNames(is_diffusion_policy, plain_names),
     "sam2act_plus": OwnNames(is_sam2act, plain_sam2act_names),
+    "memoryvla": OwnNames(is_memoryvla, read_names),
 }
 """Formats in files of `torch.save`; each is called as the model it holds."""
 
@@ -85,6 +90,8 @@ class Source:
         if self.format in OWN_NAMES:
             return OWN_NAMES[self.format].plain(read_torch_file(self.files[0]), str(self.files[0]))
         tensors = read_files(self.folder, self.files)
+        if self.format == "openvla":
+            return with_heads(tensors, self.folder)
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
@@ -97,6 +104,8 @@ class Source:
         """Our name of the variant a checkpoint is, or None where it does not say."""
         if self.format in OWN_NAMES:
             return self.format
+        if self.format == "openvla":
+            return "openvla_oft"
         said = variant_of(self.params) if self.params is not None else None
         if said is not None and said not in VARIANTS:
             # The word would become part of a configuration, where it could ask for more than a name.
@@ -151,6 +160,8 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
     if any(name.startswith("backbone.") for name in names):
         return Source("ours", folder, files)
+    if is_openvla(names):
+        return Source("openvla", folder, files)
     if any(name.startswith("PaliGemma/") for name in names):
         return Source("released", folder, files)
     few = listed(sorted(names), 3) or "none at all"

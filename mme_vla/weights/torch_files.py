@@ -19,7 +19,7 @@ def find_torch_files(folder: Path) -> list[Path]:
 
 
 def read_torch_file(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name, memory-mapped where its layout allows.
+    """The tensors of a file, by name (of tables by part: part and name), memory-mapped where its layout allows.
 
     Raises:
         UserError: the file is damaged, holds more than tensors and plain values, or no table of tensors.
@@ -35,6 +35,8 @@ def read_torch_file(path: Path) -> dict[str, Tensor]:
         if isinstance(found, dict) and isinstance(found.get(key), dict):
             found = found[key]
             break
+    if isinstance(found, dict) and found and all(isinstance(part, dict) for part in found.values()):
+        found = {f"{part}.{name}": tensor for part, own in found.items() for name, tensor in own.items()}
     if not isinstance(found, dict) or not found or not all(isinstance(value, Tensor) for value in found.values()):
         held = listed(found) if isinstance(found, dict) else type(found).__name__
         raise UserError(f"{path} holds no table of tensors, but {held}.")

@@ -15,7 +15,9 @@ from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
 from mme_vla.weights.diffusion_policy import diffusion_adapter, write_diffusion_policy
+from mme_vla.weights.memoryvla import memoryvla_adapter, write_memoryvla
 from mme_vla.weights.names.torch_backbone import EMBEDDING
+from mme_vla.weights.openvla import openvla_adapter, write_openvla
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
@@ -25,6 +27,14 @@ from mme_vla.weights.source import VARIANTS
 VIEWS = {"front": "base_0_rgb", "wrist": "left_wrist_0_rgb"}  # π0.5's names of RoboMME's cameras
 ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
 _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
+
+
+_OF_ONE_METHOD = {
+    "sam2act_plus": sam2act_adapter,
+    "diffusion_policy": diffusion_adapter,
+    "openvla": openvla_adapter,
+    "memoryvla": memoryvla_adapter,
+}
 
 
 def check_target(policy: Policy, fmt: str) -> None:
@@ -37,10 +47,8 @@ def check_target(policy: Policy, fmt: str) -> None:
         raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
-    if fmt == "diffusion_policy":
-        diffusion_adapter(policy)
-    if fmt == "sam2act_plus":
-        sam2act_adapter(policy)
+    if fmt in _OF_ONE_METHOD:
+        _OF_ONE_METHOD[fmt](policy)
 
 
 def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -109,6 +117,8 @@ WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]
     "released": write_released,
     "diffusion_policy": write_diffusion_policy,
     "sam2act_plus": write_sam2act,
+    "openvla": write_openvla,
+    "memoryvla": write_memoryvla,
 }
 
 

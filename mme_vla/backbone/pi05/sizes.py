@@ -1,20 +1,9 @@
 """Sizes as rows of a table: `pi05` is the real model, `tiny` a first-class citizen that trains on a laptop's CPU."""
 
 from dataclasses import dataclass, field
-from typing import Any
 
-from mme_vla.errors import UserError, brief
-
-LARGEST, DEEPEST = 2**24, 2**10
-"""Bounds of every size and of layers: far above any network here, and a damaged file's number ends in words."""
-
-
-def _check_positive(config: Any, prefix: str) -> None:
-    for name, value in vars(config).items():
-        if isinstance(value, int) and value < 1:
-            raise UserError(f"{prefix}{name}={brief(value)} must be at least 1.")
-        if isinstance(value, int) and value > (DEEPEST if name in ("depth", "horizon") else LARGEST):
-            raise UserError(f"{prefix}{name}={brief(value)} is larger than any network can be.")
+from mme_vla.backbone.sizes import check_positive
+from mme_vla.errors import UserError
 
 
 @dataclass(frozen=True)
@@ -29,7 +18,7 @@ class VisionConfig:
     num_heads: int = 16
 
     def __post_init__(self) -> None:
-        _check_positive(self, "vision.")
+        check_positive(self, "vision.")
         if self.image_size % self.patch_size:
             raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
 
@@ -42,7 +31,7 @@ class ExpertConfig:
     mlp_dim: int
 
     def __post_init__(self) -> None:
-        _check_positive(self, "an expert's ")
+        check_positive(self, "an expert's ")
 
 
 @dataclass(frozen=True)
@@ -62,7 +51,7 @@ class BackboneConfig:
     time_distribution: str = "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
 
     def __post_init__(self) -> None:
-        _check_positive(self, "backbone.")
+        check_positive(self, "backbone.")
         if self.num_heads % self.num_kv_heads:
             raise UserError(f"num_heads={self.num_heads} must be a multiple of num_kv_heads={self.num_kv_heads}.")
         if self.head_dim % 2:

@@ -1,0 +1,211 @@
+"""Memory banks (MemoryVLA): learned tokens of past moments that are written, retrieved, fused and merged.
+
+Unlike the memories that choose among stored vision tokens, a bank keeps what the network itself made of a moment, and
+is asked with the tokens of the current one. Its state belongs to an episode: `init_state`, `read`, `update`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from mme_vla.errors import UserError, did_you_mean
+
+FUSIONS, CONSOLIDATIONS = ("gate", "add"), ("tome", "fifo")
+LONGEST = 10_000.0  # of the time code's periods, in units of 2π
+GATE_STD = 1e-3  # of a fresh gate, which so begins at about one half
+
+
+@dataclass(frozen=True)
+class BankState:
+    """What a bank holds of one episode, in the order of time, without gradients.
+
+    entries: [t, n, d]. times: [t] int64. merged: where the newest entry made two others one; −1 where it did not.
+    """
+
+    entries: Tensor
+    times: Tensor
+    merged: int = -1
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
+class TimeCode(nn.Module):
+    """Times [n] → [n, d], through cosines, sines and two layers."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.frequencies = width // 4
+        self.input, self.output = nn.Linear(self.frequencies, width), nn.Linear(width, width)
+
+    def forward(self, times: Tensor) -> Tensor:
+        features = self.features(times).to(self.input.weight.dtype)
+        return self.output(functional.silu(self.input(features)))
+
+    def features(self, times: Tensor) -> Tensor:
+        """[cos(t f) | sin(t f)] of times [n], f_j = 10000^(−j/half); of an odd width the last number is 0."""
+        half = self.frequencies // 2
+        ramp = torch.arange(half, device=times.device, dtype=torch.float32) / max(half, 1)
+        angles = times.float()[:, None] * LONGEST**-ramp
+        return functional.pad(torch.cat([angles.cos(), angles.sin()], -1), (0, self.frequencies % 2))
+
+
+class RetrievalBlock(nn.Module):
+    """Attention of one head as wide as the tokens, then an MLP; a norm after each."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
+        self.attention_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width)
+        self.mlp_in, self.mlp_out = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+
+    def forward(self, query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
+        """Queries [b, n, d] read keys and values [b, m, d]; mask [b, 1, m] is False on padding."""
+        q, k, v = self.query(query), self.key(keys), self.value(values)
+        x = self.attention_norm(query + functional.scaled_dot_product_attention(q, k, v, attn_mask=mask))
+        return self.mlp_norm(x + self.mlp_out(functional.gelu(self.mlp_in(x))))
+
+
+class MemoryBank(nn.Module):
+    """A bank of at most `length` moments, each n tokens of width d."""
+
+    def __init__(
+        self,
+        width: int,
+        length: int = 16,
+        retrieval_layers: int = 2,
+        time_code: bool = True,
+        fusion: str = "gate",
+        consolidation: str = "tome",
+        store_fused: bool = False,
+    ) -> None:
+        """Build an empty bank.
+
+        Args:
+            width: d. length: most moments it holds.
+            retrieval_layers: blocks the current tokens read the bank through.
+            time_code: whether keys carry their moment's time.
+            fusion: how current and retrieved tokens become one: `gate` (learned, each number its own) or `add` (mean).
+            consolidation: what becomes of a moment too many: `tome` makes the two most alike neighbours one, `fifo`
+                drops the oldest.
+            store_fused: store the fused tokens instead of the current ones.
+
+        Raises:
+            UserError: an unknown choice, or a size that is not positive.
+        """
+        super().__init__()
+        for name, value in (("length", length), ("retrieval_layers", retrieval_layers)):
+            if value < 1:
+                raise UserError(f"bank.{name}={value} must be at least 1.")
+        if fusion not in FUSIONS:
+            raise UserError(f"bank.fusion={fusion!r}. {did_you_mean(str(fusion), FUSIONS)}")
+        if consolidation not in CONSOLIDATIONS:
+            raise UserError(f"bank.consolidation={consolidation!r}. {did_you_mean(str(consolidation), CONSOLIDATIONS)}")
+        self.width, self.length = width, length
+        self.consolidation, self.store_fused = consolidation, store_fused
+        self.blocks = nn.ModuleList(RetrievalBlock(width) for _ in range(retrieval_layers))
+        self.gate = nn.Linear(2 * width, width) if fusion == "gate" else None
+        self.time = TimeCode(width) if time_code else None
+        if self.gate is not None:
+            nn.init.normal_(self.gate.weight, std=GATE_STD)
+            nn.init.normal_(self.gate.bias, std=GATE_STD)
+
+    def init_state(self, tokens: int) -> BankState:
+        """An empty bank for moments of so many tokens."""
+        weight = next(self.parameters())
+        times = torch.zeros(0, dtype=torch.int64, device=weight.device)
+        return BankState(weight.new_zeros(0, tokens, self.width), times)
+
+    def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
+        """What the banks of b episodes answer to their current tokens [b, n, d]; an empty one answers with these."""
+        longest = max(len(state) for state in states)
+        if not longest:
+            return tokens
+        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)  # b t n d
+        full = torch.tensor([len(state) for state in states], device=tokens.device)
+        keys = entries
+        if self.time is not None:
+            times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
+            keys = entries + self.time(times.flatten()).to(tokens).unflatten(0, times.shape)[:, :, None]
+        held = torch.arange(longest, device=tokens.device) < full[:, None]
+        held[:, 0] |= full == 0  # a row of nothing at all has no softmax; its answer is replaced below
+        mask = None if bool(held.all()) else held.repeat_interleave(entries.shape[2], 1)[:, None]
+        answer = tokens
+        for block in self.blocks:
+            answer = block(answer, keys.flatten(1, 2), entries.flatten(1, 2), mask)
+        return torch.where((full == 0)[:, None, None], tokens, answer)
+
+    def fuse(self, tokens: Tensor, retrieved: Tensor) -> Tensor:
+        """Current and retrieved tokens [b, n, d] as one."""
+        if self.gate is None:
+            return (tokens + retrieved) / 2
+        share = torch.sigmoid(self.gate(torch.cat([tokens, retrieved], -1)))
+        return share * tokens + (1 - share) * retrieved
+
+    def read(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
+        """Fused tokens [b, n, d] of b episodes, from the current ones and their banks."""
+        return self.fuse(tokens, self.retrieve(states, tokens))
+
+    def update(self, state: BankState, tokens: Tensor, fused: Tensor, time: int) -> BankState:
+        """The bank after a moment [n, d] at `time`, of which `fused` was read; no gradient goes in."""
+        stored = (fused if self.store_fused else tokens).detach()
+        entries = torch.cat([state.entries.to(stored), stored[None]])
+        times = torch.cat([state.times, state.times.new_tensor([time])])
+        if len(times) <= self.length:
+            return BankState(entries, times)
+        if self.consolidation == "fifo":
+            return BankState(entries[1:], times[1:])
+        return _merge(entries, times)
+
+    def run(
+        self, tokens: Tensor, times: Tensor, sequences: Sequence[Tensor], states: Sequence[BankState] | None = None
+    ) -> tuple[Tensor, list[BankState]]:
+        """Take sequences of moments side by side, each in its own bank.
+
+        Args:
+            tokens: [m, n, d], all moments. times: [m] int64.
+            sequences: places in them, each sequence in the order of time.
+            states: banks the sequences go on with; empty ones by default.
+
+        Returns:
+            Fused tokens [m, n, d], and the bank after each sequence.
+        """
+        banks = list(states) if states is not None else [self.init_state(tokens.shape[1]) for _ in sequences]
+        fused: list[Tensor] = []
+        places: list[Tensor] = []
+        for step in range(max(len(sequence) for sequence in sequences)):
+            going = [i for i, sequence in enumerate(sequences) if step < len(sequence)]
+            here = torch.stack([sequences[i][step] for i in going]).to(tokens.device)
+            answer = self.read([banks[i] for i in going], tokens[here])
+            for row, i in enumerate(going):
+                banks[i] = self.update(banks[i], tokens[here[row]], answer[row], int(times[here[row]]))
+            fused.append(answer)
+            places.append(here)
+        order = torch.cat(places).argsort()
+        return torch.cat(fused)[order], banks
+
+
+def _merge(entries: Tensor, times: Tensor) -> BankState:
+    """Make the two neighbours that are most alike one: their mean, at the earlier's time."""
+    alike = functional.cosine_similarity(entries[:-1], entries[1:], dim=-1).mean(-1)
+    i = int((alike == alike.max()).nonzero()[0])
+    one = (entries[i : i + 1] + entries[i + 1 : i + 2]) / 2
+    return BankState(torch.cat([entries[:i], one, entries[i + 2 :]]), torch.cat([times[: i + 1], times[i + 2 :]]), i)
+
+
+def _padded(x: Tensor, length: int) -> Tensor:
+    return functional.pad(x, (0, 0) * (x.ndim - 1) + (0, length - len(x)))
+
+
+def groups_of(count: int, size: int) -> list[Tensor]:
+    """Places of consecutive groups of `size` moments: each in a bank of its own, whatever episode it is of."""
+    return list(torch.arange(count).split(size))
+
+
+def runs_of(episodes: Tensor) -> list[Tensor]:
+    """Places of consecutive moments of one episode: a bank is emptied when the episode changes."""
+    _, lengths = torch.unique_consecutive(episodes, return_counts=True)
+    return list(torch.arange(len(episodes)).split(lengths.tolist()))

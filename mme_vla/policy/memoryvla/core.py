@@ -1,0 +1,168 @@
+"""MemoryVLA behind its VLM: perceptual tokens, two banks, and the diffusion head that answers."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from mme_vla.backbone.memoryvla.compression import Compression
+from mme_vla.backbone.memoryvla.diffusion import Schedule
+from mme_vla.backbone.memoryvla.dit import Dit, DitConfig
+from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig
+from mme_vla.errors import UserError
+from mme_vla.memory.bank import BankState, MemoryBank
+
+
+@dataclass(frozen=True)
+class BankConfig:
+    """Both banks' options; see `MemoryBank`."""
+
+    length: int = 16
+    retrieval_layers: int = 2
+    time_code: bool = True
+    fusion: str = "gate"
+    consolidation: str = "tome"
+    store_fused: bool = False
+
+
+@dataclass(frozen=True)
+class MemoryVlaConfig:
+    """Sizes of MemoryVLA, and how its head is trained and asked.
+
+    perceptual_width, compression_width: of a perceptual token, and of the bottleneck's middle.
+    repeats: copies of a chunk in training, each with its own noise. dropout: how often the cognition token gives way.
+    ddim_steps, guidance: of sampling.
+    """
+
+    vision: FusedVisionConfig = field(default_factory=FusedVisionConfig)
+    vlm: LlamaConfig = field(default_factory=LlamaConfig)
+    head: DitConfig = field(default_factory=DitConfig)
+    bank: BankConfig = field(default_factory=BankConfig)
+    vocab_size: int = 32_064
+    perceptual_width: int = 256
+    compression_width: int = 512
+    action_dim: int = 7
+    horizon: int = 16
+    repeats: int = 4
+    dropout: float = 0.1
+    ddim_steps: int = 10
+    guidance: float = 1.5
+
+    def __post_init__(self) -> None:
+        whole = {name: value for name, value in vars(self).items() if isinstance(value, int)}
+        for name, value in whole.items():
+            if value < 1:
+                raise UserError(f"backbone.{name}={value} must be at least 1.")
+        if not 0 <= self.dropout < 1:
+            raise UserError(f"backbone.dropout={self.dropout} must lie in [0, 1).")
+        if self.guidance < 1:
+            raise UserError(f"backbone.guidance={self.guidance} must be at least 1 (no guidance).")
+
+
+@dataclass(frozen=True)
+class BankStates:
+    """Both banks of one episode, and how many moments they have taken."""
+
+    cognition: BankState
+    perceptual: BankState
+    count: int = 0
+
+
+class MemoryVlaCore(nn.Module):
+    """From one cognition token and the vision features of each moment to a chunk of actions.
+
+    Legend: m moments · p patches · widths: c of a vision feature, d of the language model, e of a perceptual token.
+    """
+
+    def __init__(
+        self,
+        config: MemoryVlaConfig,
+        cognition_bank: MemoryBank,
+        perceptual_bank: MemoryBank,
+    ) -> None:
+        super().__init__()
+        d, e = cognition_bank.width, perceptual_bank.width
+        self.config, self.patches = config, config.vision.grid**2
+        self.compression = Compression(config.vision.width, config.compression_width, e)
+        self.cognition_bank, self.perceptual_bank = cognition_bank, perceptual_bank
+        self.head = Dit(config.head, config.action_dim, config.horizon, d, e)
+        self.schedule = Schedule.cosine()
+
+    def init_state(self) -> BankStates:
+        """Both banks empty."""
+        return BankStates(self.cognition_bank.init_state(1), self.perceptual_bank.init_state(self.patches))
+
+    # Training
+
+    def loss(
+        self,
+        cognition: Tensor,
+        features: Tensor,
+        actions: Tensor,
+        times: Tensor,
+        sequences: Sequence[Tensor],
+        draws: Mapping[str, Tensor],
+    ) -> Tensor:
+        """The squared error of the predicted noise [r·m, h], averaged over the numbers of an action.
+
+        Args:
+            cognition: [m, 1, d]. features: [m, p, c]. actions: [m, h, a]. times: [m].
+            sequences: places of the moments that share a bank, in the order of time.
+            draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform; the whole batch r times over.
+        """
+        read = self.cognition_bank.run(cognition, times, sequences)[0]
+        seen = self.perceptual_bank.run(self.compression(features), times, sequences)[0]
+        repeats = len(draws["noise"]) // len(actions)
+        read, seen, actions = (x.repeat(repeats, 1, 1) for x in (read, seen, actions))
+        return self.noise_error(actions, read, seen, draws)
+
+    def noise_error(
+        self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
+    ) -> Tensor:
+        """The head's error [n, h] on chunks [n, h, a], noised as the draws say."""
+        noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
+        drop = draws["drop"] < self.config.dropout
+        found = self.head(noised, draws["steps"], cognition, perceptual, drop)
+        return (found.float() - draws["noise"].float()).square().mean(-1)
+
+    # Acting
+
+    def look(self, states: Sequence[BankStates], cognition: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """What the head reads of b episodes' current moments: fused cognition [b, 1, d] and perceptual tokens."""
+        return (
+            self.cognition_bank.read([state.cognition for state in states], cognition),
+            self.perceptual_bank.read([state.perceptual for state in states], self.compression(features)),
+        )
+
+    def store(self, state: BankStates, cognition: Tensor, features: Tensor) -> BankStates:
+        """One episode's banks after the moment [1, d], [p, c]; its time is how many went before it."""
+        fused, seen = self.look([state], cognition[None], features[None])
+        tokens = self.compression(features[None])[0]
+        return BankStates(
+            self.cognition_bank.update(state.cognition, cognition, fused[0], state.count),
+            self.perceptual_bank.update(state.perceptual, tokens, seen[0], state.count),
+            state.count + 1,
+        )
+
+    def sample(self, noise: Tensor, cognition: Tensor, perceptual: Tensor, steps: int | None = None) -> Tensor:
+        """The chunk [b, h, a] that DDIM with guidance makes of noise; nothing is clipped."""
+
+        def predict(x: Tensor, step: int) -> Tensor:
+            times = torch.full((len(x),), step, device=x.device)
+            return self.head.guided(x, times, cognition, perceptual, self.config.guidance)
+
+        return self.schedule.ddim(noise, steps or self.config.ddim_steps, predict)[-1]
+
+
+def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:
+    """The state that stands for the moment: of the last word, behind the pictures' tokens.
+
+    Args:
+        hidden: [m, n, d] of `<s>`, patches, words. words: [m] how many there are, `<s>` among them.
+
+    Returns:
+        [m, 1, d].
+    """
+    last = (patches + words - 1)[:, None, None].expand(-1, 1, hidden.shape[-1])
+    return hidden.gather(1, last)

@@ -1,0 +1,69 @@
+"""An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter them."""
+
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.memoryvla.core import BankStates, MemoryVlaCore
+from mme_vla.policy.memoryvla.processing import MemoryVlaProcessor
+
+VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
+
+
+class Writer(Host, Protocol):
+    """What such an episode asks of its policy besides."""
+
+    core: MemoryVlaCore
+
+    def require_processor(self) -> MemoryVlaProcessor: ...
+
+    def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates: ...
+
+
+class MemoryVlaEpisode(Episode):
+    """Banks beside the current view.
+
+    Of the video every `VIDEO_STRIDE`-th frame is written; of the execution, each frame at which a chunk was chosen. The
+    latter is written when the next frames arrive, so that choosing twice at one frame gives the same chunk.
+    """
+
+    def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
+        super().__init__(policy, goal, seed)
+        self._writer = policy
+        self.banks: BankStates = policy.core.init_state()
+        self.asked: tuple[Tensor, Tensor] | None = None
+        """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
+        self._due: np.ndarray | None = None
+
+    def _take(
+        self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray, drawn: np.ndarray | None = None
+    ) -> None:
+        if self.asked is not None:
+            self.banks = self._writer.core.store(self.banks, *self.asked)
+            self.asked = None
+        moments = []
+        pictures = dict(zip(range(len(demo)) if drawn is None else drawn.tolist(), frames, strict=True))
+        for i in range(len(demo)):
+            if self._due is not None and demo[i]:  # a later frame of the video shows that it was not the last one
+                moments.append(self._due)
+            if self._due is not None and (demo[i] or not self._video_over):
+                self._due = None
+            if demo[i] and (self.frames_seen + i) % VIDEO_STRIDE == 0:
+                self._due = pictures[i].copy()
+        super()._take(frames, demo, executed, drawn)
+        if moments:
+            self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
+
+    @property
+    def moment(self) -> Tensor:
+        """The current picture [3, s, s] uint8 of the camera that the policy looks through."""
+        return self._writer.require_processor().seen(self.images)
+
+
+def words(prompts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Prompts as a batch: ids [b, l] and mask [b, l]."""
+    ids, masks = zip(*prompts, strict=True)
+    return torch.stack(ids), torch.stack(masks)

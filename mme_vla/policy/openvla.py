@@ -1,0 +1,43 @@
+"""`OpenVlaPolicy`: OpenVLA-OFT with any memory as context. What it reads beside π0.5's inputs is the state."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.openvla import OpenVlaProcessor
+from mme_vla.processing.openvla_pictures import augment, centre_crop, draw_changes
+from mme_vla.processing.pictures import to_unit_range
+from mme_vla.registry import POLICIES
+from mme_vla.types import Batch
+
+
+@POLICIES.register("openvla")
+class OpenVlaPolicy(MMEPolicy):
+    """Backbone × memory × integration, with OpenVLA's pictures and a normalised state.
+
+    In training every picture is cropped and coloured by its own draws; else each is cropped in the middle, so that the
+    network sees the same share of a scene.
+    """
+
+    def observation(self, episodes: Sequence[Episode]) -> Batch:
+        """The current views, prompts and states of running episodes."""
+        processor = self.require_processor()
+        assert isinstance(processor, OpenVlaProcessor)
+        states = processor.proprio(torch.stack([episode.state for episode in episodes]))
+        return replace(super().observation(episodes), proprio=states.to(self.device))
+
+    def full_batch(self, device: torch.device | str = "cpu") -> Batch:
+        """As `MMEPolicy.full_batch`, with a state."""
+        return replace(super().full_batch(device), proprio=torch.zeros(1, self.embodiment.state.width, device=device))
+
+    def _views(self, batch: Batch) -> Tensor:
+        pictures = batch.images.flatten(0, 1)
+        if self.training and self.augment:
+            shown = augment(pictures, draw_changes(len(pictures), device=pictures.device))
+        else:
+            shown = centre_crop(pictures)
+        return to_unit_range(shown).view(batch.images.shape)

@@ -1,0 +1,71 @@
+"""OpenVLA-OFT through the training command: it learns, resumes to the bit, and the data are those of its recipe."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from prior_vla_runs import losses, run
+
+from mme_vla.data.dataset import TrainingDataset
+from mme_vla.data.sources import open_sources
+from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_policy
+from mme_vla.policy.openvla import OpenVlaPolicy
+from mme_vla.policy.tensor_files import load_tensors
+from mme_vla.testing.small import random_batch
+
+SMALL = ["train.batch_size=2", "backbone.vision.image_size=32", "backbone.vision.patch_size=2"]
+
+
+@pytest.mark.parametrize("extra", [(), ("finetune=oft", "finetune.rank=2")], ids=["full", "adapters"])
+def test_it_trains_by_the_command_and_resumes_where_it_stopped(extra: tuple[str, ...], tmp_path: Path) -> None:
+    whole = run("openvla_oft", tmp_path / "whole", *SMALL, *extra, "train.steps=4")
+    parts = tmp_path / "parts"
+    run("openvla_oft", parts, *SMALL, *extra, "train.steps=2")
+    resumed = run("openvla_oft", tmp_path / "unused", *SMALL, *extra, "train.steps=4", f"resume={parts}")
+    assert losses(parts) == losses(tmp_path / "whole") and len(losses(parts)) == 4
+    after = load_tensors(resumed)
+    for name, tensor in load_tensors(whole).items():
+        assert torch.equal(tensor, after[name]), name
+    policy = Policy.from_pretrained(resumed)
+    assert isinstance(policy, OpenVlaPolicy)
+    assert bool(policy.config.get("adapters")) == bool(extra)
+
+
+def test_with_a_memory_it_fits_a_batch() -> None:
+    policy = build_policy("openvla_oft_framesamp_context").train()
+    assert isinstance(policy, OpenVlaPolicy)
+    policy.augment = False
+    batch = random_batch(policy, valid=64)
+    batch = replace(batch, proprio=torch.zeros(len(batch.prompt), policy.embodiment.state.width))
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
+    loss = []
+    for _ in range(30):
+        optimizer.zero_grad()
+        value, _ = policy(batch)
+        value.backward()
+        optimizer.step()
+        loss.append(value.item())
+    assert loss[-1] < 0.7 * loss[0]
+
+
+def test_only_steps_with_a_full_chunk_are_learned_from_and_quantiles_are_exact() -> None:
+    policy = build_policy("openvla_oft")
+    processor, robot = policy.require_processor(), policy.embodiment
+    sources = open_sources(["sample"], robot)
+    processor.stats = compute_norm_stats(
+        sources, horizon=1, robot=robot, every=processor.counted.every, extremes=processor.counted.extremes,
+        exact=processor.counted.exact,
+    )  # fmt: skip
+    dataset = TrainingDataset(sources, processor)
+    left_out = sum(min(len(sources[0].decisions(e)), robot.action.horizon - 1) for e in range(len(sources[0])))
+    assert len(dataset) == sum(len(sources[0].decisions(e)) for e in range(len(sources[0]))) - left_out
+    assert all(dataset.step(i).recorded.all() for i in (0, len(dataset) // 2, len(dataset) - 1))
+    actions = np.concatenate([sources[0].actions(e, int(sources[0].exec_starts[e])) for e in range(len(sources[0]))])
+    np.testing.assert_allclose(processor.stats.actions.q99, np.quantile(actions.astype(np.float64), 0.99, axis=0))
+    np.testing.assert_allclose(processor.stats.actions.max, actions.max(0))
+    item = dataset[0]
+    assert item["proprio"].abs().max() <= 1 and item["actions"].abs().max() <= 1

@@ -1,0 +1,70 @@
+"""OpenVLA's and OpenVLA-OFT's files: written, read, and started from."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from mme_vla import UserError, build_policy
+from mme_vla.policy.base import Policy
+from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.testing.small import unit_stats
+from mme_vla.weights.load import load_weights, transfer
+from mme_vla.weights.source import detect_format
+from mme_vla.weights.writers import WRITERS, check_target
+
+
+def built(name: str = "openvla_oft", seed: int = 1) -> Policy:
+    policy = build_policy(name, seed=seed)
+    policy.require_processor().stats = unit_stats(policy.embodiment)
+    return policy
+
+
+def written(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
+    folder.mkdir()
+    WRITERS[fmt](policy, folder, torch.float32, policy.require_processor().stats)
+    return folder
+
+
+def equal(one: Policy, other: Policy) -> bool:
+    return all(torch.equal(x, other.state_dict()[name]) for name, x in one.state_dict().items())
+
+
+def test_a_run_is_written_in_the_published_names_and_read_again(tmp_path: Path) -> None:
+    policy = built()
+    folder = written(policy, tmp_path / "run")
+    assert detect_format(folder) == "openvla"
+    names = set(load_file(folder / "model.safetensors"))
+    assert {"vision_backbone.featurizer.blocks.0.ls1.scale_factor", "language_model.lm_head.weight"} <= names
+    head = torch.load(folder / "action_head--0_checkpoint.pt", weights_only=True)
+    assert "module.model.mlp_resnet_blocks.1.ffn.1.weight" in head
+    other = built(seed=2)
+    other.require_processor().stats = None
+    assert not equal(policy, other)
+    load_weights(other, folder)
+    assert equal(policy, other) and other.require_processor().stats is not None
+
+
+def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_path: Path) -> None:
+    folder = written(built(), tmp_path / "base")
+    for file in folder.glob("*.pt"):
+        file.unlink()
+    for name in ("openvla_oft", "openvla_oft_framesamp_context"):
+        policy = built(name, seed=2)
+        took = transfer(policy, folder)
+        assert took.new and all(policy.part_of(new) in ("action", "memory") for new in took.new)
+        assert not took.left
+    with pytest.raises(UserError, match="action_head/model"):
+        load_weights(built(seed=2), folder)
+
+
+def test_what_the_format_has_no_name_for_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="holds OpenVLA and OpenVLA-OFT"):
+        check_target(build_policy("pi05"), "openvla")
+    adapted = built()
+    apply_finetuning(adapted, "lora", freeze_vision=False, rank=2)
+    for policy in (built("openvla_oft_framesamp_context"), adapted):
+        (folder := tmp_path / policy.config["name"]).mkdir(exist_ok=True)
+        with pytest.raises(UserError, match="no name in this format"):
+            WRITERS["openvla"](policy, folder, torch.float32, None)
