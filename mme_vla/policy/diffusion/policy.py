@@ -15,7 +15,7 @@ from mme_vla.backbone.diffusion.network import DiffusionNetwork
 from mme_vla.backbone.diffusion.sizes import DiffusionSizes
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.integration.film import PooledIntegration
+from mme_vla.integration.feature_wise import PooledIntegration
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.diffusion.processing import DiffusionBatch, DiffusionProcessor
