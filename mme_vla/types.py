@@ -86,7 +86,8 @@ class Batch(TensorStruct):
     history: the memory's selection, None for a policy without memory.
     actions: [b, h, a]; normalised, padded chunk. None when sampling.
     action_mask: [b, h] bool; steps that count in the loss. None counts all.
-    state: [b, s]; raw state of the robot, never read by the network: it anchors relative actions.
+    state: [b, s]; raw state of the robot: it anchors relative actions, and backbones may read it.
+    view_tokens: [b, v, n, d]; a frozen tower's tokens of `images`, where they were made beforehand.
     """
 
     images: Tensor
@@ -97,6 +98,7 @@ class Batch(TensorStruct):
     actions: Tensor | None = None
     action_mask: Tensor | None = None
     state: Tensor | None = None
+    view_tokens: Tensor | None = None
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.

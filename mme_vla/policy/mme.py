@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import mme_vla.backbone.nano.backbone
 import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
@@ -231,6 +232,7 @@ class MMEPolicy(Policy):
             image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
+            state=torch.stack([e.state for e in episodes]),
         )
         batch = batch.without_prompt_padding().to(self.device)
         draws = stack_draws([e.draw() for e in episodes])

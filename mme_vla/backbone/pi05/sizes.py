@@ -7,7 +7,7 @@ from typing import Any, Self
 from mme_vla.errors import UserError, brief, did_you_mean
 
 
-class _Config:
+class Sizes:
     """Builds itself from a plain mapping and refuses keys it does not know."""
 
     @classmethod
@@ -20,8 +20,10 @@ class _Config:
         for key, value in values.items():
             kind = known[key].type
             nested = isinstance(kind, type) and is_dataclass(kind)
-            if isinstance(value, bool) or not isinstance(value, (Mapping, kind) if nested else kind):  # type: ignore[arg-type]
-                wanted = "a section" if nested else "a whole number" if kind is int else "text"
+            fits = isinstance(value, (Mapping, kind) if nested else kind)  # type: ignore[arg-type]
+            if not fits or (isinstance(value, bool) and kind is not bool):
+                names = {int: "a whole number", bool: "true or false"}
+                wanted = "a section" if nested else names.get(kind, "text")  # type: ignore[call-overload]
                 raise UserError(f"{cls.__name__}.{key} must be {wanted}, not {brief(value)}.")
             built[key] = kind.from_dict(value) if nested and isinstance(value, Mapping) else value  # type: ignore[union-attr]
         needed = [name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING]
@@ -35,8 +37,10 @@ LARGEST, DEEPEST = 2**24, 2**10
 """Bounds of every size and of layers: far above any network here, and a damaged file's number ends in words."""
 
 
-def _check_positive(config: Any, prefix: str) -> None:
+def check_positive(config: Any, prefix: str) -> None:
     for name, value in vars(config).items():
+        if isinstance(value, bool):
+            continue
         if isinstance(value, int) and value < 1:
             raise UserError(f"{prefix}{name}={brief(value)} must be at least 1.")
         if isinstance(value, int) and value > (DEEPEST if name in ("depth", "horizon") else LARGEST):
@@ -44,7 +48,7 @@ def _check_positive(config: Any, prefix: str) -> None:
 
 
 @dataclass(frozen=True)
-class VisionConfig(_Config):
+class VisionConfig(Sizes):
     """SigLIP; its output width is the VLM's. `image_size` must be a multiple of `patch_size`."""
 
     image_size: int = 224
@@ -55,24 +59,24 @@ class VisionConfig(_Config):
     num_heads: int = 16
 
     def __post_init__(self) -> None:
-        _check_positive(self, "vision.")
+        check_positive(self, "vision.")
         if self.image_size % self.patch_size:
             raise UserError(f"vision.image_size={self.image_size} must be a multiple of patch_size={self.patch_size}.")
 
 
 @dataclass(frozen=True)
-class ExpertConfig(_Config):
+class ExpertConfig(Sizes):
     """One Gemma expert's own sizes; depth, heads and head width are shared by all (paper, section 4.1)."""
 
     width: int
     mlp_dim: int
 
     def __post_init__(self) -> None:
-        _check_positive(self, "an expert's ")
+        check_positive(self, "an expert's ")
 
 
 @dataclass(frozen=True)
-class BackboneConfig(_Config):
+class BackboneConfig(Sizes):
     """π0.5: a vision tower, a VLM expert and an action expert under joint attention."""
 
     vision: VisionConfig = field(default_factory=VisionConfig)
@@ -88,7 +92,7 @@ class BackboneConfig(_Config):
     time_distribution: str = "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
 
     def __post_init__(self) -> None:
-        _check_positive(self, "backbone.")
+        check_positive(self, "backbone.")
         if self.num_heads % self.num_kv_heads:
             raise UserError(f"num_heads={self.num_heads} must be a multiple of num_kv_heads={self.num_kv_heads}.")
         if self.head_dim % 2:

@@ -1,0 +1,68 @@
+"""The nano backbone's vision tower: a small convolutional network, pretrained on renders of the sixteen tasks."""
+
+from collections.abc import Sequence
+from importlib.resources import files
+
+from torch import Tensor, nn
+
+from mme_vla.errors import UserError
+
+WEIGHTS = "assets/nano_vision.safetensors"
+STRIDES = (4, 2, 2)
+"""Of the three stages: a 128-pixel picture becomes 32×32, 16×16 and 8×8 places."""
+
+
+class Residual(nn.Module):
+    """x + two 3×3 convolutions of its normalised self."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.norm = nn.GroupNorm(8, width)
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.second(nn.functional.gelu(self.first(self.norm(x))))
+
+
+class ConvTower(nn.Module):
+    """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d].
+
+    Args:
+        widths: channels of the three stages. blocks: residual blocks of each. out: d.
+    """
+
+    def __init__(self, widths: Sequence[int], blocks: Sequence[int], out: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        before = 3
+        for width, count, stride in zip(widths, blocks, STRIDES, strict=True):
+            kernel = stride + 2 * (stride // 2)  # windows overlap: places know what is at their borders
+            layers.append(nn.Conv2d(before, width, kernel, stride, padding=(kernel - stride) // 2))
+            layers += [Residual(width) for _ in range(count)]
+            before = width
+        self.stages = nn.Sequential(*layers)
+        self.norm = nn.GroupNorm(8, before)
+        self.out = nn.Conv2d(before, out, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        return self.out(nn.functional.gelu(self.norm(self.stages(images)))).flatten(2).transpose(1, 2)
+
+
+def load_shipped(tower: ConvTower) -> None:
+    """Give a tower the weights that ship with the library.
+
+    Raises:
+        UserError: it has other sizes than these weights.
+    """
+    from safetensors.torch import load
+
+    state = {name: value.float() for name, value in load(files("mme_vla").joinpath(WEIGHTS).read_bytes()).items()}
+    own = tower.state_dict()
+    if {name: value.shape for name, value in state.items()} != {name: value.shape for name, value in own.items()}:
+        raise UserError(
+            "The vision weights that ship with the library are for the sizes in configs/backbone/nano.yaml. With "
+            "others set backbone.vision.pretrained=false, or train a tower of that size: python -m "
+            "mme_vla.vision_pretrain."
+        )
+    tower.load_state_dict(state)
