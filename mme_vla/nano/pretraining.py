@@ -5,6 +5,7 @@ Two linear layers on the tower's tokens say, for each of the 8×8 places under a
 """
 
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -129,7 +130,7 @@ def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, s
         rng = np.random.default_rng([settings.seed, step])
         rows = torch.from_numpy(rng.integers(0, len(pictures), settings.batch_size))
         for group in optimizer.param_groups:
-            group["lr"] = settings.lr * min(1, (step + 1) / 50) * (1 + np.cos(np.pi * step / settings.steps)) / 2
+            group["lr"] = settings.lr * min(1, (step + 1) / 50) * (1 + math.cos(math.pi * step / settings.steps)) / 2
         loss, _ = probe_loss(probe, *shifted(to_unit_range(pictures[rows]), labels[rows], rng), weights)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

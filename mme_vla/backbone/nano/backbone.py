@@ -4,7 +4,8 @@ The prefix is not processed in layers: each layer of the action column attends t
 training step on stored tokens cheap enough for a laptop, and leaves memory as many doors as it needs.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import torch
@@ -32,29 +33,19 @@ STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
 class Reader(nn.Module):
     """One layer of the action column: attention among a chunk's actions, attention to the context, and an MLP."""
 
-    def __init__(self, config: NanoConfig, contexts: Mapping[str, ExpertConfig]) -> None:
+    def __init__(self, config: NanoConfig) -> None:
         super().__init__()
         width, inner = config.action.width, config.num_heads * config.head_dim
-        self.heads, self.head_dim = config.num_heads, config.head_dim
+        self.head_dim = config.head_dim
         self.norm = AdaRMSNorm(width, width)
         self.qkv = nn.Linear(width, 3 * inner, bias=False)
         self.out = nn.Linear(inner, width, bias=False)
         self.read_norm = AdaRMSNorm(width, width)
         self.read_q = nn.Linear(width, inner, bias=False)
-        self.context_norms = nn.ModuleDict({name: RMSNorm(expert.width) for name, expert in contexts.items()})
-        self.read_kv = nn.ModuleDict(
-            {name: nn.Linear(expert.width, 2 * inner, bias=False) for name, expert in contexts.items()}
-        )
         self.read_out = nn.Linear(inner, width, bias=False)
         self.mlp_norm = AdaRMSNorm(width, width)
         self.up = nn.Linear(width, config.action.mlp_dim)
         self.down = nn.Linear(config.action.mlp_dim, width)
-
-    def keys_values(self, block: Block) -> tuple[Tensor, Tensor]:
-        """Keys and values [b, n, N, h] of a block of context."""
-        normed = self.context_norms[block.expert](block.tokens)[0]
-        k, v = self.read_kv[block.expert](normed).unflatten(-1, (-1, self.head_dim)).chunk(2, dim=-2)
-        return k, v
 
     def forward(
         self, x: Tensor, condition: Tensor, k: Tensor, v: Tensor, mask: Tensor, draws: int, hook: Hook | None, at: int
@@ -81,6 +72,20 @@ class Reader(nn.Module):
         return x + (1 + gate) * self.down(nn.functional.gelu(self.up(normed)))
 
 
+class Column(nn.Module):
+    """What a block of context becomes for the action column: keys and values of every layer, in one product."""
+
+    def __init__(self, width: int, config: NanoConfig) -> None:
+        super().__init__()
+        self.shape = (config.depth, 2, config.num_heads, config.head_dim)
+        self.norm = RMSNorm(width)
+        self.kv = nn.Linear(width, math.prod(self.shape), bias=False)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """[b, n, d] → [layers, 2, b, n, N, h]."""
+        return self.kv(self.norm(tokens)[0]).unflatten(-1, self.shape).movedim((2, 3), (0, 1))
+
+
 @BACKBONES.register("nano")
 class NanoBackbone(Backbone):
     """A pretrained convolutional tower, and a few layers of action tokens that read the context; chunks by flow matching.
@@ -96,8 +101,8 @@ class NanoBackbone(Backbone):
     unadaptable = r"\.\w*norm\.dense$"
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vision\.",
-        "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|prompt_in\.|layers\.\d+\.(?:context_norms|read_kv)\.vlm\.",
-        "memory": r"layers\.\d+\.(?:context_norms|read_kv)\.",
+        "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|prompt_in\.|columns\.vlm\.",
+        "memory": r"columns\.",
         "action": "",
     }
 
@@ -128,19 +133,18 @@ class NanoBackbone(Backbone):
         self.action_in = nn.Linear(config.action_dim, answer)
         self.steps = nn.Embedding(config.horizon, answer)
         contexts = {**(extra_experts or {}), "vlm": config.vlm}
-        self.layers = nn.ModuleList(Reader(config, contexts) for _ in range(config.depth))
+        self.columns = nn.ModuleDict({name: Column(expert.width, config) for name, expert in contexts.items()})
+        self.layers = nn.ModuleList(Reader(config) for _ in range(config.depth))
         self.final = RMSNorm(answer)
         self.action_out = nn.Linear(answer, config.action_dim)
         for name, module in self.named_children():
             if name != "vision":
                 initialise(module)
 
-    def draw_experts(self, names: list[str]) -> None:  # type: ignore[override]
-        """Give the columns of these experts fresh weights in every layer."""
-        for layer in self.layers:
-            for name in names:
-                for table in (layer.context_norms, layer.read_kv):
-                    initialise(table[name])  # type: ignore[index]
+    def draw_experts(self, names: Sequence[str]) -> None:
+        """Give the columns of these experts fresh weights."""
+        for name in names:
+            initialise(self.columns[name])
 
     def compile(self, **options: object) -> None:
         """Compile the tower and every layer in place."""
@@ -215,16 +219,13 @@ class NanoBackbone(Backbone):
 
     def _prepare(
         self, batch: Batch, images: Tensor, inject: Inject
-    ) -> tuple[list[tuple[Tensor, Tensor]], Tensor, Tensor, Injection]:
+    ) -> tuple[Tensor, Tensor, Tensor, Injection]:
         """What does not depend on the noise: each layer's keys and values, their mask, what the goal says."""
         observation = self.observation_blocks(batch, images)
         injection = inject(observation)
         seen = [block for block in injection.blocks if block.name in injection.visibility["action"]]
-        cached = []
-        for layer in self.layers:
-            keys, values = zip(*(layer.keys_values(block) for block in seen), strict=True)  # type: ignore[operator]
-            cached.append((torch.cat(keys, 1), torch.cat(values, 1)))
-        mask = additive_mask(torch.cat([block.mask for block in seen], 1)[:, None], cached[0][0].dtype)
+        cached = torch.cat([self.columns[block.expert](block.tokens) for block in seen], 3)
+        mask = additive_mask(torch.cat([block.mask for block in seen], 1)[:, None], cached.dtype)
         words = self.prompt_in(observation[1].tokens) * batch.prompt_mask[..., None]
         said = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
         return cached, mask, said, injection
@@ -232,7 +233,7 @@ class NanoBackbone(Backbone):
     def _clean(
         self,
         batch: Batch,
-        cached: list[tuple[Tensor, Tensor]],
+        cached: Tensor,
         mask: Tensor,
         said: Tensor,
         injection: Injection,

@@ -38,7 +38,7 @@ class NanoConfig(Sizes):
     vision: TowerConfig = field(default_factory=TowerConfig)
     vlm: ExpertConfig = field(default_factory=lambda: ExpertConfig(128, 256))
     action: ExpertConfig = field(default_factory=lambda: ExpertConfig(128, 256))
-    depth: int = 4
+    depth: int = 2
     num_heads: int = 4
     head_dim: int = 32
     state_dim: int = 8

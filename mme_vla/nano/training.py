@@ -1,0 +1,101 @@
+"""One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from mme_vla.config.composition import compose
+from mme_vla.errors import UserError
+from mme_vla.files import write_json
+from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.nano.learning import Decisions, collate, statistics
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.training.checkpoint import checkpoints_in
+from mme_vla.training.console import ProgressLine
+from mme_vla.training.logging import JsonLines, Loggers
+from mme_vla.training.loop import Trainer
+from mme_vla.training.runs import claim_run
+from mme_vla.training.settings import TrainSettings
+from mme_vla.training.validation import Validation
+
+DONE = "trained.json"
+
+
+def compose_policy(model: str, memories: Mapping[str, Mapping[str, Any]], words: Sequence[str]) -> dict[str, Any]:
+    """The configuration of one model at nano size, plain.
+
+    Args:
+        model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
+        words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
+    """
+    found = compose("policy", [f"model={model}", *words])
+    memory = None if found.memory is None else str(found.memory.name)
+    chosen = [f"memory.{key}={value}" for key, value in memories.get(memory or "", {}).items()]
+    config = OmegaConf.to_container(compose("policy", [f"model={model}", *words, *chosen]), resolve=True)
+    assert isinstance(config, dict)
+    return {str(key): value for key, value in config.items()}
+
+
+def build(config: Mapping[str, Any]) -> MMEPolicy:
+    """A policy with fresh weights but for its tower, which does not learn."""
+    policy = build_from_config(OmegaConf.create(dict(config)))
+    if policy.augment:
+        raise UserError("policy.augment=true changes pictures, and nano policies learn from tokens: set it to false.")
+    apply_finetuning(policy, freeze_vision=True)
+    return policy
+
+
+def train(
+    config: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    folder: Path,
+    learnt: Sequence[Demonstration],
+    held_out: Sequence[Demonstration],
+) -> Path:
+    """Train a policy in `folder`, or go on with it; the last checkpoint.
+
+    Args:
+        config: as `compose_policy` gives it. settings: the section `train`.
+        learnt, held_out: demonstrations to learn from, and to measure the loss on.
+    """
+    from accelerate import Accelerator
+
+    if (folder / DONE).is_file():
+        return checkpoints_in(folder / "checkpoints")[-1]
+    begun, cpu = time.perf_counter(), time.process_time()
+    chosen = TrainSettings.from_dict(settings, int(config["seed"]))
+    whole = {**config, "train": dict(settings)}
+    resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
+    folder.mkdir(parents=True, exist_ok=True)
+    run, lock = claim_run(folder, True, resume, whole)
+    with lock:
+        policy = build(config)
+        policy.require_processor().stats = statistics(learnt, policy)
+        policy.config["card"] = {"data": f"{len(learnt)} demonstrations of {learnt[0].task}", "recipe": dict(settings)}
+        samples, held = Decisions(policy, learnt), Decisions(policy, held_out)
+        validation = Validation(held, collate, chosen.val_samples, chosen.batch_size, chosen.seed)
+        trainer = Trainer(policy, samples, collate, validation, chosen, run, whole, Accelerator(cpu=True))
+        line, loggers = ProgressLine(chosen.steps, run.step), Loggers([JsonLines(folder, run.step)])
+        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(learnt)} demonstrations")
+        try:
+            with line:
+                finished = trainer.run(line, loggers)
+        finally:
+            loggers.close()
+    assert trainer.last_checkpoint is not None
+    if not finished:
+        raise SystemExit(128 + (trainer.stopped_by or 0))
+    spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
+    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), **spent})
+    return trainer.last_checkpoint
+
+
+def learning_curve(folder: Path) -> list[dict[str, float]]:
+    """What the run logged, a dictionary a line."""
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
