@@ -6,15 +6,18 @@ Two linear layers on the tower's tokens say, for each of the 8×8 places under a
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from mme_vla.backbone.nano.backbone import NanoBackbone
+from mme_vla.backbone.nano.sizes import NanoConfig
 from mme_vla.backbone.nano.tower import ConvTower
 from mme_vla.errors import UserError
 from mme_vla.files import write_atomically
@@ -33,7 +36,7 @@ class PretrainSettings:
     held_out: share of the scenes that only measure. save_every: updates between two drafts. seed: of everything random.
     """
 
-    steps: int = 1500
+    steps: int = 800
     batch_size: int = 32
     lr: float = 2e-3
     held_out: float = 0.1
@@ -60,6 +63,18 @@ class Probe(nn.Module):
     def _picture(self, x: Tensor, side: int) -> Tensor:
         x = x.unflatten(1, (self.grid, self.grid)).unflatten(-1, (-1, side, side))  # n y x c i j
         return x.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
+
+
+def fresh_tower(sizes: Mapping[str, Any], width: int) -> tuple[ConvTower, int]:
+    """A tower with random weights, and the side of its token grid.
+
+    Args:
+        sizes: the section `backbone.vision`. width: of a token.
+    """
+    backbone = NanoBackbone(NanoConfig.from_dict({
+        "vision": {**sizes, "pretrained": False}, "vlm": {"width": width, "mlp_dim": width},
+    }))  # fmt: skip
+    return backbone.vision, backbone.grid  # type: ignore[return-value]
 
 
 def load_scenes(files: Sequence[Path]) -> tuple[Tensor, Tensor]:
