@@ -34,6 +34,10 @@ class TensorStruct:
         """Return a copy whose tensors went through `Tensor.to` with these arguments."""
         return self._map(lambda x: x.to(*args, **kwargs))
 
+    def rows(self, chosen: Tensor) -> Self:
+        """Return the rows of every tensor that `chosen` names: numbers [n], or a mask."""
+        return self._map(lambda x: x[chosen])
+
     def pin_memory(self) -> Self:
         """Return a copy in page-locked memory (what `DataLoader(pin_memory=True)` calls)."""
         return self._map(lambda x: x.pin_memory())

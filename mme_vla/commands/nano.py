@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 # Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
-HELD_OUT = 10  # one demonstration in so many only measures the loss
 
 
 @cli("nano")
@@ -43,7 +42,6 @@ def main(cfg: DictConfig) -> None:
 def run(config: Mapping[str, Any]) -> Path:
     """All stages of a run; the path of its page."""
     from mme_vla.nano.evaluating import run_episodes
-    from mme_vla.nano.learning import load_all
     from mme_vla.nano.page import write_page
     from mme_vla.nano.training import build, compose_policy, train
 
@@ -57,11 +55,9 @@ def run(config: Mapping[str, Any]) -> Path:
         memories = [build(each).memory for each in composed.values()]
         looks: list[Looks] = [memory_looks(memory) for memory in memories if memory is not None]
         files = record_all(config, folder / "demonstrations", looks)
-    learnt = load_all([file for number, file in enumerate(files) if number % HELD_OUT != HELD_OUT - 1])
-    held_out = load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:])
     for model, each in composed.items():
         with minutes.of(f"training {model}"):
-            checkpoint = train(each, config["train"], folder / model, learnt, held_out)
+            checkpoint = train(each, config["train"], folder / model, files)
         with minutes.of(f"evaluation {model}"):
             run_episodes(
                 checkpoint, folder / model / config["split"], config["task"], split=config["split"],

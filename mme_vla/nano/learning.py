@@ -11,14 +11,18 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.errors import UserError
+from mme_vla.files import write_atomically
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats
-from mme_vla.types import Batch
+from mme_vla.types import Batch, HistoryTokens
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
+
+
+_PAST = "history."
 
 
 class SparseHistory(History):
@@ -40,13 +44,17 @@ class SparseHistory(History):
         return self._tokens[torch.as_tensor(rows), torch.as_tensor(indices[:, 1])]
 
 
-class Decisions(Dataset[dict[str, Any]]):
-    """The decisions of demonstrations as a policy learns them; everything is in memory.
+class Decisions(Dataset[int]):
+    """The decisions of demonstrations as a policy learns them, all in memory: an item is its number, see `collate`.
 
-    Items hold the tokens of the current pictures (`Batch.view_tokens`) in place of the pictures.
+    batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     """
 
-    def __init__(self, policy: MMEPolicy, demonstrations: Sequence[Demonstration]) -> None:
+    def __init__(self, batch: Batch) -> None:
+        self.batch = batch
+
+    @classmethod
+    def of(cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration]) -> "Decisions":
         """Make all tokens.
 
         Args:
@@ -55,15 +63,41 @@ class Decisions(Dataset[dict[str, Any]]):
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
         """
-        self._items = [item for found in demonstrations for item in _items(policy, found)]
-        if not self._items:
+        items = [item for found in demonstrations for item in _items(policy, found)]
+        if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
+        return cls(_stack(items))
+
+    @classmethod
+    def load(cls, path: Path) -> "Decisions":
+        """Read what `save` wrote."""
+        from safetensors.torch import load_file
+
+        found = load_file(path)
+        past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
+        now = {name: value for name, value in found.items() if not name.startswith(_PAST)}
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None))
+
+    def save(self, path: Path) -> None:
+        """Write one file of tensors, whole or not at all."""
+        from safetensors.torch import save_file
+
+        values = {name: value for name, value in vars(self.batch).items() if isinstance(value, Tensor)}
+        if self.batch.history is not None:
+            values |= {f"{_PAST}{name}": value for name, value in vars(self.batch.history).items()}
+        with write_atomically(path) as draft:
+            save_file({name: value.contiguous() for name, value in values.items()}, draft)
 
     def __len__(self) -> int:
-        return len(self._items)
+        return len(self.batch.prompt)
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        return self._items[index]
+    def __getitem__(self, index: int) -> int:
+        return index
+
+    def collate(self, rows: Sequence[int]) -> Batch:
+        """The batch of these decisions."""
+        chosen = torch.as_tensor(list(rows))
+        return self.batch.rows(chosen)
 
 
 def load_all(files: Sequence[Path]) -> list[Demonstration]:
@@ -126,8 +160,7 @@ def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
     )  # fmt: skip
 
 
-def collate(items: Sequence[dict[str, Any]]) -> Batch:
-    """Stack items into a `Batch` whose pictures are tokens already."""
+def _stack(items: Sequence[dict[str, Any]]) -> Batch:
 
     def stack(name: str) -> Tensor:
         return torch.stack([item[name] for item in items])

@@ -11,11 +11,12 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.files import write_json
-from mme_vla.nano.demonstrations import Demonstration
-from mme_vla.nano.learning import Decisions, collate, statistics
+from mme_vla.nano.learning import Decisions, load_all, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.normalisers import NormStats
+from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
 from mme_vla.training.console import ProgressLine
 from mme_vla.training.logging import JsonLines, Loggers
@@ -25,6 +26,8 @@ from mme_vla.training.settings import TrainSettings
 from mme_vla.training.validation import Validation
 
 DONE = "trained.json"
+HELD_OUT = 10
+"""One demonstration in so many only measures the loss."""
 
 
 def compose_policy(model: str, memories: Mapping[str, Mapping[str, Any]], words: Sequence[str]) -> dict[str, Any]:
@@ -55,14 +58,13 @@ def train(
     config: Mapping[str, Any],
     settings: Mapping[str, Any],
     folder: Path,
-    learnt: Sequence[Demonstration],
-    held_out: Sequence[Demonstration],
+    files: Sequence[Path],
 ) -> Path:
     """Train a policy in `folder`, or go on with it; the last checkpoint.
 
     Args:
         config: as `compose_policy` gives it. settings: the section `train`.
-        learnt, held_out: demonstrations to learn from, and to measure the loss on.
+        files: demonstrations; one in `HELD_OUT` only measures the loss.
     """
     from accelerate import Accelerator
 
@@ -76,13 +78,12 @@ def train(
     run, lock = claim_run(folder, True, resume, whole)
     with lock:
         policy = build(config)
-        policy.require_processor().stats = statistics(learnt, policy)
-        policy.config["card"] = {"data": f"{len(learnt)} demonstrations of {learnt[0].task}", "recipe": dict(settings)}
-        samples, held = Decisions(policy, learnt), Decisions(policy, held_out)
-        validation = Validation(held, collate, chosen.val_samples, chosen.batch_size, chosen.seed)
-        trainer = Trainer(policy, samples, collate, validation, chosen, run, whole, Accelerator(cpu=True))
+        samples, held = prepared(policy, folder, files)
+        policy.config["card"] = {"data": f"{len(files)} demonstrations", "recipe": dict(settings)}
+        validation = Validation(held, held.collate, chosen.val_samples, chosen.batch_size, chosen.seed)
+        trainer = Trainer(policy, samples, samples.collate, validation, chosen, run, whole, Accelerator(cpu=True))
         line, loggers = ProgressLine(chosen.steps, run.step), Loggers([JsonLines(folder, run.step)])
-        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(learnt)} demonstrations")
+        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(files)} demonstrations")
         try:
             with line:
                 finished = trainer.run(line, loggers)
@@ -94,6 +95,22 @@ def train(
     spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
     write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), **spent})
     return trainer.last_checkpoint
+
+
+def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[Decisions, Decisions]:
+    """Decisions to learn from, and to measure by; their tokens, and the statistics, are made once for a folder."""
+    learnt_file, held_file, stats_file = (folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE))
+    processor = policy.require_processor()
+    if held_file.is_file():  # written last
+        processor.stats = NormStats.load(stats_file)
+        return Decisions.load(learnt_file), Decisions.load(held_file)
+    learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
+    processor.stats = statistics(learnt, policy)
+    processor.stats.save(stats_file)
+    samples, held = Decisions.of(policy, learnt), Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]))
+    samples.save(learnt_file)
+    held.save(held_file)
+    return samples, held
 
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:
