@@ -1,9 +1,8 @@
 """`mme-vla COMMAND …`, the same as `python -m mme_vla COMMAND …`: the library's commands under one name."""
 
 import sys
-from importlib import import_module
 
-from mme_vla.commands import COMMANDS
+from mme_vla.commands import COMMANDS, run
 from mme_vla.errors import did_you_mean
 
 
@@ -19,7 +18,7 @@ def main() -> None:
         print(f"mme-vla: there is no command {name!r}. {did_you_mean(name, COMMANDS)}", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = [f"mme-vla {name}", *words]
-    import_module(f"mme_vla.commands.{COMMANDS[name][0]}").main()
+    run(COMMANDS[name][0])
 
 
 if __name__ == "__main__":

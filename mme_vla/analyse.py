@@ -1,6 +1,6 @@
 """`python -m mme_vla.analyse`: the command is mme_vla/commands/analyse.py."""
 
-from mme_vla.commands.analyse import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("analyse")

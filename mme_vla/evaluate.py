@@ -1,6 +1,6 @@
 """`python -m mme_vla.evaluate`: the command is mme_vla/commands/evaluate.py."""
 
-from mme_vla.commands.evaluate import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("evaluate")

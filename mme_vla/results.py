@@ -1,6 +1,6 @@
 """`python -m mme_vla.results`: the command is mme_vla/commands/results.py."""
 
-from mme_vla.commands.results import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("results")

@@ -1,6 +1,6 @@
 """`python -m mme_vla.serve`: the command is mme_vla/commands/serve.py."""
 
-from mme_vla.commands.serve import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("serve")

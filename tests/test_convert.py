@@ -54,6 +54,15 @@ def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(tmp_p
     assert np.array_equal(frames[:, :, 8:], np.repeat(frames[:1, :, 8:], 12, axis=0))
 
 
+def test_a_conversion_says_what_is_done_and_nothing_of_what_the_libraries_do(tmp_path: Path, recorded, capfd) -> None:
+    episodes, _ = recorded
+    convert(episodes, tmp_path / "out", ConvertOptions())
+    out, said = capfd.readouterr()
+    assert out == ""
+    assert [line.partition(":")[0] for line in said.splitlines()] == ["read", "convert"], said
+    assert f"{len(episodes)} of {len(episodes)} episodes" in said
+
+
 def test_a_flipped_bit_in_a_converted_dataset_is_found(tmp_path: Path, recorded) -> None:
     convert(recorded[0], tmp_path / "out")
     assert EpisodeSource(tmp_path / "out").verify() > 5

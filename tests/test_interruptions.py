@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from h5_files import write_file
 
+from mme_vla import commands
 from mme_vla.config.endings import print_user_errors
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
@@ -35,6 +36,17 @@ def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str
     assert (done.returncode, "Traceback" in done.stderr) == (code, False)
     assert done.stderr.count("\n") == 1
     assert f"Stopped by {words}" in done.stderr
+
+
+def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sentence(monkeypatch, capsys) -> None:
+    def interrupted(name: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(commands, "import_module", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        commands.run("train")
+    assert ended.value.code == 130
+    assert "Stopped by Ctrl-C" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,9 @@
 """The commands: the only place that reads a command line. `mme-vla NAME` and `python -m mme_vla NAME` run them."""
 
+from importlib import import_module
+
+from mme_vla.config.endings import print_user_errors
+
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train a policy"),
     "evaluate": ("evaluate", "run a policy on the benchmark"),
@@ -17,3 +21,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
 }
 """Name on the command line → module of this room, and what it does in a line."""
+
+
+def run(module: str) -> None:
+    """Run the command in a module of this room, importing it first: Ctrl-C ends that with a sentence as well."""
+    with print_user_errors():
+        import_module(f"{__name__}.{module}").main()

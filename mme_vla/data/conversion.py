@@ -17,6 +17,7 @@ import numpy as np
 
 from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, open_episode, pose_columns
 from mme_vla.data.progress import progress
+from mme_vla.data.quiet import quiet_libraries
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
@@ -140,9 +141,11 @@ def _convert(
     missing = [i for i, part in enumerate(parts) if not part.is_dir()]
     with progress("convert", len(parts), len(parts) - len(missing), "episodes") as advance:
         for i in missing:
-            _write_part(episodes[i], parts[i], options)
+            with quiet_libraries():
+                _write_part(episodes[i], parts[i], options)
             advance(1)
-    _merge(parts, partial / _MERGED, plan)
+    with quiet_libraries():
+        _merge(parts, partial / _MERGED, plan)
     (partial / _MERGED).rename(output)
     drop_plan(partial)
     return len(missing)
@@ -258,11 +261,9 @@ def count_frames(path: Path) -> int:
 
 def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
-    from lerobot.utils.utils import SuppressProgressBars
 
     sides = [read_json(part / SIDE_FILE, "the facts of a converted episode") for part in parts]
-    with SuppressProgressBars():  # one bar for the merge, not one for every file it reads
-        aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
+    aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
     episodes = [{"episode_index": i, **side} for i, side in enumerate(sides)]

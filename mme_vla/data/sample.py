@@ -1,6 +1,6 @@
 """`python -m mme_vla.data.sample`: the command is mme_vla/commands/sample.py."""
 
-from mme_vla.commands.sample import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("sample")

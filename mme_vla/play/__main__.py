@@ -1,6 +1,6 @@
 """`python -m mme_vla.play`: the command is mme_vla/commands/play.py."""
 
-from mme_vla.commands.play import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("play")

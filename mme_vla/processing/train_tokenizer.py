@@ -1,6 +1,6 @@
 """`python -m mme_vla.processing.train_tokenizer`: the command is mme_vla/commands/train_tokenizer.py."""
 
-from mme_vla.commands.train_tokenizer import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("train_tokenizer")

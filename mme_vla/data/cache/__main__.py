@@ -1,6 +1,6 @@
 """`python -m mme_vla.data.cache`: the command is mme_vla/commands/cache.py."""
 
-from mme_vla.commands.cache import main
+from mme_vla.commands import run
 
 if __name__ == "__main__":
-    main()
+    run("cache")
