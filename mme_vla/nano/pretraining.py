@@ -1,7 +1,7 @@
 """Pretraining of the nano backbone's vision tower: which object is where, and what colour things have.
 
-Two linear layers on the tower's tokens say, for each of the 8×8 places under a token, what the labels of
-`scenes.py` say, and give back a coarse picture. Both are thrown away; what was linear in a token stays so for memory.
+The tower says, for each of the 8×8 places under a token, which class of objects is seen there (the labels of
+`scenes.py`), and gives back a coarse picture.
 """
 
 import logging
@@ -18,14 +18,13 @@ from torch.nn import functional
 
 from mme_vla.backbone.nano.backbone import NanoBackbone
 from mme_vla.backbone.nano.sizes import NanoConfig
-from mme_vla.backbone.nano.tower import ConvTower
+from mme_vla.backbone.nano.tower import CLASSES, COARSE, FINE, ConvTower
 from mme_vla.errors import UserError
 from mme_vla.files import write_atomically
-from mme_vla.nano.scenes import CLASSES, LABEL_SIDE
+from mme_vla.nano.scenes import LABEL_SIDE
 from mme_vla.processing.pictures import to_unit_range
 
 logger = logging.getLogger(__name__)
-COARSE = 32  # side of the picture that is given back
 SHIFT = 8  # pixels that a picture is moved by at most
 
 
@@ -44,25 +43,16 @@ class PretrainSettings:
     seed: int = 0
 
 
-class Probe(nn.Module):
-    """A tower with the two linear layers that it is trained through."""
+def as_pictures(tower: ConvTower, pictures: Tensor, grid: int) -> tuple[Tensor, Tensor]:
+    """What a tower says of pictures [n, 3, s, s]: class scores [n, classes, 64, 64] and colours [n, 3, 32, 32]."""
+    scores, colours = tower.answers(pictures)
+    return _joined(scores, grid, FINE), _joined(colours.unflatten(-1, (3, -1)), grid, COARSE)
 
-    def __init__(self, tower: ConvTower, grid: int) -> None:
-        super().__init__()
-        self.tower, self.grid = tower, grid
-        self.fine, self.coarse = LABEL_SIDE // grid, COARSE // grid
-        width = tower.out.out_channels
-        self.classes = nn.Linear(width, self.fine**2 * len(CLASSES))
-        self.colours = nn.Linear(width, self.coarse**2 * 3)
 
-    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor]:
-        """Pictures [n, 3, s, s] in [−1, 1] → class scores [n, classes, 64, 64] and colours [n, 3, 32, 32]."""
-        tokens = self.tower(pictures)
-        return self._picture(self.classes(tokens), self.fine), self._picture(self.colours(tokens), self.coarse)
-
-    def _picture(self, x: Tensor, side: int) -> Tensor:
-        x = x.unflatten(1, (self.grid, self.grid)).unflatten(-1, (-1, side, side))  # n y x c i j
-        return x.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
+def _joined(x: Tensor, grid: int, side: int) -> Tensor:
+    """[n, grid², c, side²] → [n, c, grid·side, grid·side]."""
+    x = x.unflatten(-1, (side, side)).unflatten(1, (grid, grid))  # n y x c i j
+    return x.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)
 
 
 def fresh_tower(sizes: Mapping[str, Any], width: int) -> tuple[ConvTower, int]:
@@ -105,11 +95,13 @@ def shifted(pictures: Tensor, labels: Tensor, rng: np.random.Generator) -> tuple
     return picture[..., top : top + side, left : left + side], label
 
 
-def probe_loss(probe: Probe, pictures: Tensor, labels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def tower_loss(
+    tower: ConvTower, grid: int, pictures: Tensor, labels: Tensor, weights: Tensor
+) -> tuple[Tensor, Tensor]:
     """The training loss of a batch, and the share [classes] of each class's places that are named rightly."""
-    scores, colours = probe(pictures)
+    scores, colours = as_pictures(tower, pictures, grid)
     loss = functional.cross_entropy(scores, labels, weights)
-    loss = loss + functional.l1_loss(colours, functional.interpolate(pictures, COARSE, mode="area"))
+    loss = loss + functional.l1_loss(colours, functional.interpolate(pictures, grid * COARSE, mode="area"))
     right = scores.argmax(1) == labels
     share = [right[labels == number].float().mean() for number in range(len(CLASSES))]
     return loss, torch.stack(share).detach()
@@ -133,12 +125,12 @@ def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, s
     val_pictures, val_labels = load_scenes(shuffled[:held])
     pictures, labels = load_scenes(shuffled[held:])
     weights = _class_weights(labels)
-    probe = Probe(tower, grid).to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(probe.parameters(), lr=settings.lr, weight_decay=0.01)
+    tower.to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(tower.parameters(), lr=settings.lr, weight_decay=0.01)
     start = 0
     if draft.is_file():
         state = torch.load(draft, weights_only=True)
-        probe.load_state_dict(state["probe"])
+        tower.load_state_dict(state["tower"])
         optimizer.load_state_dict(state["optimizer"])
         start = state["step"]
     for step in range(start, settings.steps):
@@ -146,19 +138,19 @@ def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, s
         rows = torch.from_numpy(rng.integers(0, len(pictures), settings.batch_size))
         for group in optimizer.param_groups:
             group["lr"] = settings.lr * min(1, (step + 1) / 50) * (1 + math.cos(math.pi * step / settings.steps)) / 2
-        loss, _ = probe_loss(probe, *shifted(to_unit_range(pictures[rows]), labels[rows], rng), weights)
+        loss, _ = tower_loss(tower, grid, *shifted(to_unit_range(pictures[rows]), labels[rows], rng), weights)
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        nn.utils.clip_grad_norm_(probe.parameters(), 1.0)
+        nn.utils.clip_grad_norm_(tower.parameters(), 1.0)
         optimizer.step()
         done = step + 1
         if done % settings.save_every == 0 or done == settings.steps:
             with write_atomically(draft) as path:
                 torch.save(
-                    {"probe": probe.state_dict(), "optimizer": optimizer.state_dict(), "step": done}, path
+                    {"tower": tower.state_dict(), "optimizer": optimizer.state_dict(), "step": done}, path
                 )
             logger.info("step %d/%d · loss %.4f · %s", done, settings.steps, loss.item(),
-                        report(probe, val_pictures, val_labels, weights))  # fmt: skip
+                        report(tower, grid, val_pictures, val_labels, weights))  # fmt: skip
     state = {name: value.contiguous().half() for name, value in tower.state_dict().items()}
     with write_atomically(weights_file) as path:
         save_file(state, path)
@@ -166,12 +158,12 @@ def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, s
 
 
 @torch.no_grad()
-def report(probe: Probe, pictures: Tensor, labels: Tensor, weights: Tensor) -> str:
-    """What a probe gets right of scenes it was not trained on, in a line."""
+def report(tower: ConvTower, grid: int, pictures: Tensor, labels: Tensor, weights: Tensor) -> str:
+    """What a tower gets right of scenes it was not trained on, in a line."""
     losses, shares = [], []
     for start in range(0, len(pictures), 64):
         part = to_unit_range(pictures[start : start + 64])
-        loss, share = probe_loss(probe, part, labels[start : start + 64].long(), weights)
+        loss, share = tower_loss(tower, grid, part, labels[start : start + 64].long(), weights)
         losses.append(loss)
         shares.append(share)
     named = zip(CLASSES, torch.stack(shares).nanmean(0).tolist(), strict=True)

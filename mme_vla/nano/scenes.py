@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mme_vla.backbone.nano.tower import CLASSES
 from mme_vla.envs.make import make_task
 from mme_vla.files import write_atomically
 from mme_vla.processing.pictures import resize_with_pad_uint8
@@ -16,11 +17,6 @@ from mme_vla.processing.pictures import resize_with_pad_uint8
 if TYPE_CHECKING:
     from mme_vla.envs.task import Task
 
-CLASSES = (
-    "nothing", "robot", "red cube", "green cube", "blue cube", "other cube", "container", "button", "target", "disc",
-    "box", "obstacle", "peg",
-)  # fmt: skip
-"""What a pixel may show; a class's place in here is its number in a label."""
 _BY_NAME = {
     "container": "container", "button": "button", "target": "target", "spot": "target", "disc": "disc",
     "board": "box", "box": "box", "obstacle": "obstacle", "peg": "peg",

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,8 @@ def train(
     resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
     folder.mkdir(parents=True, exist_ok=True)
     run, lock = claim_run(folder, True, resume, whole)
-    with lock:
+    with ExitStack() as held_lock:
+        held_lock.push(lock)  # it is held already
         policy = build(config)
         samples, held = prepared(policy, folder, files)
         policy.config["card"] = {"data": f"{len(files)} demonstrations", "recipe": dict(settings)}

@@ -101,7 +101,7 @@ class NanoBackbone(Backbone):
     unadaptable = r"\.\w*norm\.dense$"
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vision\.",
-        "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|prompt_in\.|columns\.vlm\.",
+        "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\.",
         "memory": r"columns\.",
         "action": "",
     }
@@ -110,7 +110,7 @@ class NanoBackbone(Backbone):
         super().__init__(config, extra_experts)
         self.config = config
         tower, width, answer = config.vision, config.vlm.width, config.action.width
-        self.vision_width = self.token_width = width
+        self.token_width = width
         self.answer_width = answer
         self.depth, self.head_dim = config.depth, config.head_dim
         self.image_size, self.grid = tower.image_size, tower.image_size // 16
@@ -119,11 +119,13 @@ class NanoBackbone(Backbone):
         self.vision = ConvTower(
             (tower.width_32, tower.width_16, tower.width_8), (tower.blocks_32, tower.blocks_16, tower.blocks_8), width
         )
+        self.vision_width = self.vision.token_width
         initialise(self.vision)
         if tower.pretrained and self.device.type != "meta":
             load_shipped(self.vision)
         self.places = nn.Embedding(self.grid**2, width)
         self.views = nn.Embedding(MAX_VIEWS, width)
+        self.see_in = nn.Linear(self.vision_width, width)
         self.see = nn.Sequential(nn.Linear(width, config.vlm.mlp_dim), nn.GELU(), nn.Linear(config.vlm.mlp_dim, width))
         self.embedding = nn.Embedding(config.vocab_size, width)
         self.positions = nn.Embedding(MAX_WORDS, width)
@@ -169,8 +171,8 @@ class NanoBackbone(Backbone):
             tokens = self.encode_images(images.flatten(0, 1)).unflatten(0, (-1, views))
         else:
             tokens = batch.view_tokens.to(self.places.weight.dtype)
-        placed = tokens + self.places.weight + self.views.weight[:views, None]  # b v n d
-        seen = tokens + self.see(placed)
+        placed = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
+        seen = placed + self.see(placed)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.embedding(batch.prompt) + self.positions.weight[: batch.prompt.shape[1]]
         return [

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from importlib.resources import files
 
+import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
@@ -25,11 +26,26 @@ class Residual(nn.Module):
         return x + self.second(nn.functional.gelu(self.first(self.norm(x))))
 
 
+CLASSES = (
+    "nothing", "robot", "red cube", "green cube", "blue cube", "other cube", "container", "button", "target", "disc",
+    "box", "obstacle", "peg",
+)  # fmt: skip
+"""What a place of a picture may show; a class's number is its place in here."""
+FINE, COARSE = 8, 4
+"""A token stands for 8×8 places that show a class each, and for 4×4 places that have a colour each."""
+LOUDNESS = (8.0, 3.0, 3.0, 3.0, 0.3)
+"""Factors of mass, presence, column, row and colours, which bring them to one size."""
+
+
 class ConvTower(nn.Module):
-    """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d].
+    """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d] that say what is where.
+
+    A token holds, for each class but the first, its mass, its presence and where in the token it is, column and row in
+    [−1, 1] times the presence; and the colours of its 4×4 places.
 
     Args:
-        widths: channels of the three stages. blocks: residual blocks of each. out: d.
+        widths: channels of the three stages. blocks: residual blocks of each. out: channels that the answers are read
+            from.
     """
 
     def __init__(self, widths: Sequence[int], blocks: Sequence[int], out: int) -> None:
@@ -44,9 +60,29 @@ class ConvTower(nn.Module):
         self.stages = nn.Sequential(*layers)
         self.norm = nn.GroupNorm(8, before)
         self.out = nn.Conv2d(before, out, 1)
+        self.classes = nn.Linear(out, FINE**2 * len(CLASSES))
+        self.colours = nn.Linear(out, COARSE**2 * 3)
+        line = (torch.arange(FINE) + 0.5) / FINE * 2 - 1
+        self.register_buffer("columns", line.repeat(FINE), persistent=False)
+        self.register_buffer("rows", line.repeat_interleave(FINE), persistent=False)
+
+    @property
+    def token_width(self) -> int:
+        """d."""
+        return 4 * (len(CLASSES) - 1) + self.colours.out_features
+
+    def answers(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        """Scores of the classes [n, (s/16)², classes, 64] and colours [n, (s/16)², 48] in [−1, 1]."""
+        features = self.out(nn.functional.gelu(self.norm(self.stages(images)))).flatten(2).transpose(1, 2)
+        return self.classes(features).unflatten(-1, (len(CLASSES), -1)), self.colours(features)
 
     def forward(self, images: Tensor) -> Tensor:
-        return self.out(nn.functional.gelu(self.norm(self.stages(images)))).flatten(2).transpose(1, 2)
+        scores, colours = self.answers(images)
+        shares = scores.softmax(2)[:, :, 1:]
+        mass, presence = shares.mean(-1), shares.amax(-1)
+        places = [(shares * line).sum(-1) / shares.sum(-1) * presence for line in (self.columns, self.rows)]
+        parts = (mass, presence, *places, colours)
+        return torch.cat([part * factor for part, factor in zip(parts, LOUDNESS, strict=True)], -1)
 
 
 def load_shipped(tower: ConvTower) -> None:
