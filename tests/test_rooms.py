@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "mme_vla"
 
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
-    "commands", "testing", "play", "evaluation", "serving", "training", "subgoal", "envs", "data", "weights", "policy",
+    "commands", "nano", "testing", "play", "evaluation", "serving", "training", "subgoal", "envs", "data", "weights", "policy",
     "processing", "integration", "memory", "backbone", "config", "media", "embodiment", "types", "registry", "files",
     "errors",
 ]  # fmt: skip

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json, write_json
 
 if TYPE_CHECKING:
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 # Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+SEEDS_APART = 100_000  # first seeds of two difficulties
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
 
 
@@ -33,8 +34,7 @@ def main(cfg: DictConfig) -> None:
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     check_names(config["task"], "mme_vla", "waypoint", None, None)
-    if config["demonstrations"] < 2:
-        raise UserError(f"demonstrations={config['demonstrations']}: one to learn from and one to measure by, at least.")
+    check_counts(config["demonstrations"])
     require_simulator()
     run({str(key): value for key, value in config.items()})
 
@@ -90,6 +90,22 @@ def memory_looks(memory: Any) -> "Looks":
     return look
 
 
+def check_counts(counts: Any) -> None:
+    """Make sure that demonstrations are asked for as difficulty: how many.
+
+    Raises:
+        UserError: another form, an unknown difficulty, or fewer than two in all.
+    """
+    known = ("easy", "medium", "hard")
+    if not isinstance(counts, Mapping) or not all(isinstance(n, int) and n >= 0 for n in counts.values()):
+        raise UserError(f"demonstrations={brief(counts)}: write how many of each difficulty, such as {{easy: 100}}.")
+    for level in counts:
+        if level not in known:
+            raise UserError(f"Unknown difficulty {brief(level)}. {did_you_mean(str(level), known)}")
+    if sum(counts.values()) < 2:
+        raise UserError(f"demonstrations={brief(counts)}: it takes two, to learn from and to measure by.")
+
+
 def record_all(config: Mapping[str, Any], folder: Path, looks: "list[Looks]") -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
 
@@ -98,34 +114,48 @@ def record_all(config: Mapping[str, Any], folder: Path, looks: "list[Looks]") ->
     """
     from mme_vla.data.progress import progress
     from mme_vla.embodiment.robomme import CAMERAS
-    from mme_vla.envs.episodes import choose_tasks
-    from mme_vla.nano.demonstrations import record
 
     folder.mkdir(parents=True, exist_ok=True)
-    (task,) = choose_tasks(config["task"])
     cameras = [name for name in CAMERAS if name == "front" or "front" not in config["embodiment"]]
-    levels, wanted = list(config["difficulties"]), int(config["demonstrations"])
+    counts: dict[str, int] = config["demonstrations"]
     files: list[Path] = []
-    seed, failed = int(config["first_seed"]), 0
-    with progress("record", wanted, unit="demonstrations") as advance:
-        while len(files) < wanted:
-            level = levels[seed % len(levels)]
-            path = folder / f"{level}-{seed}.npz"
-            none = path.with_suffix(".failed")
-            if not path.is_file() and not none.is_file():
-                found = record(task, seed, level, looks, cameras)
-                if found is None:
-                    none.touch()
-                else:
-                    found.save(path)
-            seed += 1
-            failed = 0 if path.is_file() else failed + 1
-            if failed >= RETRIES:
-                raise UserError(f"{task}: {RETRIES} scenes in a row, to seed {seed - 1}, that cannot be demonstrated.")
-            if path.is_file():
+    with progress("record", sum(counts.values()), unit="demonstrations") as advance:
+        for number, (level, wanted) in enumerate(counts.items()):
+            first = int(config["first_seed"]) + number * SEEDS_APART
+            for path in demonstrations_of(config["task"], level, first, wanted, folder, looks, cameras):
                 files.append(path)
                 advance(1)
     return files
+
+
+def demonstrations_of(
+    task: str, level: str, first_seed: int, count: int, folder: Path, looks: "list[Looks]", cameras: Sequence[str]
+) -> Iterator[Path]:
+    """The files of `count` demonstrations from this seed on; what is there is not made again, nor tried.
+
+    Raises:
+        UserError: scene after scene without a demonstration that succeeds.
+    """
+    from mme_vla.nano.demonstrations import record
+
+    failed, found, seed = 0, 0, first_seed
+    while found < count:
+        path = folder / f"{level}-{seed}.npz"
+        none = path.with_suffix(".failed")
+        if not path.is_file() and not none.is_file():
+            made = record(task, seed, level, looks, cameras)
+            if made is None:
+                none.touch()
+            else:
+                made.save(path)
+        there = path.is_file()
+        failed = 0 if there else failed + 1
+        if failed >= RETRIES:
+            raise UserError(f"{task}: {RETRIES} {level} scenes in a row, to seed {seed}, cannot be demonstrated.")
+        seed += 1
+        if there:
+            found += 1
+            yield path
 
 
 class _Minutes:

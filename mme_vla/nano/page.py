@@ -30,7 +30,7 @@ def write_page(folder: Path, config: Mapping[str, Any], models: Sequence[str], m
     parts = [
         f"# {config['task']} on two cores",
         "",
-        f"{config['demonstrations']} demonstrations, {config['train']['steps']} updates, split `{config['split']}`; "
+        f"{sum(config['demonstrations'].values())} demonstrations, {config['train']['steps']} updates, split `{config['split']}`; "
         f"each episode once for each of the seeds {', '.join(map(str, config['policy_seeds']))} of the policy's noise.",
         "",
         success_table(records),
