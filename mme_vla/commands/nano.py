@@ -174,7 +174,3 @@ class _Minutes:
         finally:
             self.spent[stage] = self.spent.get(stage, 0.0) + (time.perf_counter() - begun) / 60
             write_json(self._path, self.spent)
-
-
-if __name__ == "__main__":
-    main()

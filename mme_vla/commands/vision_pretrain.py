@@ -55,7 +55,3 @@ def run(config: Mapping[str, Any]) -> Path:
     torch.manual_seed(settings.seed)
     tower, grid = fresh_tower(OmegaConf.to_container(sizes), width)
     return pretrain(tower, grid, files, folder, settings)
-
-
-if __name__ == "__main__":
-    main()
