@@ -46,9 +46,7 @@ class Demonstration:
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
-        about = {
-            name: getattr(self, name) for name in ("task", "seed", "difficulty", "goal", "length", "exec_start")
-        }
+        about = {name: getattr(self, name) for name in ("task", "seed", "difficulty", "goal", "length", "exec_start")}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
         for camera, taken in self.pictures.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)

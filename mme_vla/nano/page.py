@@ -1,4 +1,4 @@
-"""The page of a nano run: success beside its brackets, the paired test, minutes, learning curves; from records alone."""
+"""The page of a nano run: success beside its brackets, the paired test, minutes and learning curves."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,8 +30,9 @@ def write_page(folder: Path, config: Mapping[str, Any], models: Sequence[str], m
     parts = [
         f"# {config['task']} on two cores",
         "",
-        f"{sum(config['demonstrations'].values())} demonstrations, {config['train']['steps']} updates, split `{config['split']}`; "
-        f"each episode once for each of the seeds {', '.join(map(str, config['policy_seeds']))} of the policy's noise.",
+        f"{sum(config['demonstrations'].values())} demonstrations, {config['train']['steps']} updates, split "
+        f"`{config['split']}`; each episode once for each of the seeds {', '.join(map(str, config['policy_seeds']))} "
+        "of the policy's noise.",
         "",
         success_table(records),
         "",

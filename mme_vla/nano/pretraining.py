@@ -95,9 +95,7 @@ def shifted(pictures: Tensor, labels: Tensor, rng: np.random.Generator) -> tuple
     return picture[..., top : top + side, left : left + side], label
 
 
-def tower_loss(
-    tower: ConvTower, grid: int, pictures: Tensor, labels: Tensor, weights: Tensor
-) -> tuple[Tensor, Tensor]:
+def tower_loss(tower: ConvTower, grid: int, pictures: Tensor, labels: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """The training loss of a batch, and the share [classes] of each class's places that are named rightly."""
     scores, colours = as_pictures(tower, pictures, grid)
     loss = functional.cross_entropy(scores, labels, weights)
@@ -146,9 +144,7 @@ def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, s
         done = step + 1
         if done % settings.save_every == 0 or done == settings.steps:
             with write_atomically(draft) as path:
-                torch.save(
-                    {"tower": tower.state_dict(), "optimizer": optimizer.state_dict(), "step": done}, path
-                )
+                torch.save({"tower": tower.state_dict(), "optimizer": optimizer.state_dict(), "step": done}, path)
             logger.info("step %d/%d · loss %.4f · %s", done, settings.steps, loss.item(),
                         report(tower, grid, val_pictures, val_labels, weights))  # fmt: skip
     state = {name: value.contiguous().half() for name, value in tower.state_dict().items()}

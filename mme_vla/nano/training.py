@@ -101,7 +101,9 @@ def train(
 
 def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[Decisions, Decisions]:
     """Decisions to learn from, and to measure by; their tokens, and the statistics, are made once for a folder."""
-    learnt_file, held_file, stats_file = (folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE))
+    learnt_file, held_file, stats_file = (
+        folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
+    )
     processor = policy.require_processor()
     if held_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
@@ -109,7 +111,10 @@ def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[De
     learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
     processor.stats = statistics(learnt, policy)
     processor.stats.save(stats_file)
-    samples, held = Decisions.of(policy, learnt), Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]))
+    samples, held = (
+        Decisions.of(policy, learnt),
+        Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:])),
+    )
     samples.save(learnt_file)
     held.save(held_file)
     return samples, held

@@ -19,8 +19,8 @@ from mme_vla.backbone.nano.sizes import NanoConfig
 from mme_vla.backbone.nano.tower import ConvTower, load_shipped
 from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.backbone import initialise
-from mme_vla.backbone.pi05.sizes import ExpertConfig
 from mme_vla.backbone.pi05.siglip import pool_grid
+from mme_vla.backbone.pi05.sizes import ExpertConfig
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
@@ -42,9 +42,10 @@ class Reader(nn.Module):
         self.out = nn.Linear(inner, width, bias=False)
         self.read_norm = AdaRMSNorm(width, width)
         self.read_q = nn.Linear(width, inner, bias=False)
+        self.read_gate = nn.Linear(width, inner)
         self.read_out = nn.Linear(inner, width, bias=False)
         self.mlp_norm = AdaRMSNorm(width, width)
-        self.up = nn.Linear(width, config.action.mlp_dim)
+        self.up = nn.Linear(width, 2 * config.action.mlp_dim)
         self.down = nn.Linear(config.action.mlp_dim, width)
 
     def forward(
@@ -63,13 +64,15 @@ class Reader(nn.Module):
         q = self.read_q(normed).unflatten(-1, (-1, self.head_dim))
         # The draws of a sample read the same context: they stand side by side as its queries.
         together = q.unflatten(0, (-1, draws)).flatten(1, 2)
-        read = self.read_out(attend(together, k, v, mask)).unflatten(1, (draws, -1)).flatten(0, 1)
-        x = x + (1 + gate) * read
+        read = attend(together, k, v, mask).unflatten(1, (draws, -1)).flatten(0, 1)
+        # What the goal asks for decides what of it counts: products are learned sooner here than behind the MLP.
+        x = x + (1 + gate) * self.read_out(read * self.read_gate(condition)[:, None])
         if hook is not None:
             rows = x.unflatten(0, (-1, draws)).unbind(1)
             x = torch.stack([hook(at, row) for row in rows], 1).flatten(0, 1)
         normed, gate = self.mlp_norm(x, condition)
-        return x + (1 + gate) * self.down(nn.functional.gelu(self.up(normed)))
+        inner, opening = self.up(normed).chunk(2, dim=-1)
+        return x + (1 + gate) * self.down(nn.functional.gelu(inner) * opening)
 
 
 class Column(nn.Module):
@@ -88,7 +91,7 @@ class Column(nn.Module):
 
 @BACKBONES.register("nano")
 class NanoBackbone(Backbone):
-    """A pretrained convolutional tower, and a few layers of action tokens that read the context; chunks by flow matching.
+    """A pretrained convolutional tower, and layers of action tokens that read the context; chunks by flow matching.
 
     The network predicts the chunk without its noise, and the velocity follows. The loss takes several noisy versions of
     each sample, which share the context.
@@ -219,9 +222,7 @@ class NanoBackbone(Backbone):
 
         return flow.euler(draws["noise"], steps, velocity)
 
-    def _prepare(
-        self, batch: Batch, images: Tensor, inject: Inject
-    ) -> tuple[Tensor, Tensor, Tensor, Injection]:
+    def _prepare(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[Tensor, Tensor, Tensor, Injection]:
         """What does not depend on the noise: each layer's keys and values, their mask, what the goal says."""
         observation = self.observation_blocks(batch, images)
         injection = inject(observation)

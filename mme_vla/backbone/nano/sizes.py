@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from mme_vla.backbone.pi05.sizes import ExpertConfig, check_positive, Sizes
+from mme_vla.backbone.pi05.sizes import ExpertConfig, Sizes, check_positive
 from mme_vla.errors import UserError
 
 

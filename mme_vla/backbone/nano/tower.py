@@ -1,5 +1,6 @@
 """The nano backbone's vision tower: a small convolutional network, pretrained on renders of the sixteen tasks."""
 
+import math
 from collections.abc import Sequence
 from importlib.resources import files
 
@@ -33,15 +34,20 @@ CLASSES = (
 """What a place of a picture may show; a class's number is its place in here."""
 FINE, COARSE = 8, 4
 """A token stands for 8×8 places that show a class each, and for 4×4 places that have a colour each."""
-LOUDNESS = (8.0, 3.0, 3.0, 3.0, 0.3)
-"""Factors of mass, presence, column, row and colours, which bring them to one size."""
+LOUDNESS = (1.0, 32.0, 320.0, 320.0, 0.1)
+"""Factors of presence, share, column, row and colours, which bring them to one size."""
+
+
+FAINT = 0.02
+"""Tokens full of a class that the picture must show at least for shares to add up to about one."""
 
 
 class ConvTower(nn.Module):
     """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d] that say what is where.
 
-    A token holds, for each class but the first, its mass, its presence and where in the token it is, column and row in
-    [−1, 1] times the presence; and the colours of its 4×4 places.
+    A token holds, for each class but the first, its presence; its share of all that the picture shows of the class, as
+    it is and times the column and the row in the picture, each in [−1, 1]; and the colours of its 4×4 places. So a sum
+    of tokens, and pooled ones, say where the things of a class are: their middle.
 
     Args:
         widths: channels of the three stages. blocks: residual blocks of each. out: channels that the answers are read
@@ -68,7 +74,7 @@ class ConvTower(nn.Module):
 
     @property
     def token_width(self) -> int:
-        """d."""
+        """D."""
         return 4 * (len(CLASSES) - 1) + self.colours.out_features
 
     def answers(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -80,8 +86,13 @@ class ConvTower(nn.Module):
         scores, colours = self.answers(images)
         shares = scores.softmax(2)[:, :, 1:]
         mass, presence = shares.mean(-1), shares.amax(-1)
-        places = [(shares * line).sum(-1) / shares.sum(-1) * presence for line in (self.columns, self.rows)]
-        parts = (mass, presence, *places, colours)
+        share = mass / (mass.sum(1, keepdim=True) + FAINT)
+        grid = math.isqrt(shares.shape[1])
+        middles = (torch.arange(grid, device=shares.device) + 0.5) / grid * 2 - 1
+        column, row = ((shares * line).mean(-1) / mass / grid for line in (self.columns, self.rows))
+        column = share * (column + middles.repeat(grid)[:, None])
+        row = share * (row + middles.repeat_interleave(grid)[:, None])
+        parts = (presence, share, column, row, colours)
         return torch.cat([part * factor for part, factor in zip(parts, LOUDNESS, strict=True)], -1)
 
 
