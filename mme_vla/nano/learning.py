@@ -23,6 +23,8 @@ NARROWEST = 0.1  # of an action's number, in metres or radians: less than that i
 
 
 _PAST = "history."
+OFTEN, ELSEWHERE = 4, 0.05
+"""How often a decision to go elsewhere is learned for every other; metres from where on it is elsewhere."""
 
 
 class SparseHistory(History):
@@ -45,16 +47,19 @@ class SparseHistory(History):
 
 
 class Decisions(Dataset[int]):
-    """The decisions of demonstrations as a policy learns them, all in memory: an item is its number, see `collate`.
+    """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
 
     batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
+    far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
+        an item `OFTEN` times.
     """
 
-    def __init__(self, batch: Batch) -> None:
-        self.batch = batch
+    def __init__(self, batch: Batch, far: Tensor, often: int = 1) -> None:
+        self.batch, self.far = batch, far
+        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
 
     @classmethod
-    def of(cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration]) -> "Decisions":
+    def of(cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1) -> "Decisions":
         """Make all tokens.
 
         Args:
@@ -66,38 +71,47 @@ class Decisions(Dataset[int]):
         items = [item for found in demonstrations for item in _items(policy, found)]
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        return cls(_stack(items))
+        far = torch.from_numpy(np.concatenate([_far(found.motions.targets) for found in demonstrations]))
+        return cls(_stack(items), far, often)
 
     @classmethod
-    def load(cls, path: Path) -> "Decisions":
+    def load(cls, path: Path, often: int = 1) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
         found = load_file(path)
+        far = found.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
         now = {name: value for name, value in found.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None))
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
         from safetensors.torch import save_file
 
         values = {name: value for name, value in vars(self.batch).items() if isinstance(value, Tensor)}
+        values["far"] = self.far
         if self.batch.history is not None:
             values |= {f"{_PAST}{name}": value for name, value in vars(self.batch.history).items()}
         with write_atomically(path) as draft:
             save_file({name: value.contiguous() for name, value in values.items()}, draft)
 
     def __len__(self) -> int:
-        return len(self.batch.prompt)
+        return len(self._rows)
 
     def __getitem__(self, index: int) -> int:
-        return index
+        return int(self._rows[index])
 
     def collate(self, rows: Sequence[int]) -> Batch:
         """The batch of these decisions."""
         chosen = torch.as_tensor(list(rows))
         return self.batch.rows(chosen)
+
+
+def _far(targets: np.ndarray) -> np.ndarray:
+    """Which of an episode's motions [m, 7] end elsewhere above the table than the one before; the first does. [m]."""
+    steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
+    return np.concatenate([[True], steps > ELSEWHERE])
 
 
 def load_all(files: Sequence[Path]) -> list[Demonstration]:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.files import write_json
-from mme_vla.nano.learning import Decisions, load_all, statistics
+from mme_vla.nano.learning import OFTEN, Decisions, load_all, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy
@@ -107,12 +107,12 @@ def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[De
     processor = policy.require_processor()
     if held_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        return Decisions.load(learnt_file), Decisions.load(held_file)
+        return Decisions.load(learnt_file, OFTEN), Decisions.load(held_file)
     learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
     processor.stats = statistics(learnt, policy)
     processor.stats.save(stats_file)
     samples, held = (
-        Decisions.of(policy, learnt),
+        Decisions.of(policy, learnt, OFTEN),
         Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:])),
     )
     samples.save(learnt_file)

@@ -16,7 +16,7 @@ from mme_vla.backbone.layers.attention import additive_mask, attend
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.nano.sizes import NanoConfig
-from mme_vla.backbone.nano.tower import ConvTower, load_shipped
+from mme_vla.backbone.nano.tower import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.backbone import initialise
 from mme_vla.backbone.pi05.siglip import pool_grid
@@ -26,6 +26,8 @@ from mme_vla.types import Batch
 
 EULER_STEPS = 10
 MAX_VIEWS, MAX_WORDS = 4, 256
+FIRST = CLASSES.index("red cube") - 1
+"""Where, among the classes of a token, what the goal names stands."""
 STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
 """Per radian or metre: a finger's four centimetres count as well as a joint's turn."""
 
@@ -167,6 +169,22 @@ class NanoBackbone(Backbone):
         """Tokens [n, grid², d] as memories store them."""
         return pool_grid(self.encode_images(images), grid, pooling)
 
+    def mark(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
+        """The class that the prompt names first changes places with the first cube, so that one place holds what is asked.
+
+        Which word names which class is part of the tower's weights (`ConvTower.words`).
+        """
+        named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
+        places = torch.where(named.any(1), named.int().argmax(1), prompt.shape[1])
+        first = torch.where(named.any(2).any(1), places.argmin(1), FIRST)  # b
+        order = torch.arange(named.shape[2], device=prompt.device).repeat(len(prompt), 1)
+        order = torch.where(order == first[:, None], FIRST, order)
+        order[:, FIRST] = first
+        groups = torch.cat([order + group * order.shape[1] for group in range(4)], 1)
+        rest = torch.arange(groups.shape[1], tokens.shape[-1], device=prompt.device).expand(len(prompt), -1)
+        whole = torch.cat([groups, rest], 1)
+        return tokens.gather(-1, whole.view(len(prompt), *[1] * (tokens.ndim - 2), -1).expand_as(tokens))
+
     def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
         """`images`, the tokens of all views (`batch.view_tokens` where they were made beforehand), and `prompt`."""
         views = images.shape[1]
@@ -174,6 +192,7 @@ class NanoBackbone(Backbone):
             tokens = self.encode_images(images.flatten(0, 1)).unflatten(0, (-1, views))
         else:
             tokens = batch.view_tokens.to(self.places.weight.dtype)
+        tokens = self.mark(tokens, batch.prompt, batch.prompt_mask)
         placed = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
         seen = placed + self.see(placed)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)

@@ -38,6 +38,8 @@ LOUDNESS = (1.0, 32.0, 320.0, 320.0, 0.1)
 """Factors of presence, share, column, row and colours, which bring them to one size."""
 
 
+WORDS = 2048
+"""Entries of the shipped tokenizer."""
 FAINT = 0.02
 """Tokens full of a class that the picture must show at least for shares to add up to about one."""
 
@@ -68,6 +70,8 @@ class ConvTower(nn.Module):
         self.out = nn.Conv2d(before, out, 1)
         self.classes = nn.Linear(out, FINE**2 * len(CLASSES))
         self.colours = nn.Linear(out, COARSE**2 * 3)
+        # word of the shipped tokenizer × class but the first: 1 where the word names the class
+        self.register_buffer("words", torch.zeros(WORDS, len(CLASSES) - 1))
         line = (torch.arange(FINE) + 0.5) / FINE * 2 - 1
         self.register_buffer("columns", line.repeat(FINE), persistent=False)
         self.register_buffer("rows", line.repeat_interleave(FINE), persistent=False)
