@@ -14,7 +14,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.nano.environment import make_drawn_env
 from mme_vla.policy.mme import MMEPolicy
 
-MAX_STEPS = 1300
+MAX_STEPS = 500
 
 
 def run_episodes(
