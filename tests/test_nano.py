@@ -7,11 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import REPOSITORY
 
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.nano.tower import CLASSES, WEIGHTS
+from mme_vla.commands.loading import shipped_checkpoint
 from mme_vla.commands.nano import check_counts
 from mme_vla.data.waypoints import Motions
+from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, SparseHistory, statistics
@@ -149,3 +152,30 @@ def test_a_history_gives_only_what_it_has() -> None:
 def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) -> None:
     with pytest.raises(UserError, match=words):
         check_counts(counts)
+
+
+def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
+    policy = MMEPolicy.from_pretrained(shipped_checkpoint("nano") or "")
+    assert policy.require_memory().budget == 4
+    made = demonstration()
+    episode = policy.start_episode(made.goal)
+    frames = np.stack([made.pictures["front"].get(frame, made.pictures["front"][0]) for frame in range(67)])
+    episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
+    assert policy.act(episode).shape == (4, 7)
+
+
+def test_what_the_goal_names_first_is_marked_in_pictures_and_memory() -> None:
+    backbone, processor = nano().backbone, nano().require_processor()
+    ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
+    plain, plain_mask = processor.prompt("press the button")
+    tokens = torch.arange(96.0).expand(2, 3, 96)
+    marked = backbone.mark(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
+    assert marked[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
+    assert torch.equal(marked[1], tokens[1])
+
+
+def test_the_pages_figures_follow_from_the_records() -> None:
+    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / "VideoUnmask"]))
+    won = {model: sum(r.success for r in records if r.model.startswith(model)) for model in ("framesamp", "pi05")}
+    assert len(records) == 100 and won == {"framesamp": 27, "pi05": 0}
+    assert "| **54 %** (40 … 67) | 19/26 | 8/12 | 0/12 |" in (REPOSITORY / "docs" / "nano.md").read_text()
