@@ -1,4 +1,4 @@
-"""The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes; needs the extra `sim` and Vulkan."""
+"""The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes; needs the extra `sim`."""
 
 import subprocess
 import sys

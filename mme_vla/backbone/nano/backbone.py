@@ -170,7 +170,7 @@ class NanoBackbone(Backbone):
         return pool_grid(self.encode_images(images), grid, pooling)
 
     def mark(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
-        """The class that the prompt names first changes places with the first cube, so that one place holds what is asked.
+        """The class that the prompt names first changes places with the first cube: one place holds what is asked.
 
         Which word names which class is part of the tower's weights (`ConvTower.words`).
         """
