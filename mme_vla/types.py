@@ -31,6 +31,10 @@ class TensorStruct:
         """Return a copy whose tensors went through `Tensor.to` with these arguments."""
         return self._map(lambda x: x.to(*args, **kwargs))
 
+    def rows(self, chosen: Tensor) -> Self:
+        """Return the rows of every tensor that `chosen` names: numbers [n], or a mask."""
+        return self._map(lambda x: x[chosen])
+
     def pin_memory(self) -> Self:
         """Return a copy in page-locked memory (what `DataLoader(pin_memory=True)` calls)."""
         return self._map(lambda x: x.pin_memory())
@@ -83,8 +87,9 @@ class Batch(TensorStruct):
     history: the memory's selection, None for a policy without memory.
     actions: [b, h, a]; normalised, padded chunk. None when sampling.
     action_mask: [b, h] bool; steps that count in the loss. None counts all.
-    state: [b, s]; raw state of the robot, never read by the network: it anchors relative actions.
+    state: [b, s]; raw state of the robot: it anchors relative actions, and backbones may read it.
     proprio: [b, s]; normalised state, for the networks that read it.
+    view_tokens: [b, v, n, d]; a frozen tower's tokens of `images`, where they were made beforehand.
     """
 
     images: Tensor
@@ -96,6 +101,7 @@ class Batch(TensorStruct):
     action_mask: Tensor | None = None
     state: Tensor | None = None
     proprio: Tensor | None = None
+    view_tokens: Tensor | None = None
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.

@@ -9,8 +9,9 @@ PACKAGE = Path(__file__).resolve().parent.parent / "mme_vla"
 
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
-    "commands", "testing", "play", "evaluation", "serving", "training", "subgoal", "envs", "data", "weights", "policy",
-    "processing", "integration", "memory", "backbone", "embodiment", "config", "media", "types", "registry", "files",
+    "commands", "nano", "testing", "play", "evaluation", "serving", "training", "subgoal", "envs", "data", "weights",
+    "policy", "processing", "integration", "memory", "backbone", "embodiment", "config", "media", "types", "registry",
+    "files",
     "errors",
 ]  # fmt: skip
 TOP_LEVEL = 12  # files

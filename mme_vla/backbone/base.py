@@ -100,6 +100,10 @@ class Backbone(nn.Module):
         """Blocks of the current views [b, v, 3, s, s] in [−1, 1] and of the batch's prompt."""
         raise NotImplementedError
 
+    def mark(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
+        """Stored tokens [b, n, d_vision] as they are read beside a prompt [b, l]; by default as they are."""
+        return tokens
+
     # Training
 
     def loss_draws(self, count: int, generator: torch.Generator) -> Draws:

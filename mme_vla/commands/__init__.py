@@ -14,6 +14,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "play": ("play", "play the tasks yourself, or let a model play"),
     "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
     "cache": ("cache", "the vision tokens of a dataset, computed once"),
+    "nano": ("nano", "from nothing to a page of results on one task, on two cores"),
+    "vision-pretrain": ("vision_pretrain", "the vision tower of the nano backbone, from renders of the tasks"),
     "record": ("record", "demonstrate episodes of the benchmark and keep them as a dataset"),
     "gallery": ("gallery", "the tasks at a glance, one demonstrated episode each, on one page"),
     "weights": ("weights", "a checkpoint from one format to another"),

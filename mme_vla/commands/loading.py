@@ -1,6 +1,7 @@
 """The policy a command is about: a checkpoint, or a model with fresh weights for trying things out."""
 
 import logging
+from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,6 +28,10 @@ _MODEL_KEYS = (
     "subgoal_text",
     "token_budget",
 )
+
+
+SHIPPED = "nano"
+"""`checkpoint=nano`: a policy with four tokens of memory that solves VideoUnmask (docs/nano.md)."""
 
 
 class LoadedPolicy(NamedTuple):
@@ -58,7 +63,7 @@ def load_policy(
     if cfg.checkpoint is not None:
         if named:
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
-        source = Path(str(cfg.checkpoint)).expanduser()
+        source = shipped_checkpoint(str(cfg.checkpoint)) or Path(str(cfg.checkpoint)).expanduser()
         where = str(resolve_checkpoint(source)) if source.exists() or source.name == LATEST else str(cfg.checkpoint)
         policy = Policy.from_pretrained(
             where, device=device, dtype=cfg.dtype, revision=cfg.revision, trust_plugins=cfg.trust_plugins
@@ -78,6 +83,13 @@ def load_policy(
     policy.require_processor().stats = unit_stats(policy.embodiment)
     logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
     return LoadedPolicy(policy, str(cfg.name), None)
+
+
+def shipped_checkpoint(name: str) -> Path | None:
+    """The folder of the checkpoint that ships with the library under this name; a folder of that name goes first."""
+    if name != SHIPPED or Path(name).exists():
+        return None
+    return Path(str(files("mme_vla").joinpath("assets", SHIPPED)))
 
 
 def words_of(*keys: str) -> list[str]:

@@ -22,9 +22,19 @@ class FrameSamp(PerceptualMemory):
     """budget / grid² frames of grid×grid tokens each: 32 frames of 16 tokens as released."""
 
     def __init__(
-        self, d_vision: int, width: int, budget: int = 512, grid: int = 4, pooling: str = "mean", **encoder: Any
+        self,
+        d_vision: int,
+        width: int,
+        budget: int = 512,
+        grid: int = 4,
+        pooling: str = "mean",
+        every: int = 1,
+        **encoder: Any,
     ):
         """See `PerceptualMemory`; `grid` is the side of a remembered frame's token grid.
+
+        Args:
+            every: frames 0 and k·every − 1 can be remembered; the others are neither drawn nor encoded. 1: all.
 
         Raises:
             UserError: the budget is not a whole number of frames.
@@ -34,11 +44,16 @@ class FrameSamp(PerceptualMemory):
                 f"memory.budget={budget} is not a whole number of {grid}×{grid}-token frames: "
                 f"choose a multiple of {grid**2}, such as {max(budget // grid**2, 1) * grid**2}."
             )
-        super().__init__(d_vision, width, budget, StorageSpec(grid, pooling), **encoder)
+        super().__init__(d_vision, width, budget, StorageSpec(grid, pooling, every), **encoder)
         self.frames = budget // grid**2
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return every_one([evenly_spaced_frames(int(step), self.frames) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(evenly_spaced_frames(step, self.frames), self.storage.grid)
+        return whole_frames(self.chosen(step), self.storage.grid)
+
+    def chosen(self, step: int) -> np.ndarray:
+        """The frames remembered at `step`: evenly spaced among those that are stored."""
+        stored = self.storage.kept_frames(step + 1)
+        return stored[evenly_spaced_frames(len(stored) - 1, self.frames)]

@@ -4,7 +4,7 @@ Both forms answer the same three questions: which frames are there (`len`), what
 (`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory cannot tell them apart.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Protocol
 
@@ -222,3 +222,21 @@ class OnlineHistory(History):
         rows = self._row_of(indices[:, 0], np.asarray(self._kept, np.int64))
         device = self._tokens.device
         return self._tokens[torch.as_tensor(rows, device=device), torch.as_tensor(indices[:, 1], device=device)]
+
+
+class MarkedHistory(History):
+    """A history whose tokens go through `mark` [n, d_vision] → [n, d_vision] as they are gathered."""
+
+    def __init__(self, whole: History, mark: Callable[[Tensor], Tensor]) -> None:
+        super().__init__(whole.spec, whole.exec_start)
+        self._whole, self._mark = whole, mark
+
+    def __len__(self) -> int:
+        return len(self._whole)
+
+    @property
+    def scores(self) -> FrameScores:
+        return self._whole.scores
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        return self._mark(self._whole.gather(indices))

@@ -2,12 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+import mme_vla.backbone.nano.backbone
 import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
@@ -17,6 +20,7 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
 from mme_vla.integration.base import Integration, doors_of
 from mme_vla.memory.base import Memory
+from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
@@ -150,7 +154,7 @@ class MMEPolicy(Policy):
             given = self.loss_draws(len(batch.actions), torch.default_generator) | given
         drawn = map_draws(given, lambda value: value.to(self.device))
         with self.autocast():
-            memory = self.encode_memory(batch.history) if memory is None else memory
+            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             losses = self.backbone.loss(batch, self._views(batch), self._inject(memory), drawn)  # b h
         if batch.action_mask is None:
             loss = losses.mean()
@@ -164,7 +168,7 @@ class MMEPolicy(Policy):
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
         with self.autocast():
-            memory = self.encode_memory(batch.history) if memory is None else memory
+            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             return self.backbone.velocity(batch, self._views(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
 
     def recompute(self, wanted: bool) -> None:
@@ -183,6 +187,13 @@ class MMEPolicy(Policy):
         if self.memory is None or history is None:
             return None
         return self.memory(history)
+
+    def _marked(self, batch: Batch) -> HistoryTokens | None:
+        """The batch's selection as the backbone reads it beside the prompt."""
+        if batch.history is None:
+            return None
+        features = self.backbone.mark(batch.history.features, batch.prompt, batch.prompt_mask)
+        return replace(batch.history, features=features)
 
     def _views(self, batch: Batch) -> Tensor:
         from mme_vla.processing.augment import augment_views
@@ -218,7 +229,7 @@ class MMEPolicy(Policy):
             draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
         drawn = map_draws(named_draws(draws), lambda value: value.to(self.device))
         with self.autocast():
-            memory = self.encode_memory(batch.history) if memory is None else memory
+            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             return self.backbone.sample(batch, self._views(batch), self._inject(memory), drawn, steps)
 
     # Episodes
@@ -231,6 +242,7 @@ class MMEPolicy(Policy):
             image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
+            state=torch.stack([e.state for e in episodes]),
         )
         return batch.without_prompt_padding().to(self.device)
 
@@ -238,19 +250,27 @@ class MMEPolicy(Policy):
         self, batch: Batch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories."""
-        return self.sample_actions(batch, draws, steps, memory=self._remember(episodes))
+        return self.sample_actions(batch, draws, steps, memory=self._remember(episodes, batch))
 
     @torch.no_grad()
-    def _remember(self, episodes: Sequence[Episode]) -> MemoryTokens | None:
+    def _remember(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
         """Memory tokens of running episodes, through what their streams have already taken."""
         if self.memory is None:
             return None
         with self.autocast():
-            return self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+            histories = [
+                MarkedHistory(e.required_history(), partial(self._mark_one, batch.prompt[i], batch.prompt_mask[i]))
+                for i, e in enumerate(episodes)
+            ]
+            return self.memory.encode(histories, [e.stream for e in episodes])
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
         """What the memory reads; nothing without one."""
         return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
+
+    def _mark_one(self, prompt: Tensor, prompt_mask: Tensor, tokens: Tensor) -> Tensor:
+        """Stored tokens [n, d_vision] of one episode, read beside its prompt [l]."""
+        return self.backbone.mark(tokens[None], prompt[None], prompt_mask[None])[0]
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""

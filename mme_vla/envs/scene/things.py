@@ -50,6 +50,10 @@ class Thing:
             self.entity.set_linear_velocity(np.zeros((1, 3), np.float32))
             self.entity.set_angular_velocity(np.zeros((1, 3), np.float32))
 
+    def show(self) -> None:
+        """Draw the object, or leave it out, as its height says: due where its pose was set from outside."""
+        self._draw(bool(self.position[2] > UNDER_THE_FLOOR))
+
     def _draw(self, drawn: bool) -> None:
         """Leave out of the pictures what the floor hides anyway: dozens of marks cost a third of the rendering."""
         body = self.entity._objs[0].find_component_by_type(RenderBodyComponent) if self._may_sink else None

@@ -1,0 +1,195 @@
+"""Training on demonstrations of planned motions: every decision is a sample, and all its tokens are made beforehand."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from mme_vla.errors import UserError
+from mme_vla.files import write_atomically
+from mme_vla.memory.base import stack_history
+from mme_vla.memory.history import History, StorageSpec
+from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats
+from mme_vla.types import Batch, HistoryTokens
+
+NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
+
+
+_PAST = "history."
+OFTEN, ELSEWHERE = 4, 0.05
+"""How often a decision to go elsewhere is learned for every other; metres from where on it is elsewhere."""
+
+
+class SparseHistory(History):
+    """The tokens of some of an episode's frames; any other frame is refused.
+
+    tokens: frame → [patches, d_vision].
+    """
+
+    def __init__(self, spec: StorageSpec, length: int, tokens: Mapping[int, Tensor], exec_start: int) -> None:
+        super().__init__(spec, exec_start)
+        self._length, self._kept = length, np.array(sorted(tokens), np.int64)
+        self._tokens = torch.stack([tokens[int(frame)] for frame in self._kept])
+
+    def __len__(self) -> int:
+        return self._length
+
+    def gather(self, indices: np.ndarray) -> Tensor:
+        rows = self._row_of(indices[:, 0], self._kept)
+        return self._tokens[torch.as_tensor(rows), torch.as_tensor(indices[:, 1])]
+
+
+class Decisions(Dataset[int]):
+    """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
+
+    batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
+    far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
+        an item `OFTEN` times.
+    """
+
+    def __init__(self, batch: Batch, far: Tensor, often: int = 1) -> None:
+        self.batch, self.far = batch, far
+        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
+
+    @classmethod
+    def of(cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1) -> "Decisions":
+        """Make all tokens.
+
+        Args:
+            policy: with the vision weights it trains with, and statistics.
+
+        Raises:
+            UserError: there is no decision, or a frame that the memory remembers was not drawn.
+        """
+        items = [item for found in demonstrations for item in _items(policy, found)]
+        if not items:
+            raise UserError("The demonstrations hold no decision to learn from.")
+        far = torch.from_numpy(np.concatenate([_far(found.motions.targets) for found in demonstrations]))
+        return cls(_stack(items), far, often)
+
+    @classmethod
+    def load(cls, path: Path, often: int = 1) -> "Decisions":
+        """Read what `save` wrote."""
+        from safetensors.torch import load_file
+
+        found = load_file(path)
+        far = found.pop("far")
+        past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
+        now = {name: value for name, value in found.items() if not name.startswith(_PAST)}
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often)
+
+    def save(self, path: Path) -> None:
+        """Write one file of tensors, whole or not at all."""
+        from safetensors.torch import save_file
+
+        values = {name: value for name, value in vars(self.batch).items() if isinstance(value, Tensor)}
+        values["far"] = self.far
+        if self.batch.history is not None:
+            values |= {f"{_PAST}{name}": value for name, value in vars(self.batch.history).items()}
+        with write_atomically(path) as draft:
+            save_file({name: value.contiguous() for name, value in values.items()}, draft)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, index: int) -> int:
+        return int(self._rows[index])
+
+    def collate(self, rows: Sequence[int]) -> Batch:
+        """The batch of these decisions."""
+        chosen = torch.as_tensor(list(rows))
+        return self.batch.rows(chosen)
+
+
+def _far(targets: np.ndarray) -> np.ndarray:
+    """Which of an episode's motions [m, 7] end elsewhere above the table than the one before; the first does. [m]."""
+    steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
+    return np.concatenate([[True], steps > ELSEWHERE])
+
+
+def load_all(files: Sequence[Path]) -> list[Demonstration]:
+    """Recorded demonstrations, in this order."""
+    return [Demonstration.load(file) for file in files]
+
+
+def statistics(demonstrations: Sequence[Demonstration], policy: MMEPolicy) -> NormStats:
+    """What states and motions are normalised by; numbers that hardly move keep their size.
+
+    Raises:
+        UserError: fewer than two decisions.
+    """
+    states, actions = RunningStats(), RunningStats()
+    space = policy.embodiment.action
+    for found in demonstrations:
+        state = torch.from_numpy(found.states[found.motions.decisions])
+        states.update(state.numpy())
+        targets = torch.from_numpy(found.motions.targets)[:, None]
+        actions.update(space.to_relative(targets, state).numpy())
+    return NormStats(state=states.result(), actions=_widened(actions.result()))
+
+
+def _widened(stats: QuantileStats) -> QuantileStats:
+    middle, half = (stats.q01 + stats.q99) / 2, np.maximum((stats.q99 - stats.q01) / 2, NARROWEST)
+    return replace(stats, q01=middle - half, q99=middle + half)
+
+
+@torch.no_grad()
+def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
+    processor, cameras = policy.require_processor(), policy.embodiment.camera_names
+    decisions = [int(frame) for frame in found.motions.decisions]
+    views = processor.images([np.stack([found.pictures[name][frame] for frame in decisions]) for name in cameras])
+    flat = views.flatten(0, 1).float() / 255 * 2 - 1
+    view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
+    history = _history(policy, found)
+    items = []
+    for place, frame in enumerate(decisions):
+        state = found.states[frame]
+        chunk, recorded = found.motions.chunk(frame, processor.horizon)
+        prompt, prompt_mask = processor.prompt(found.goal, state=state)
+        item = {
+            "view_tokens": view_tokens[place], "prompt": prompt, "prompt_mask": prompt_mask,
+            "state": torch.from_numpy(state), "actions": processor.actions(chunk, state),
+            "action_mask": torch.from_numpy(recorded),
+        }  # fmt: skip
+        if history is not None:
+            item["history"] = policy.require_memory().recall(history, frame)
+        items.append(item)
+    return items
+
+
+def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
+    if policy.memory is None:
+        return None
+    taken = found.pictures[policy.embodiment.memory_camera]
+    tokens = policy.encode_frames(np.stack(list(taken.values())))
+    return SparseHistory(
+        policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start
+    )  # fmt: skip
+
+
+def _stack(items: Sequence[dict[str, Any]]) -> Batch:
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([item[name] for item in items])
+
+    view_tokens = stack("view_tokens")
+    rows, views = view_tokens.shape[:2]
+    batch = Batch(
+        images=torch.zeros(rows, views, 3, 0, 0, dtype=torch.uint8),
+        image_mask=torch.ones(rows, views, dtype=torch.bool),
+        prompt=stack("prompt"),
+        prompt_mask=stack("prompt_mask"),
+        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+        actions=stack("actions"),
+        action_mask=stack("action_mask"),
+        state=stack("state"),
+        view_tokens=view_tokens,
+    )
+    return batch.without_prompt_padding()

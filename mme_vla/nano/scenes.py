@@ -1,0 +1,151 @@
+"""Pictures of the sixteen tasks with what is where in them: what the small vision tower learns to see from.
+
+Nothing is simulated: a scene is built once, and for each picture its objects, the arm and the gripper are put somewhere
+else. Segmentation says which object every pixel shows, so labels cost nothing.
+"""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.backbone.nano.tower import CLASSES
+from mme_vla.envs.make import make_task
+from mme_vla.files import write_atomically
+from mme_vla.processing.pictures import resize_with_pad_uint8
+
+if TYPE_CHECKING:
+    from mme_vla.envs.task import Task
+
+_BY_NAME = {
+    "container": "container", "button": "button", "target": "target", "spot": "target", "disc": "disc",
+    "board": "box", "box": "box", "obstacle": "obstacle", "peg": "peg",
+}  # fmt: skip
+LABEL_SIDE = 64
+"""Labels have a number for each of 64×64 places of a picture."""
+_CUBES = ("red cube", "green cube", "blue cube")
+_CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out where it has one
+
+
+def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pictures of one scene, differently arranged each time.
+
+    Args:
+        count: arrangements; each gives a picture of the front camera and one of the wrist's.
+        size: side of the pictures.
+
+    Returns:
+        pictures [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.
+    """
+    from mme_vla.envs.robot.kinematics import Arm
+
+    env = make_task(task, render=True, seed=seed, difficulty=difficulty)
+    try:
+        env.reset()
+        arm, rng = Arm(env.agent), np.random.default_rng(seed)
+        owners = _owners(env)
+        pictures, labels = [], []
+        for _ in range(count):
+            _arrange(env, arm, rng)
+            for picture, segments in _take(env):
+                pictures.append(resize_with_pad_uint8(picture, size))
+                labels.append(_label(picture, segments, owners))
+        return np.stack(pictures), np.stack(labels)
+    finally:
+        env.close()
+
+
+def record_scenes(folder: Path, task: str, seed: int, difficulty: str, count: int, size: int) -> Path:
+    """Draw a scene into `folder`, unless it is there already; the path of its file."""
+    path = folder / f"{task}-{difficulty}-{seed}.npz"
+    if not path.is_file():
+        pictures, labels = draw_scene(task, seed, difficulty, count, size)
+        folder.mkdir(parents=True, exist_ok=True)
+        with write_atomically(path) as draft, draft.open("wb") as file:
+            np.savez_compressed(file, pictures=pictures, labels=labels)
+    return path
+
+
+def _owners(env: "Task") -> dict[int, str]:
+    """Segmentation id → what the object is called, of everything that is not part of the room."""
+    owners: dict[int, str] = {}
+    for thing in env.things:
+        for number in thing.segmentation_ids:
+            owners[number] = thing.name
+        articulation = getattr(thing.entity, "articulation", None)
+        for link in () if articulation is None else articulation.links:
+            owners[int(link.per_scene_id[0])] = thing.name
+    return owners | {int(link.per_scene_id[0]): "robot" for link in env.agent.robot.links}
+
+
+def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
+    """Put what can move, and the arm, somewhere else; half of the time containers are out of the way."""
+    import sapien
+    import torch
+
+    covered = rng.random() < 0.5
+    for thing in env.things:
+        if getattr(thing.entity, "px_body_type", "") != "dynamic":
+            continue
+        home = thing.initial_pose
+        if thing.name.startswith("container") and not covered:
+            thing.move_away()
+            continue
+        lifted = rng.uniform(0, 0.15) if rng.random() < 0.2 else 0.0
+        place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), home.p[2] + lifted])
+        thing.move_to(sapien.Pose(place, (_turn(rng.uniform(-np.pi, np.pi)) * sapien.Pose(q=home.q)).q))
+    if rng.random() < 0.2:
+        env.agent.robot.set_qpos(torch.as_tensor(_rest(env), dtype=torch.float32)[None])
+        return
+    near = [thing.position for thing in env.things if abs(thing.position[0]) < 0.5 and thing.position[2] > -0.05]
+    place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), rng.uniform(0.03, 0.35)])
+    if near and rng.random() < 0.6:
+        place = near[rng.integers(len(near))] + [0, 0, rng.uniform(0.01, 0.2)]
+    down = sapien.Pose(q=[0, 1, 0, 0])
+    joints = arm.ik(sapien.Pose(place) * _turn(rng.uniform(-0.8, 0.8)) * down, env.qpos)
+    if joints is not None:
+        fingers = [] if env.stick else [rng.uniform(0.0, 0.04)] * 2
+        env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
+
+
+def _turn(yaw: float) -> Any:
+    import sapien
+
+    return sapien.Pose(q=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
+
+
+def _rest(env: "Task") -> np.ndarray:
+    return env.reset_action if env.stick else np.append(env.reset_action[:7], [0.04, 0.04])
+
+
+def _take(env: "Task") -> list[tuple[np.ndarray, np.ndarray]]:
+    """Picture [H, W, 3] and segmentation [H, W] of both cameras."""
+    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+    taken = []
+    for camera in ("base_camera", "hand_camera"):
+        sensor = env.scene.sensors[camera]
+        sensor.capture()
+        images = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=True)
+        taken.append((images["rgb"][0].cpu().numpy(), images["segmentation"][0, ..., 0].cpu().numpy()))
+    return taken
+
+
+def _label(picture: np.ndarray, segments: np.ndarray, owners: dict[int, str]) -> np.ndarray:
+    label = np.zeros(segments.shape, np.uint8)
+    for number in np.unique(segments):
+        name = owners.get(int(number))
+        if name is not None:
+            shown = segments == number
+            label[shown] = CLASSES.index(_class_of(name, picture[shown]))
+    step = len(label) // LABEL_SIDE
+    return label[step // 2 :: step, step // 2 :: step]
+
+
+def _class_of(name: str, pixels: np.ndarray) -> str:
+    """The class of an object by its name; of a cube by its colour, as far as it is one of three."""
+    kind = name.partition("_")[0]
+    if kind != "cube":
+        return name if name == "robot" else _BY_NAME[kind]
+    colour = np.median(pixels, axis=0)
+    first, second = np.sort(colour)[::-1][:2]
+    return _CUBES[int(colour.argmax())] if first - second > _CLEAR_COLOUR else "other cube"

@@ -1,0 +1,125 @@
+"""One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from mme_vla.config.composition import compose
+from mme_vla.errors import UserError
+from mme_vla.files import write_json
+from mme_vla.nano.learning import OFTEN, Decisions, load_all, statistics
+from mme_vla.policy.build import build_from_config
+from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.policy.mme import MMEPolicy, mme_of
+from mme_vla.processing.normalisers import NormStats
+from mme_vla.processing.processor import STATS_FILE
+from mme_vla.training.checkpoint import checkpoints_in
+from mme_vla.training.console import ProgressLine
+from mme_vla.training.logging import JsonLines, Loggers
+from mme_vla.training.loop import Trainer
+from mme_vla.training.runs import claim_run
+from mme_vla.training.settings import TrainSettings
+from mme_vla.training.validation import Validation
+
+DONE = "trained.json"
+HELD_OUT = 10
+"""One demonstration in so many only measures the loss."""
+
+
+def compose_policy(model: str, memories: Mapping[str, Mapping[str, Any]], words: Sequence[str]) -> dict[str, Any]:
+    """The configuration of one model at nano size, plain.
+
+    Args:
+        model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
+        words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
+    """
+    found = compose("policy", [f"model={model}", *words])
+    memory = None if found.memory is None else str(found.memory.name)
+    chosen = [f"memory.{key}={value}" for key, value in memories.get(memory or "", {}).items()]
+    config = OmegaConf.to_container(compose("policy", [f"model={model}", *words, *chosen]), resolve=True)
+    assert isinstance(config, dict)
+    return {str(key): value for key, value in config.items()}
+
+
+def build(config: Mapping[str, Any]) -> MMEPolicy:
+    """A policy with fresh weights but for its tower, which does not learn."""
+    policy = mme_of(build_from_config(OmegaConf.create(dict(config))), "nanoMME")
+    if policy.augment:
+        raise UserError("policy.augment=true changes pictures, and nano policies learn from tokens: set it to false.")
+    apply_finetuning(policy, freeze_vision=True)
+    return policy
+
+
+def train(
+    config: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    folder: Path,
+    files: Sequence[Path],
+) -> Path:
+    """Train a policy in `folder`, or go on with it; the last checkpoint.
+
+    Args:
+        config: as `compose_policy` gives it. settings: the section `train`.
+        files: demonstrations; one in `HELD_OUT` only measures the loss.
+    """
+    from accelerate import Accelerator
+
+    if (folder / DONE).is_file():
+        return checkpoints_in(folder / "checkpoints")[-1]
+    begun, cpu = time.perf_counter(), time.process_time()
+    chosen = TrainSettings.from_dict(settings, int(config["seed"]))
+    whole = {**config, "train": dict(settings)}
+    resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
+    folder.mkdir(parents=True, exist_ok=True)
+    run, lock = claim_run(folder, True, resume, whole)
+    with ExitStack() as held_lock:
+        held_lock.push(lock)  # it is held already
+        policy = build(config)
+        samples, held = prepared(policy, folder, files)
+        policy.config["card"] = {"data": f"{len(files)} demonstrations", "recipe": dict(settings)}
+        validation = Validation(held, held.collate, chosen.val_samples, chosen.batch_size, chosen.seed)
+        trainer = Trainer(policy, samples, samples.collate, validation, chosen, run, whole, Accelerator(cpu=True))
+        line, loggers = ProgressLine(chosen.steps, run.step), Loggers([JsonLines(folder, run.step)])
+        line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(files)} demonstrations")
+        try:
+            with line:
+                finished = trainer.run(line, loggers)
+        finally:
+            loggers.close()
+    assert trainer.last_checkpoint is not None
+    if not finished:
+        raise SystemExit(128 + (trainer.stopped_by or 0))
+    spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
+    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), **spent})
+    return trainer.last_checkpoint
+
+
+def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[Decisions, Decisions]:
+    """Decisions to learn from, and to measure by; their tokens, and the statistics, are made once for a folder."""
+    learnt_file, held_file, stats_file = (
+        folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
+    )
+    processor = policy.require_processor()
+    if held_file.is_file():  # written last
+        processor.stats = NormStats.load(stats_file)
+        return Decisions.load(learnt_file, OFTEN), Decisions.load(held_file)
+    learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
+    processor.stats = statistics(learnt, policy)
+    processor.stats.save(stats_file)
+    samples, held = (
+        Decisions.of(policy, learnt, OFTEN),
+        Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:])),
+    )
+    samples.save(learnt_file)
+    held.save(held_file)
+    return samples, held
+
+
+def learning_curve(folder: Path) -> list[dict[str, float]]:
+    """What the run logged, a dictionary a line."""
+    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]

@@ -1,0 +1,181 @@
+"""The nano backbone, its tower and its tokens; and what stands between demonstrations and training."""
+
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import REPOSITORY
+
+from mme_vla import UserError, build_policy
+from mme_vla.backbone.nano.tower import CLASSES, WEIGHTS
+from mme_vla.commands.loading import shipped_checkpoint
+from mme_vla.commands.nano import check_counts
+from mme_vla.data.waypoints import Motions
+from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.memory.framesamp import FrameSamp
+from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.nano.learning import Decisions, SparseHistory, statistics
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.testing import check_backbone
+
+SMALL = {
+    "vision": {"image_size": 32, "width_32": 8, "width_16": 8, "width_8": 8, "pretrained": False},
+    "vlm": {"width": 16, "mlp_dim": 16}, "action": {"width": 16, "mlp_dim": 16}, "num_heads": 2, "head_dim": 8,
+    "vocab_size": 64,
+}  # fmt: skip
+EVERY_EIGHTH = {"budget": 256, "grid": 8, "every": 8}
+
+
+def nano(model: str = "framesamp_modul") -> MMEPolicy:
+    memory = {"memory": EVERY_EIGHTH} if model.startswith("framesamp") else {}
+    words = {"backbone": "nano", "embodiment": "robomme_waypoint_front", "policy": {"augment": False}}
+    return build_policy(model, **words, **memory)
+
+
+def demonstration(frames: tuple[int, ...] = (0, 15, 39, 47, 63, 66, 79, 95, 119, 120, 151, 155)) -> Demonstration:
+    rng = np.random.default_rng(0)
+    pictures = {frame: rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
+    targets = rng.uniform(-0.2, 0.2, (3, 7)).astype(np.float32)
+    motions = Motions(np.array([66, 120, 155]), targets)
+    states = rng.uniform(-1, 1, (180, 8)).astype(np.float32)
+    goal = "watch the video carefully, then pick up the container hiding the green cube"
+    return Demonstration("VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": pictures})
+
+
+def test_it_keeps_a_backbones_promises() -> None:
+    check_backbone("nano", **SMALL)
+
+
+@pytest.mark.parametrize("model", ["pi05", "framesamp_context", "framesamp_modul", "framesamp_expert", "ttt_modul"])
+def test_every_composition_has_under_five_million_parameters(model: str) -> None:
+    assert sum(p.numel() for p in nano(model).parameters()) < 5e6
+
+
+def test_the_shipped_tower_weighs_under_six_megabytes_and_other_sizes_are_refused() -> None:
+    assert len(files("mme_vla").joinpath(WEIGHTS).read_bytes()) < 6e6
+    with pytest.raises(UserError, match=r"backbone\.vision\.pretrained=false"):
+        build_policy("pi05", backbone="nano", **{"backbone.vision.width_8": 80})
+
+
+def test_the_shipped_tower_names_what_is_where() -> None:
+    """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far from it."""
+    tower = nano("pi05").backbone.vision
+    picture = torch.full((1, 3, 128, 128), 0.3)
+    picture[0, :, 52:60, 66:74] = torch.tensor([0.7, -0.9, -0.9])[:, None, None]
+    with torch.no_grad():
+        shares = tower.answers(picture)[0].softmax(2)[0]  # token, class, place
+    red = shares[:, CLASSES.index("red cube")].amax(-1).view(8, 8)
+    assert red.argmax() == 3 * 8 + 4 and red[3, 4] > 0.5
+    assert shares[:, CLASSES.index("green cube")].max() < 0.5
+
+
+def test_framesamp_remembers_every_eighth_frame_alone_when_told_so() -> None:
+    memory = FrameSamp(16, 16, budget=256, grid=8, every=8)
+    assert memory.chosen(66).tolist() == [0, 15, 39, 63]
+    assert memory.chosen(5).tolist() == [0]
+    assert all(memory.storage.keeps(int(frame)) for frame in memory.chosen(300))
+    assert FrameSamp(16, 16, budget=256, grid=8).chosen(66).tolist() == [0, 22, 44, 66]
+
+
+def test_a_demonstration_is_read_as_it_was_written(tmp_path: Path) -> None:
+    made = demonstration()
+    made.save(tmp_path / "a.npz")
+    read = Demonstration.load(tmp_path / "a.npz")
+    assert (read.goal, read.length, read.exec_start) == (made.goal, made.length, made.exec_start)
+    assert np.array_equal(read.motions.targets, made.motions.targets)
+    assert list(read.pictures) == ["front"] and np.array_equal(read.pictures["front"][66], made.pictures["front"][66])
+
+
+def test_a_frame_that_was_not_drawn_is_refused() -> None:
+    policy = nano()
+    policy.require_processor().stats = statistics([demonstration()], policy)
+    with pytest.raises(UserError, match=r"\[39\]"):
+        Decisions.of(policy, [demonstration((0, 15, 47, 63, 66, 79, 95, 119, 120, 151, 155))])
+
+
+def test_decisions_are_the_samples_and_hold_what_an_episode_would_show() -> None:
+    policy, made = nano().eval(), demonstration()
+    policy.require_processor().stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).collate([0, 1, 2])
+    assert batch.actions is not None and batch.action_mask is not None
+    assert batch.action_mask.sum(1).tolist() == [3, 2, 1]
+    episode = policy.start_episode(made.goal)
+    frames = np.stack([made.pictures["front"].get(frame, made.pictures["front"][0]) for frame in range(67)])
+    episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
+    history = episode.recall()
+    assert batch.history is not None
+    assert torch.equal(history.features, batch.history.features[0])
+    assert torch.equal(history.positions, batch.history.positions[0])
+
+
+def test_tokens_made_beforehand_give_the_loss_of_the_pictures() -> None:
+    policy, made = nano("pi05").eval(), demonstration()
+    processor = policy.require_processor()
+    processor.stats = statistics([made], policy)
+    batch = Decisions.of(policy, [made]).collate([0, 1, 2])
+    shown = processor.images([np.stack([made.pictures["front"][frame] for frame in (66, 120, 155)])])
+    draws = policy.loss_draws(3, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        ready, drawn = policy(batch, draws)[0], policy(replace(batch, images=shown, view_tokens=None), draws)[0]
+    assert torch.allclose(ready, drawn, atol=1e-5)
+
+
+def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
+    policy = nano()
+    policy.require_processor().stats = statistics([demonstration()], policy)
+    made = Decisions.of(policy, [demonstration()])
+    made.save(tmp_path / "a.safetensors")
+    pairs = zip(made.batch.tensors(), Decisions.load(tmp_path / "a.safetensors").batch.tensors(), strict=True)
+    assert all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_numbers_that_hardly_move_keep_their_size() -> None:
+    policy = nano()
+    stats = statistics([demonstration()], policy)
+    assert (stats.actions.q99 - stats.actions.q01 >= 0.2 - 1e-9).all()
+
+
+def test_a_history_gives_only_what_it_has() -> None:
+    memory = FrameSamp(4, 4, budget=4, grid=1)
+    history = SparseHistory(memory.storage, 10, {0: torch.zeros(1, 4), 9: torch.ones(1, 4)}, 0)
+    assert history.gather(np.array([[9, 0]])).sum() == 4
+    with pytest.raises(UserError, match=r"\[5\]"):
+        history.gather(np.array([[5, 0]]))
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"), [({"easy": 1}, "takes two"), ({"simple": 4}, "easy"), (30, "how many of each"), ({}, "two")]
+)
+def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) -> None:
+    with pytest.raises(UserError, match=words):
+        check_counts(counts)
+
+
+def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
+    policy = MMEPolicy.from_pretrained(shipped_checkpoint("nano") or "")
+    assert policy.require_memory().budget == 4
+    made = demonstration()
+    episode = policy.start_episode(made.goal)
+    frames = np.stack([made.pictures["front"].get(frame, made.pictures["front"][0]) for frame in range(67)])
+    episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
+    assert policy.act(episode).shape == (4, 7)
+
+
+def test_what_the_goal_names_first_is_marked_in_pictures_and_memory() -> None:
+    backbone, processor = nano().backbone, nano().require_processor()
+    ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
+    plain, plain_mask = processor.prompt("press the button")
+    tokens = torch.arange(96.0).expand(2, 3, 96)
+    marked = backbone.mark(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
+    assert marked[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
+    assert torch.equal(marked[1], tokens[1])
+
+
+def test_the_pages_figures_follow_from_the_records() -> None:
+    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / "VideoUnmask"]))
+    won = {model: sum(r.success for r in records if r.model.startswith(model)) for model in ("framesamp", "pi05")}
+    assert len(records) == 100 and won == {"framesamp": 27, "pi05": 0}
+    assert "| **54 %** (40 … 67) | 19/26 | 8/12 | 0/12 |" in (REPOSITORY / "docs" / "nano.md").read_text()

@@ -1,0 +1,38 @@
+"""The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes; needs the extra `sim`."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import REPOSITORY
+
+pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+
+from mme_vla.envs.rendering_check import render_backend
+from mme_vla.errors import UserError
+from mme_vla.evaluation.record_log import find_records, read_folders
+
+SMALL = (
+    "demonstrations.easy=2", "demonstrations.medium=0", "demonstrations.hard=0", "train.steps=20",
+    "train.batch_size=4", "train.val_every=10", "episodes=2", "policy_seeds=[7]", "max_steps=20", "beside=[]",
+)  # fmt: skip
+
+
+@pytest.mark.timeout(600)
+def test_from_nothing_to_a_page_and_again_without_doing_anything_twice(tmp_path: Path) -> None:
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    words = [sys.executable, "-W", "ignore", "-m", "mme_vla.nano", "task=VideoUnmask", *SMALL, f"output={tmp_path}"]
+    assert subprocess.run(words, cwd=REPOSITORY, check=True, capture_output=True).returncode == 0
+    records = read_folders(find_records([tmp_path]))
+    assert [record.episode for record in sorted(records, key=lambda r: r.episode)] == [0, 1]
+    assert {record.action_space for record in records} == {"waypoint"}
+    page = (tmp_path / "page.md").read_text()
+    assert "| framesamp_modul" in page and (tmp_path / "learning.png").is_file()
+    written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
+    subprocess.run(words, cwd=REPOSITORY, check=True, capture_output=True, timeout=200)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == written
+    assert len(read_folders(find_records([tmp_path]))) == 2
