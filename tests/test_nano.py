@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import REPOSITORY
+from safetensors.torch import load
 
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.nano.tower import CLASSES, WEIGHTS
@@ -18,6 +19,7 @@ from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, SparseHistory, statistics
+from mme_vla.nano.pretraining import class_words
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing import check_backbone
 
@@ -70,6 +72,11 @@ def test_the_shipped_tower_names_what_is_where() -> None:
     red = shares[:, CLASSES.index("red cube")].amax(-1).view(8, 8)
     assert red.argmax() == 3 * 8 + 4 and red[3, 4] > 0.5
     assert shares[:, CLASSES.index("green cube")].max() < 0.5
+
+
+def test_a_fresh_tower_knows_the_words_that_the_shipped_one_knows() -> None:
+    words = load(files("mme_vla").joinpath(WEIGHTS).read_bytes())["words"].float()
+    assert torch.equal(class_words(), words) and words.sum() == 3
 
 
 def test_framesamp_remembers_every_eighth_frame_alone_when_told_so() -> None:

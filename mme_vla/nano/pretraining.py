@@ -18,15 +18,18 @@ from torch.nn import functional
 
 from mme_vla.backbone.nano.backbone import NanoBackbone
 from mme_vla.backbone.nano.sizes import NanoConfig
-from mme_vla.backbone.nano.tower import CLASSES, COARSE, FINE, ConvTower
+from mme_vla.backbone.nano.tower import CLASSES, COARSE, FINE, WORDS, ConvTower
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.files import write_atomically
 from mme_vla.nano.scenes import LABEL_SIDE
 from mme_vla.processing.pictures import to_unit_range
+from mme_vla.processing.tokenizer import SAMPLE, Tokenizer
 
 logger = logging.getLogger(__name__)
 SHIFT = 8  # pixels that a picture is moved by at most
+NAMED = {"red": "red cube", "green": "green cube", "blue": "blue cube"}
+"""Words of goals, and the class of objects that each names."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,17 @@ def fresh_tower(sizes: Mapping[str, Any], width: int) -> tuple[ConvTower, int]:
     """
     section = {"vision": {**sizes, "pretrained": False}, "vlm": {"width": width, "mlp_dim": width}}
     backbone = NanoBackbone(read_section(NanoConfig, section, "backbone"))
+    backbone.vision.words.copy_(class_words())
     return backbone.vision, backbone.grid
+
+
+def class_words() -> Tensor:
+    """Which word of the shipped tokenizer names which class of objects: [words, classes but the first], 0 or 1."""
+    tokenizer = Tokenizer.load(SAMPLE)
+    table = torch.zeros(WORDS, len(CLASSES) - 1)
+    for word, name in NAMED.items():
+        table[tokenizer.piece(f"▁{word}"), CLASSES.index(name) - 1] = 1
+    return table
 
 
 def load_scenes(files: Sequence[Path]) -> tuple[Tensor, Tensor]:

@@ -118,6 +118,6 @@ def load_shipped(tower: ConvTower) -> None:
         raise UserError(
             "The vision weights that ship with the library are for the sizes in configs/backbone/nano.yaml. With "
             "others set backbone.vision.pretrained=false, or train a tower of that size: python -m "
-            "mme_vla.vision_pretrain."
+            "mme_vla.nano.vision_pretrain."
         )
     tower.load_state_dict(state)
