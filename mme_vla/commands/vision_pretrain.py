@@ -1,4 +1,4 @@
-"""`python -m mme_vla.nano.vision_pretrain`: the vision tower of the nano backbone, from renders of the sixteen tasks."""
+"""`python -m mme_vla.nano.vision_pretrain`: the vision tower of the nano backbone, from renders of the tasks."""
 
 import logging
 import os
