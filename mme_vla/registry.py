@@ -94,7 +94,9 @@ class Registry[T]:
 
 MEMORIES: Registry[Any] = Registry("memory")
 INTEGRATIONS: Registry[Any] = Registry("integration")
-BACKBONES: Registry[Any] = Registry("backbone", {"openvla": "mme_vla.backbone.openvla.backbone"})
+BACKBONES: Registry[Any] = Registry(
+    "backbone", {name: f"mme_vla.backbone.{name}.backbone" for name in ("pi05", "openvla", "nano")}
+)
 POLICIES: Registry[Any] = Registry(
     "policy",
     {

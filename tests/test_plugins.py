@@ -11,7 +11,7 @@ import pytest
 import torch
 from conftest import REPOSITORY
 
-from mme_vla import MMEPolicy, UserError, build_policy, inspect
+from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.commands import analyse
 from mme_vla.commands.weights import convert
 from mme_vla.config.composition import compose, import_plugins
@@ -92,6 +92,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         policy = build_policy("fading", config_dir=folder / "configs", backbone=small)
     finally:
         sys.path[:] = before
+        plugins._imported.pop(f"{OWN}.memory", None)  # not asked of other tests' worker processes
     policy.require_processor().stats = unit_stats()
     policy(random_batch(policy, 1, valid=32))[0].backward()
     torch.optim.SGD(policy.parameters(), 1e-3).step()

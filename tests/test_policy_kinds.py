@@ -10,7 +10,7 @@ from torch import nn
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
 from mme_vla.config.composition import compose
-from mme_vla.config.variant import composition_digest
+from mme_vla.policy.digest import composition_digest
 from mme_vla.policy.kinds import policy_class
 from mme_vla.processing.normalisers import QuantileStats, RunningStats, normalize, unnormalize
 from mme_vla.training.ema import EMA

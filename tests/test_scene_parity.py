@@ -122,12 +122,12 @@ def test_pictures_along_the_replay_are_the_recorded_ones(episode: Episode, monke
     drawn, shown = set().union(*wanted.values()), iter(range(10**6))
     frame = Observer.frame
 
-    def sparse(observer: Observer, info: dict[str, Any]) -> dict[str, Any]:
+    def sparse(observer: Observer, info: dict[str, Any], *asked: Any) -> dict[str, Any]:
         """Takes the wanted pictures alone, since one takes as long as hundreds of steps."""
         made = next(shown)
         # The list that an episode begins with ends with a frame that no step was stored for.
         observer.render = (made if made < episode.execution else made - 1) in drawn
-        return {"front_rgb": None, "wrist_rgb": None} | frame(observer, info)
+        return {"front_rgb": None, "wrist_rgb": None} | frame(observer, info, *asked)
 
     monkeypatch.setattr(Observer, "frame", sparse)
     monkeypatch.setattr(Observer, "segmentation", lambda _: np.zeros((256, 256), np.int64))  # for grounded texts alone

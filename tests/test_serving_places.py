@@ -59,7 +59,7 @@ def test_a_whole_evaluation_whose_connections_are_never_closed(monkeypatch):
         return episode
 
     def told(episodes, _):  # which episode was asked, and how many frames it remembers
-        return np.stack([np.full((20, 8), episode._state[0] + episode.frames_seen) for episode in episodes])
+        return np.stack([np.full((20, 8), episode.state[0] + episode.frames_seen) for episode in episodes])
 
     monkeypatch.setattr(policy, "start_episode", watched)
     monkeypatch.setattr(policy, "act", told)

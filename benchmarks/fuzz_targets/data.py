@@ -105,6 +105,9 @@ class _Pictures:
     def __len__(self) -> int:
         return len(LENGTHS)
 
+    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+        return np.ones(LENGTHS[episode], bool)
+
     def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
         values = np.random.default_rng(episode).integers(0, 255, (LENGTHS[episode], SIDE, SIDE, 3), np.uint8)
         return values[np.asarray(indices)]

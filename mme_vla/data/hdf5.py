@@ -1,6 +1,5 @@
 """Reading the official demonstration files, `record_dataset_<Task>.h5`, one episode at a time."""
 
-import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError, brief
-from mme_vla.files import decoding, require_file
+from mme_vla.files import decoding, parse_json, require_file
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
 _REMEDY = "Download or copy the file again."
@@ -219,9 +218,10 @@ class RawEpisode:
         """The choice of frames it was recorded at; None for one that was drawn whole."""
         if FRAMES not in self._group:
             return None
-        with decoding(f"{self.ref.file} {self.ref.group}/{FRAMES}", "JSON", _REMEDY):
-            found: dict[str, Any] = json.loads(self._text(self._value(FRAMES)))
-            return found
+        found: dict[str, Any] = parse_json(
+            self._text(self._value(FRAMES)), f"{self.ref.file} {self.ref.group}/{FRAMES}"
+        )
+        return found
 
     @cached_property
     def drawn(self) -> dict[str, np.ndarray]:

@@ -24,4 +24,7 @@ class Drawing:
 
     def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
         """The cameras that show a frame of this number."""
-        return tuple(c for c in CAMERAS if frame in self.frames.get(c, NOTHING) or (newest and c in self.now))
+        known = dict.fromkeys(
+            (*CAMERAS, *self.frames, *self.now)
+        )  # an environment may have others than the benchmark's
+        return tuple(c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now))

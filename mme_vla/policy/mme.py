@@ -10,8 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import mme_vla.backbone.nano.backbone
-import mme_vla.backbone.pi05.backbone
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
