@@ -12,8 +12,9 @@ import torch
 from conftest import REPOSITORY
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.commands import analyse
+from mme_vla.commands import analyse, inspect
 from mme_vla.commands.weights import convert
+from mme_vla.config import plugins
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD, imported_plugins, trust_as_flag, trust_as_override
 from mme_vla.config.plugins import import_plugins as import_modules

@@ -162,6 +162,7 @@ class Observer:
         return self.task.agent.robot.links_map["camera_link"].pose.sp
 
     def _take_pictures(self, cameras: Collection[str]) -> None:
+        cameras = [name for name in cameras if name in SENSORS]
         if not cameras:
             return
         scene = self.task.scene
