@@ -42,8 +42,8 @@ def main(cfg: DictConfig) -> None:
 def run(config: Mapping[str, Any]) -> Path:
     """All stages of a run; the path of its page."""
     from mme_vla.nano.evaluating import run_episodes
+    from mme_vla.nano.fitting import build, compose_policy, train
     from mme_vla.nano.page import write_page
-    from mme_vla.nano.training import build, compose_policy, train
 
     folder = Path(config["output"])
     folder.mkdir(parents=True, exist_ok=True)

@@ -24,7 +24,5 @@ class Drawing:
 
     def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
         """The cameras that show a frame of this number."""
-        known = dict.fromkeys(
-            (*CAMERAS, *self.frames, *self.now)
-        )  # an environment may have others than the benchmark's
+        known = dict.fromkeys((*CAMERAS, *self.frames, *self.now))  # some environments have more than the benchmark
         return tuple(c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now))

@@ -10,7 +10,7 @@ from mme_vla.evaluation.rollout.evaluation import evaluate, memory_budget
 from mme_vla.evaluation.rollout.plan import choose_episodes
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.nano.environment import make_drawn_env
+from mme_vla.nano.drawn_environment import make_drawn_env
 from mme_vla.policy.digest import composition_digest
 from mme_vla.policy.mme import MMEPolicy
 

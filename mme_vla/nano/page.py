@@ -12,7 +12,7 @@ from mme_vla.evaluation.results.intervals import wilson
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.files import write_atomically
-from mme_vla.nano.training import learning_curve
+from mme_vla.nano.fitting import learning_curve
 
 PAGE, CURVES = "page.md", "learning.png"
 LEVELS = ("easy", "medium", "hard")
