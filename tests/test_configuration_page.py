@@ -19,6 +19,10 @@ def test_the_page_is_what_the_files_say(script):
     assert script.PAGE.read_text() == script.page(), "run: python docs/configuration.py"
 
 
+def test_every_file_of_the_top_level_says_which_command_reads_it(script):
+    assert {file.stem for file in script.CONFIGS.glob("*.yaml")} == set(script.COMMANDS)
+
+
 def test_every_key_has_a_comment_in_one_file_of_its_group(script):
     """A group's other files may repeat a key without explaining it again."""
     unexplained = []

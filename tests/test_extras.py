@@ -67,6 +67,8 @@ SUFFICE = [
     Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
     Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
+    Case(("sim",), "mme_vla.nano --help", "demonstrations"),  # tests/test_nano_end_to_end.py runs it
+    Case(("sim",), "mme_vla.nano.vision_pretrain --help", "arrangements"),
     Case(("sim",), "mme_vla.envs.record --help", "episodes"),
     Case(("sim",), "mme_vla.envs.show --help", "task"),
     Case(("sim",), f"{PLAY} player=random", "records:"),

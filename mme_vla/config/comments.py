@@ -18,6 +18,8 @@ COMMANDS = {
     "record": "python -m mme_vla.envs.record",
     "show": "python -m mme_vla.envs.show",
     "play": "python -m mme_vla.play",
+    "nano": "python -m mme_vla.nano",
+    "vision_pretrain": "python -m mme_vla.nano.vision_pretrain",
     "evaluate": "python -m mme_vla.evaluate",
     "subgoal_build": "python -m mme_vla.subgoal.build",
     "subgoal_train": "python -m mme_vla.subgoal.train",
