@@ -133,7 +133,7 @@ def test_a_running_episode_acts_as_a_fresh_look_and_a_saved_policy_as_the_first(
         for piece in pieces:
             shown = frames[piece]
             episode.observe({"front": shown, "wrist": shown}, np.zeros((len(shown), 8), np.float32))
-            which._remember([episode])
+            which._remember([episode], which.observation([episode]))
         return which.act(episode)
 
     streamed = chunks(policy, [slice(0, 1), slice(1, 17), slice(17, 33)])

@@ -1,6 +1,7 @@
 """`Integration`: the one room that knows both memory and backbone, through the backbone's two doors."""
 
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 from torch import Tensor, nn
 
@@ -34,10 +35,12 @@ class Integration(nn.Module):
         hook: the action expert's per-layer hook for this chunk, with all that depends on memory alone computed now.
         condition: what becomes of the condition of the action expert's norms (the embedded flow time).
         beside: blocks that stand beside the actions in every step; `visibility` needs rows for them.
+        brings: doors it goes through by no method of this class, where only other kinds of policy have them.
     """
 
     memory_width: int = 0
     visibility: Visibility = PI05_VISIBILITY
+    brings: ClassVar[frozenset[str]] = frozenset()
 
     def __init__(self, backbone: BackboneConfig) -> None:
         super().__init__()
@@ -71,7 +74,8 @@ DOORS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"e
 
 def doors_of(kind: type[Integration]) -> frozenset[str]:
     """The doors an integration goes through: those it overrides. Asked before it is built to a backbone's sizes."""
-    return frozenset(door for name, door in DOORS.items() if getattr(kind, name) is not getattr(Integration, name))
+    overridden = {door for name, door in DOORS.items() if getattr(kind, name) is not getattr(Integration, name)}
+    return kind.brings | overridden
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:

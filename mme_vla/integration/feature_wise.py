@@ -13,14 +13,12 @@ from mme_vla.types import MemoryTokens
 class PooledIntegration(Integration):
     """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one says it hosts `vector`."""
 
+    brings = frozenset({"vector"})
     feature_width: int
 
     def feature(self, memory: MemoryTokens | None) -> Tensor:
         """Memory tokens [b, n, d] → [b, feature_width]."""
         raise NotImplementedError
-
-    def uses(self) -> frozenset[str]:
-        return frozenset({"vector"})
 
 
 @INTEGRATIONS.register("film")

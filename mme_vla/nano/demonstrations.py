@@ -15,7 +15,7 @@ import numpy as np
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs.make import make_task
-from mme_vla.files import write_atomically
+from mme_vla.files import parse_json, write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import RecordedStep
@@ -64,7 +64,8 @@ class Demonstration:
                 if f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
-            return cls(**json.loads(str(file["about"])), states=file["states"], motions=motions, pictures=pictures)
+            about = parse_json(str(file["about"]), str(path))
+            return cls(**about, states=file["states"], motions=motions, pictures=pictures)
 
 
 def record(

@@ -1,6 +1,5 @@
 """One policy of a nano run: built, trained on demonstrations, and evaluated in closed loop; each once."""
 
-import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
@@ -11,7 +10,7 @@ from omegaconf import OmegaConf
 
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
-from mme_vla.files import write_json
+from mme_vla.files import read_json_lines, write_json
 from mme_vla.nano.learning import OFTEN, Decisions, load_all, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
@@ -122,4 +121,4 @@ def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[De
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:
     """What the run logged, a dictionary a line."""
-    return [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [line for _, line in read_json_lines(folder / "metrics.jsonl", "the log of a run")]

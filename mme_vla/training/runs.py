@@ -1,5 +1,6 @@
 """Run folders: which one this run writes to, what it may resume from, and which settings it may change then."""
 
+import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields
 from itertools import zip_longest
@@ -12,9 +13,11 @@ from mme_vla.files import FolderLock, plain
 from mme_vla.files.locks import LOCK
 from mme_vla.policy.kinds import policy_name
 from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, resolve_checkpoint, step_of
+from mme_vla.registry import INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
 
+PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
 
 MAY_DIFFER = (
@@ -155,7 +158,16 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         "embodiment": embodiment_of(config).to_dict(),
         "train": {**train, **config["train"]},
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
+        **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
     }
+
+
+def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str, Any]:
+    """A part's section with the options that it leaves to the constructor: some came later than the run."""
+    if section.get("name") not in table:
+        return dict(section)
+    options = inspect.signature(table[str(section["name"])]).parameters.values()
+    return {o.name: o.default for o in options if o.default is not o.empty} | dict(section)
 
 
 def _holds_run(folder: Path) -> bool:
