@@ -1,7 +1,6 @@
 """Closed-loop evaluation of a nano policy on the benchmark's episodes, through planned motions."""
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ from mme_vla.evaluation.rollout.evaluation import evaluate, memory_budget
 from mme_vla.evaluation.rollout.plan import choose_episodes
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.nano.drawn_environment import make_drawn_env
 from mme_vla.policy.digest import composition_digest
 from mme_vla.policy.mme import MMEPolicy
 
@@ -35,7 +33,6 @@ def run_episodes(
         split, episodes: as `evaluate` has them.
     """
     policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
-    every = 1 if policy.memory is None else policy.memory.storage.keep_every
     jobs = choose_episodes(task, episodes, split)
     records: list[EpisodeRecord] = []
     for seed in seeds:
@@ -44,7 +41,6 @@ def run_episodes(
             str(policy.config["name"]), checkpoint.name, seed, split, max_steps,
             memory_budget=memory_budget(policy), composition=composition_digest(policy.config),
         )  # fmt: skip
-        base = partial(make_drawn_env, every=every if policy.memory is not None else 10**6)
-        done = evaluate(policy, jobs, folder / f"seed{seed}", facts, settings, source=str(checkpoint), base=base)
+        done = evaluate(policy, jobs, folder / f"seed{seed}", facts, settings, source=str(checkpoint))
         records += done.records
     return records
