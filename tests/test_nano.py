@@ -87,6 +87,13 @@ def test_framesamp_remembers_every_eighth_frame_alone_when_told_so() -> None:
     assert FrameSamp(16, 16, budget=256, grid=8).chosen(66).tolist() == [0, 22, 44, 66]
 
 
+def test_framesamp_names_the_frames_it_will_read_also_when_it_stores_every_eighth_alone() -> None:
+    memory = FrameSamp(d_vision=8, width=8, budget=4, grid=1, every=8)
+    for step in (0, 5, 66, 200):
+        assert memory.frames_read([step], 30).tolist() == sorted(set(memory.chosen(step).tolist()))
+        assert set(memory.frames_read([step], 30)) <= set(memory.storage.kept_frames(step + 1))
+
+
 def test_a_demonstration_is_read_as_it_was_written(tmp_path: Path) -> None:
     made = demonstration()
     made.save(tmp_path / "a.npz")

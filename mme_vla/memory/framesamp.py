@@ -48,7 +48,7 @@ class FrameSamp(PerceptualMemory):
         self.frames = budget // grid**2
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([evenly_spaced_frames(int(step), self.frames) for step in steps])
+        return every_one([self.chosen(int(step)) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         return whole_frames(self.chosen(step), self.storage.grid)
