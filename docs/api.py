@@ -71,7 +71,8 @@ def members(kind: type) -> list[tuple[str, Any]]:
 def section(name: str) -> str:
     """A name with its signature, its words and, for a class, its methods."""
     thing = getattr(mme_vla, name)
-    head = f"from mme_vla import {name}  # {thing.__module__}\n{name}{signature(thing)}"
+    called = signature(thing)
+    head = f"from mme_vla import {name}  # {thing.__module__}" + (f"\n{name}{called}" if called else "")
     parts = [f"### `{name}`", f"```python\n{head}\n```", text_of(thing)]
     if inspect.isclass(thing) and not issubclass(thing, Exception):
         for method, member in members(thing):
