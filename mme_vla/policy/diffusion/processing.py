@@ -13,10 +13,10 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.fields import whole
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
-from mme_vla.files import check_sums, inside
 from mme_vla.memory.base import stack_history
-from mme_vla.policy.diffusion.text import HASHED, text_encoder
-from mme_vla.processing.base import STATS_FILE, Counted, PolicyProcessor, Sample, read_settings
+from mme_vla.policy.diffusion.text import text_encoder
+from mme_vla.processing.base import STATS_FILE, Counted, PolicyProcessor, Sample
+from mme_vla.processing.goal_encoders import HASHED, load_with_goal_encoder
 from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.registry import PROCESSORS
@@ -205,26 +205,4 @@ class DiffusionProcessor(PolicyProcessor):
         Raises:
             UserError: `folder` holds no processor, a damaged one, or one that names a text tower elsewhere.
         """
-        folder = Path(folder)
-        settings = read_settings(folder)
-        if settings.pop("name", None) != "diffusion_policy":
-            raise UserError(f"{folder} holds a processor of another kind of policy.")
-        text, stats = settings.get("text"), settings.pop("stats", None)
-        if tokenizer is not None:
-            settings["text"] = str(tokenizer)
-        elif text not in (CLIP_NAME, HASHED):
-            raise UserError(
-                f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a checkpoint's word. If "
-                f"you trust it: from_pretrained(…, tokenizer={brief(text, 200)})."
-            )
-        try:
-            robot = Embodiment.from_dict(settings.pop("embodiment", {}))
-            if stats is not None:
-                if not isinstance(stats, str):
-                    raise UserError(f"stats={brief(stats)} must be the name of a file.")
-                path = inside(folder, stats, "statistics")
-                check_sums(folder, [stats])
-                settings["stats"] = NormStats.load(path)
-            return cls(embodiment=robot, **settings)
-        except (TypeError, ValueError, KeyError, IndexError) as error:
-            raise UserError(f"{folder}: its processor cannot be built ({error}).") from None
+        return load_with_goal_encoder(cls, "diffusion_policy", Path(folder), tokenizer, trusted=(CLIP_NAME, HASHED))

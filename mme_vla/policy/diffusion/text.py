@@ -1,6 +1,5 @@
 """The goal's words as one vector of unit length, computed once for each goal."""
 
-import hashlib
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,52 +9,28 @@ from torch import Tensor
 from torch.nn import functional
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.processing.prompt import checked_text
+from mme_vla.processing.goal_encoders import HASHED, GoalEncoder, direction_of
 
 if TYPE_CHECKING:
     from transformers import CLIPTextModelWithProjection
 
 CLIP = "openai/clip-vit-base-patch32"
-HASHED = "hashed"
 CLIP_WIDTH = 512
 LONGEST = 77
 """Tokens that CLIP reads."""
 
 
-class TextFeatures:
-    """Texts → [d]. Nothing of it learns and nothing is saved with a policy but its name."""
-
-    def __init__(self, width: int) -> None:
-        self.width = width
-        self._known: dict[str, Tensor] = {}
-
-    def __call__(self, text: str) -> Tensor:
-        """The vector [d] of a text, of unit length.
-
-        Raises:
-            UserError: it is no text, or the encoder cannot be had.
-        """
-        if checked_text(text, "the goal") not in self._known:
-            self._known[text] = self.encode(text)
-        return self._known[text]
-
-    def encode(self, text: str) -> Tensor:
-        """The vector of a text that is not known yet."""
-        raise NotImplementedError
-
-
-class HashedWords(TextFeatures):
+class HashedWords(GoalEncoder):
     """The sum of one fixed random direction a word: equal words, equal vectors. To try things out without CLIP."""
 
     def encode(self, text: str) -> Tensor:
         total = torch.zeros(self.width)
         for word in text.lower().split() or [""]:
-            seed = int.from_bytes(hashlib.sha256(word.encode()).digest()[:8], "big") >> 1
-            total += torch.randn(self.width, generator=torch.Generator().manual_seed(seed))
+            total += direction_of(word, self.width)
         return functional.normalize(total, dim=0)
 
 
-class ClipText(TextFeatures):
+class ClipText(GoalEncoder):
     """CLIP's text tower and projection, frozen, on the CPU; read when the first text is asked for."""
 
     def __init__(self, width: int, source: str | Path = CLIP) -> None:
@@ -101,7 +76,7 @@ def text_features(tower: "CLIPTextModelWithProjection", ids: Tensor, mask: Tenso
     return functional.normalize(tower(input_ids=ids, attention_mask=mask).text_embeds, dim=-1)
 
 
-def text_encoder(name: str, width: int) -> TextFeatures:
+def text_encoder(name: str, width: int) -> GoalEncoder:
     """The encoder called `hashed` or `clip`, or a CLIP in a folder of one's own."""
     if name == HASHED:
         return HashedWords(width)

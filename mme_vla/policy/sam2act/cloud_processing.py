@@ -14,11 +14,11 @@ from mme_vla.backbone.sam2act.rotations import quaternions_of
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.files import check_sums, inside
 from mme_vla.policy.sam2act.batches import KeyframeBatch
-from mme_vla.policy.sam2act.goal_tokens import HASHED, goal_tokens
+from mme_vla.policy.sam2act.goal_tokens import goal_tokens
 from mme_vla.policy.sam2act.scene import Shot, cloud_of
-from mme_vla.processing.base import STATS_FILE, PolicyProcessor, read_settings
+from mme_vla.processing.base import STATS_FILE, PolicyProcessor
+from mme_vla.processing.goal_encoders import HASHED, load_with_goal_encoder
 from mme_vla.processing.normalisers import NormStats, QuantileStats
 from mme_vla.registry import PROCESSORS
 
@@ -246,29 +246,7 @@ class SAM2ActProcessor(PolicyProcessor):
         Raises:
             UserError: `folder` holds no processor, a damaged one, or one that names a text tower elsewhere.
         """
-        folder = Path(folder)
-        settings = read_settings(folder)
-        if settings.pop("name", None) != NAME:
-            raise UserError(f"{folder} holds a processor of another kind of policy.")
-        text, stats = settings.get("text"), settings.pop("stats", None)
-        if tokenizer is not None:
-            settings["text"] = str(tokenizer)
-        elif text != HASHED:
-            raise UserError(
-                f"{folder} takes its text tower from {brief(text, 200)}, which is not read on a checkpoint's word. If "
-                f"you trust it: from_pretrained(…, tokenizer={brief(text, 200)})."
-            )
-        try:
-            robot = Embodiment.from_dict(settings.pop("embodiment", {}))
-            if stats is not None:
-                if not isinstance(stats, str):
-                    raise UserError(f"stats={brief(stats)} must be the name of a file.")
-                path = inside(folder, stats, "statistics")
-                check_sums(folder, [stats])
-                settings["stats"] = NormStats.load(path)
-            return cls(embodiment=robot, **settings)
-        except (TypeError, IndexError, UserError) as error:
-            raise UserError(f"{folder}: its processor cannot be built ({error}).") from None
+        return load_with_goal_encoder(cls, NAME, Path(folder), tokenizer, trusted=(HASHED,))
 
 
 def _neutral(width: int) -> QuantileStats:

@@ -1,6 +1,5 @@
 """The goal's words as tokens: CLIP's text tower before its projection, or fixed random words to try things out."""
 
-import hashlib
 from functools import cached_property
 from typing import Any
 
@@ -8,31 +7,15 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.processing.prompt import checked_text
-
-HASHED = "hashed"
+from mme_vla.processing.goal_encoders import HASHED, GoalEncoder, direction_of
 
 
-class GoalTokens:
-    """Texts → [l, w]. Nothing of it learns, and nothing is saved with a policy but its name."""
+class GoalTokens(GoalEncoder):
+    """Texts → tokens [words, width]."""
 
     def __init__(self, width: int, words: int) -> None:
-        self.width, self.words = width, words
-        self._known: dict[str, Tensor] = {}
-
-    def __call__(self, text: str) -> Tensor:
-        """The tokens [l, w] of a text.
-
-        Raises:
-            UserError: it is no text, or the encoder cannot be had.
-        """
-        if checked_text(text, "the goal") not in self._known:
-            self._known[text] = self.encode(text)
-        return self._known[text]
-
-    def encode(self, text: str) -> Tensor:
-        """The tokens of a text that is not known yet."""
-        raise NotImplementedError
+        super().__init__(width)
+        self.words = words
 
 
 class HashedTokens(GoalTokens):
@@ -42,8 +25,7 @@ class HashedTokens(GoalTokens):
         """See `GoalTokens`."""
         tokens = torch.zeros(self.words, self.width)
         for place, word in enumerate(text.lower().split()[: self.words]):
-            seed = int.from_bytes(hashlib.sha256(word.encode()).digest()[:8], "big") >> 1
-            tokens[place] = torch.randn(self.width, generator=torch.Generator().manual_seed(seed))
+            tokens[place] = direction_of(word, self.width)
         return tokens
 
 
