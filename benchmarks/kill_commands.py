@@ -107,7 +107,7 @@ def _evaluate(inputs: Path, folder: Path) -> None:
 class _Recorder:
     """Stands in for the simulator: the steps of a demonstration, made up."""
 
-    def __init__(self, task: Any, on_step: Callable[[Any], None]) -> None:
+    def __init__(self, task: Any, on_step: Callable[[Any], None], drawing: Any) -> None:
         self._seed, self._on_step = task.seed, on_step
 
     def record(self) -> Any:
