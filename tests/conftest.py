@@ -1,6 +1,8 @@
 """Fixtures that find the data beside the repository, and skip clearly where it is absent."""
 
+import gc
 import os
+import sys
 from pathlib import Path
 
 # Tests are run side by side (`pytest -n auto`): one thread each, as many tests as there are cores.
@@ -8,7 +10,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
 
+from mme_vla.envs.vector import processes
+
 REPOSITORY = Path(__file__).resolve().parent.parent
+
+# What commands import besides: `forked.py` runs them in the same way as workers.
+processes.PRELOADED += ["lerobot.datasets.lerobot_dataset", "matplotlib.pyplot"]
 
 
 def _folder(variable: str, default: Path, what: str) -> Path:
@@ -16,6 +23,23 @@ def _folder(variable: str, default: Path, what: str) -> Path:
     if not folder.is_dir():
         pytest.skip(f"{what} not found at {folder}; set {variable} to a folder of that layout to run this test")
     return folder
+
+
+_MANY_MODULES = 300
+_modules_frozen = 0
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _imports_left_out_of_collections() -> None:
+    """ManiSkill collects garbage for every scene it builds, which takes half a second with all that tests import.
+
+    A file's tests begin with what earlier files imported left out, as workers do with what they are forked with.
+    """
+    global _modules_frozen
+    if len(sys.modules) > _modules_frozen + _MANY_MODULES:
+        gc.collect()
+        gc.freeze()
+        _modules_frozen = len(sys.modules)
 
 
 @pytest.fixture(autouse=True)

@@ -5,6 +5,7 @@ import sys
 import textwrap
 from pathlib import Path
 
+import forked
 import pytest
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -178,7 +179,7 @@ def app(tree: Path, tmp_path: Path) -> Path:
 
 
 def run(app: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, str(app), *arguments], cwd=app.parent, capture_output=True, text=True)
+    return forked.script(app, *arguments, cwd=app.parent)
 
 
 def test_a_command_runs_with_hydras_run_folder(app: Path) -> None:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import forked
 import pytest
 from conftest import REPOSITORY
 
@@ -19,9 +20,7 @@ MODULES = {name: words.removeprefix("python -m ") for name, words in COMMANDS.it
 def ask(module: str, *words: str, code: int = 0) -> str:
     """What a command says; it must end with `code` and never with a traceback."""
     environment = {"COLUMNS": "100", "PATH": "", "HOME": str(REPOSITORY)}
-    done = subprocess.run(
-        [sys.executable, "-m", module, *words], capture_output=True, text=True, cwd=REPOSITORY, env=environment
-    )
+    done = forked.run(module, *words, env=environment)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done.stdout if code == 0 else done.stderr

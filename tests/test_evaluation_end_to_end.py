@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import forked
 import pytest
 from conftest import REPOSITORY
 
@@ -25,8 +26,8 @@ def command(module: str, *words: str) -> list[str]:
     return [sys.executable, "-W", "ignore", "-m", f"mme_vla.{module}", *words]
 
 
-def call(*words: str) -> str:
-    done = subprocess.run(command(*words), cwd=REPOSITORY, capture_output=True, text=True)
+def call(module: str, *words: str) -> str:
+    done = forked.run(f"mme_vla.{module}", *words)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
 

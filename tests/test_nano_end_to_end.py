@@ -1,11 +1,9 @@
 """The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes; needs the extra `sim`."""
 
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import pytest
-from conftest import REPOSITORY
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
@@ -25,14 +23,15 @@ def test_from_nothing_to_a_page_and_again_without_doing_anything_twice(tmp_path:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    words = [sys.executable, "-W", "ignore", "-m", "mme_vla.nano", "task=VideoUnmask", *SMALL, f"output={tmp_path}"]
-    assert subprocess.run(words, cwd=REPOSITORY, check=True, capture_output=True).returncode == 0
+    words = ["mme_vla.nano", "task=VideoUnmask", *SMALL, f"output={tmp_path}"]
+    done = forked.run(*words)
+    assert done.returncode == 0, done.stderr
     records = read_folders(find_records([tmp_path]))
     assert [record.episode for record in sorted(records, key=lambda r: r.episode)] == [0, 1]
     assert {record.action_space for record in records} == {"waypoint"}
     page = (tmp_path / "page.md").read_text()
     assert "| framesamp_modul" in page and (tmp_path / "learning.png").is_file()
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
-    subprocess.run(words, cwd=REPOSITORY, check=True, capture_output=True, timeout=200)
+    assert forked.run(*words).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == written
     assert len(read_folders(find_records([tmp_path]))) == 2

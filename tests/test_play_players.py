@@ -1,11 +1,9 @@
 """Players without hands: the oracle, a tiny Qwen3-VL, and a stand-in for the API; unusable answers of every kind."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
+import forked
 import numpy as np
 import pytest
 from play_fakes import BLOCKS, MOTION, VIDEO, a_session
@@ -210,9 +208,7 @@ def test_the_oracle_needs_this_librarys_tasks():
 def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
     words = ["task=[VideoUnmask,VideoUnmaskSwap]", "episodes=[0]", "player=oracle", f"output={tmp_path / 'run'}"]
-    done = subprocess.run(
-        [sys.executable, "-m", "mme_vla.play", *words], capture_output=True, text=True, cwd=Path(__file__).parent.parent
-    )
+    done = forked.run("mme_vla.play", *words)
     assert done.returncode == 0, done.stderr
     first, second = read_records(tmp_path / "run" / "episodes.jsonl")
     assert (first.outcome, second.outcome) == ("success", "success")
@@ -233,10 +229,7 @@ def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     ],
 )
 def test_what_cannot_work_is_said_before_anything_begins(words, message, tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "mme_vla.play", *words, f"output={tmp_path / 'run'}"],
-        capture_output=True, text=True, cwd=Path(__file__).parent.parent,
-    )  # fmt: skip
+    done = forked.run("mme_vla.play", *words, f"output={tmp_path / 'run'}")
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr

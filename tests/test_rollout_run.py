@@ -8,6 +8,7 @@ import sys
 import time
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -274,8 +275,7 @@ def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.Capt
 def test_a_launcher_that_is_not_installed_is_named_with_its_extra() -> None:
     if importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is not None:
         pytest.skip("the extra `sweep` is installed")
-    command = [sys.executable, "-m", "mme_vla.evaluate", "--multirun", "launcher=joblib", "model=pi05"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    done = forked.run("mme_vla.evaluate", "--multirun", "launcher=joblib", "model=pi05")
     assert done.returncode == 2 and "uv sync --inexact --extra sweep" in done.stderr and "Traceback" not in done.stderr
 
 
@@ -284,8 +284,7 @@ def test_a_launcher_that_is_not_installed_is_named_with_its_extra() -> None:
 )
 def test_the_command_evaluates_a_checkpoint_in_the_simulator(checkpoint: Path, tmp_path: Path) -> None:
     words = [f"checkpoint={checkpoint}", "tasks=[StopCube]", "episodes=1", "max_steps=16", "render=false", "seed=7"]
-    command = [sys.executable, "-W", "ignore", "-m", "mme_vla.evaluate", *words, f"output={tmp_path}"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    done = forked.run("mme_vla.evaluate", *words, f"output={tmp_path}")
     assert done.returncode == 0, done.stderr
     (record,) = read_records(tmp_path / "episodes.jsonl")
     assert (record.model, record.checkpoint, record.model_seed) == ("framesamp_modul", 3, 7)

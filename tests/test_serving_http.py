@@ -13,6 +13,7 @@ import sys
 import threading
 from types import SimpleNamespace
 
+import forked
 import numpy as np
 import pytest
 from conftest import REPOSITORY
@@ -205,8 +206,7 @@ def test_the_command_says_what_it_needs():
     for words, said in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
         with pytest.raises(UserError, match=said):
             load_policy(compose("serve", words), "serve", LOGGER)
-    command = [sys.executable, "-m", "mme_vla.serve", "checkpoint=x", "model=pi05"]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    done = forked.run("mme_vla.serve", "checkpoint=x", "model=pi05")
     assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
 
 

@@ -1,14 +1,12 @@
 """Predictors in rollouts: the log of every subgoal, its score, and predictors in the background."""
 
 import json
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from PIL import Image
 from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
@@ -267,8 +265,7 @@ def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str
     except UserError as error:
         pytest.skip(str(error))
     tasks = ["model=groundsg", "backbone=tiny", "tasks=[PickXtimes,ButtonUnmask]", "episodes=1", "max_steps=24"]
-    command = [sys.executable, "-W", "ignore", "-m", "mme_vla.evaluate", *tasks, *words, "video=all", "workers=2"]
-    done = subprocess.run([*command, f"output={tmp_path}"], cwd=REPOSITORY, capture_output=True, text=True)
+    done = forked.run("mme_vla.evaluate", *tasks, *words, "video=all", "workers=2", f"output={tmp_path}")
     assert done.returncode == 0, done.stderr
     records = read_records(tmp_path / "episodes.jsonl")
     assert sorted(record.task for record in records) == ["ButtonUnmask", "PickXtimes"]

@@ -1,11 +1,10 @@
 """A composition is called what it is, in folders, configurations and records, and results keep compositions apart."""
 
 import json
-import subprocess
-import sys
 import textwrap
 from pathlib import Path
 
+import forked
 import pytest
 
 from mme_vla.config.composition import compose
@@ -80,10 +79,10 @@ def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path
         '    print("at", cfg.name, cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
     )
     words = ["integration=modulator", "memory=framesamp"]
-    done = subprocess.run([sys.executable, str(app), *words], cwd=tmp_path, capture_output=True, text=True)
+    done = forked.script(app, *words, cwd=tmp_path)
     assert done.stdout.startswith(f"at framesamp_modul framesamp_modul {tmp_path}/outputs/framesamp_modul/"), done
     words = ["--multirun", "integration=modulator", "memory=framesamp,tokendrop"]
-    done = subprocess.run([sys.executable, str(app), *words], cwd=tmp_path, capture_output=True, text=True)
+    done = forked.script(app, *words, cwd=tmp_path)
     lines = [line.split() for line in done.stdout.splitlines() if line.startswith("at ")]
     assert [(line[1], Path(line[3]).name) for line in lines] == [
         ("framesamp_modul", "0_framesamp_modul"),

@@ -3,11 +3,10 @@
 import json
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
+import forked
 import pytest
 import torch
 from safetensors.torch import save_file
@@ -151,8 +150,8 @@ def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "mme_vla.weights.convert", str(bases["lerobot"]), str(tmp_path / "new")]
-    done = subprocess.run([*command, "backbone=tiny", "--dry-run"], capture_output=True, text=True)
+    command = ["mme_vla.weights.convert", str(bases["lerobot"]), str(tmp_path / "new")]
+    done = forked.run(*command, "backbone=tiny", "--dry-run")
     assert done.returncode == 0, done.stderr
     assert re.search(
         r"q_proj\.weight +\S+ +backbone\.transformer\.layers\.\*\.experts\.action\.qkv\.weight", done.stdout
@@ -161,7 +160,7 @@ def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path
     assert re.search(r"tied.*\n.*\n.*lm_head\.weight +\S+embed_tokens\.weight", done.stdout)
     assert "derived: recomputed constants: none" in done.stdout
     assert list(tmp_path.iterdir()) == []
-    wrong = subprocess.run([*command, "backbone=tinny"], capture_output=True, text=True)
+    wrong = forked.run(*command, "backbone=tinny")
     assert wrong.returncode == 2
     assert "tiny" in wrong.stderr
     assert "Traceback" not in wrong.stderr

@@ -13,6 +13,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.recorded import Job, Wanted
+from mme_vla.envs.vector.processes import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.files import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.files.parents import end_with_parent, signals_held
@@ -118,10 +119,12 @@ def _begin_worker(plugins: Sequence[str]) -> None:
 
 def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None) -> Iterator[dict[str, Any]]:
     if workers == 1 or len(jobs) < 2:
+        import mme_vla.envs.vector.preloaded  # noqa: F401 - scenes are built faster from here on
+
         yield from (record_episode(job, folder, previews) for job in jobs)
         return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, _begin_worker, (imported_plugins(),)) as pool:
+    begun = (settings(), _begin_worker, imported_plugins())
+    with ProcessPoolExecutor(workers, simulating_processes(), begin, begun) as pool:
         with signals_held():  # the workers are started here, and inherit that
             futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
         try:

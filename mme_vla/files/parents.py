@@ -18,10 +18,11 @@ def end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is None:
         return
-    watched, number = [parent.sentinel], parent.pid
+    # The process that forked this one: the parent itself, or its fork server, which ends when the parent does.
+    watched, number = [parent.sentinel], os.getppid()
 
     def watch() -> None:
-        # Forked sisters hold each other's ends of the pipe, so the parent's number is looked at as well.
+        # Forked sisters hold each other's ends of the pipe, so that number is looked at as well.
         while not wait(watched, timeout=1.0) and os.getppid() == number:
             pass
         os._exit(1)  # nothing to tidy up for anybody, and a simulator may take long to

@@ -8,10 +8,10 @@
                 ...  # reply.job, reply.observation, reply.info; then
                 envs.send(reply.worker, action)  # or, when reply.done: envs.start_next(reply.worker)
 
-Processes are started afresh ("spawn"), so a script that makes one keeps its work under `if __name__ == "__main__":`.
+Processes inherit nothing of the script that makes one (`processes.py`), which therefore keeps its work under
+`if __name__ == "__main__":`.
 """
 
-import multiprocessing
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -26,6 +26,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.envs.vector.processes import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.files.parents import signals_held
 
@@ -82,7 +83,7 @@ class VecEnv:
         """Episodes that no worker has begun yet."""
         self.timeout = timeout
         self._factory, self._options = factory, options or {}
-        self._context = multiprocessing.get_context("spawn")
+        self._context = simulating_processes()
         self._closed = False
         self._workers: list[_Worker] = []
         self._lost: list[Reply] = []
@@ -193,9 +194,8 @@ class VecEnv:
     def _spawn(self) -> _Worker:
         here, there = self._context.Pipe()
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
-        process = self._context.Process(
-            target=_work, args=(imported_plugins(), there, block, self._factory, self._options), daemon=True
-        )
+        work = (imported_plugins(), there, block, self._factory, self._options)
+        process = self._context.Process(target=begin, args=(settings(), _work, *work), daemon=True)
         with signals_held():
             process.start()
         there.close()
