@@ -4,6 +4,7 @@ imported PyTorch, LeRobot and the simulator once. Seconds of CPU time are saved 
 Tests of what happens while a command is imported, or when it is killed, start real processes.
 """
 
+import importlib
 import os
 import runpy
 import subprocess
@@ -17,8 +18,17 @@ from conftest import REPOSITORY
 from mme_vla.envs.vector import processes
 
 
-def run(*words: str, cwd: Path = REPOSITORY, env: Mapping[str, str] | None = None, timeout: float = 280.0):
+def run(
+    *words: str,
+    cwd: Path = REPOSITORY,
+    env: Mapping[str, str] | None = None,
+    hidden: Sequence[str] = (),
+    timeout: float = 280.0,
+):
     """What `python -W ignore -m <words>` would end as in a folder, with these environment variables besides the own.
+
+    Args:
+        hidden: modules that do not exist for it.
 
     Returns:
         A `subprocess.CompletedProcess` with text.
@@ -27,7 +37,7 @@ def run(*words: str, cwd: Path = REPOSITORY, env: Mapping[str, str] | None = Non
         out, err = Path(folder, "out"), Path(folder, "err")
         variables = {**os.environ, **(env or {})}
         process = processes.simulating_processes().Process(
-            target=processes.begin, args=(variables, _be, words, cwd, out, err)
+            target=processes.begin, args=(variables, _be, words, cwd, hidden, out, err)
         )
         process.start()
         process.join(timeout)
@@ -43,13 +53,17 @@ def script(path: Path, *words: str, **how):
     return run(str(path), *words, **how)
 
 
-def _be(words: Sequence[str], cwd: Path, out: Path, err: Path) -> None:
+def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: Path) -> None:
+    if hidden:
+        assert not set(hidden) & set(sys.modules), "these are imported already"
+        os.environ["HIDDEN_MODULES"] = " ".join(hidden)
+        sys.path.insert(0, str(Path(__file__).parent / "extras"))
+        importlib.import_module("sitecustomize")
     os.chdir(cwd)
     sys.path[0:0] = [str(cwd)]
     for path, number in ((out, 1), (err, 2)):
         with path.open("wb") as file:
             os.dup2(file.fileno(), number)
-    sys.stdin = Path(os.devnull).open()  # for the rest of the process
     sys.argv = list(words)
     if words[0].endswith(".py"):
         runpy.run_path(words[0], run_name="__main__")

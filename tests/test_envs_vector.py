@@ -1,8 +1,12 @@
 """Environments in worker processes: order, frames, crashes, hangs, closing."""
 
+import gc
 import multiprocessing
+import os
+import sys
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +15,7 @@ from envs_stand_ins import FRAME, make_light_env
 
 from mme_vla.envs import VecEnv, make_vec_env
 from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.envs.vector.processes import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 
 
@@ -159,6 +164,24 @@ def test_closing_ends_all_processes_even_busy_ones() -> None:
     for use in (envs.recv, lambda: envs.send(0, 1), lambda: envs.start_next(0)):
         with pytest.raises(UserError, match="closed"):
             use()
+
+
+def tell(file: Path) -> None:
+    """What a process finds when it begins."""
+    file.write_text(f"{os.environ.get('SETTING')} {gc.get_freeze_count()} {'sapien' in sys.modules}")
+
+
+def test_processes_begin_with_the_settings_of_their_time_and_all_imports_left_out_of_collections(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("sapien", reason="needs the simulator: uv sync --inexact --extra sim")
+    for value in ("first", "second"):
+        monkeypatch.setenv("SETTING", value)
+        process = simulating_processes().Process(target=begin, args=(settings(), tell, tmp_path / value))
+        process.start()
+        process.join(60)
+        setting, frozen, imported = (tmp_path / value).read_text().split()
+        assert (setting, imported) == (value, "True") and int(frozen) > 100_000
 
 
 @pytest.mark.parametrize(
