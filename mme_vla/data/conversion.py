@@ -16,7 +16,9 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.columns import DRAWN
-from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, any_chosen_frames, open_episode, pose_columns
+from mme_vla.data.hdf5 import any_chosen_frames, open_episode, pose_columns
+from mme_vla.data.hdf5_episode import SUBGOALS, RawEpisode
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries

@@ -13,7 +13,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.processing.base import PolicyProcessor, Sample
-from mme_vla.processing.processor import collate as collate
+from mme_vla.processing.collating import collate as collate
 from mme_vla.processing.subgoal_text import SubgoalText
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.columns import DRAWN, find_columns, width_of
-from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
     content_fingerprint,
