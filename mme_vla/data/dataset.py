@@ -192,7 +192,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return Sample(
             views={name: source.frames(step.episode, window, name) for name in cameras},
             states=states[window - first],
-            goal=step.goal,
+            goal=source.robot.action.worded(step.goal, source.options(step.episode)),
             subgoal=subgoal,
             past_actions=self.past_actions(step),
             actions=step.actions,

@@ -8,15 +8,19 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.choice_rows import CHOICE_NUMBERS, row_of
 from mme_vla.data.hdf5_values import REMEDY, EpisodeRef, StoredValues
 from mme_vla.data.waypoints import known_poses
-from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.embodiment.options import read_options
+from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.errors import UserError, brief
 from mme_vla.files import decoding, parse_json
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
 POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
 """Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
+CHOICES = ("setup/available_multi_choices", "timestep_0/action/choice_action", "timestep_0/info/is_subgoal_boundary")
+"""What an episode has whose options and choices were recorded."""
 FRAMES = "setup/frames"
 """Where a file keeps the choice of frames it was recorded at, as JSON, if not all were drawn."""
 _PICTURES = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
@@ -158,6 +162,39 @@ class RawEpisode(StoredValues):
         return known_poses(
             np.stack(steps), self.exec_start, lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7)[:7]
         )
+
+    def choice_actions(self) -> np.ndarray:
+        """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at all others.
+
+        Raises:
+            UserError: a step holds something that is no choice.
+        """
+        rows = np.zeros((self.length, len(CHOICE_NUMBERS)), np.float32)
+        for k in range(self.length):
+            begins = self._flag(k, "info/is_subgoal_boundary") and not self._flag(k, "info/is_completed")
+            if begins or k == self.exec_start:
+                try:
+                    row = row_of(self._text(self._step(k, "action/choice_action")))
+                except UserError as error:
+                    place = f"{self.ref.file} {self.ref.group}/timestep_{k}/action/choice_action"
+                    raise UserError(f"{place}: {error} {REMEDY}") from None
+                rows[k] = 0 if row is None else row
+        return rows
+
+    @cached_property
+    def options(self) -> list[dict[str, Any]]:
+        """What could be chosen: `label`, `action` and `need_parameter` of each option.
+
+        Raises:
+            UserError: the file holds something else.
+        """
+        place = f"{self.ref.file} {self.ref.group}/{CHOICES[0]}"
+        given = parse_json(self._text(self._value(CHOICES[0])), place, list)
+        try:
+            found = read_options(given, len(LETTERS))
+        except UserError as error:
+            raise UserError(f"{place}: {error} {REMEDY}") from None
+        return [option.to_dict() for option in found]
 
     def shot(self, step: int, camera: str) -> dict[str, np.ndarray]:
         """What a camera (`front`, `wrist`) recorded at a step, and where it stood.

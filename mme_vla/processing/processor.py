@@ -35,7 +35,7 @@ class Processor(PolicyProcessor):
         image_size: s; side of the square pictures the vision tower takes, in pixels.
         tokenizer: turns prompts into ids.
         prompt: name of the prompt format (`PROMPTS`).
-        prompt_length: l; longest prompt in tokens.
+        prompt_length: longest prompt in tokens, without the options of a robot that chooses.
         subgoal_length: longest subgoal in it, in tokens; None for no limit of its own.
         action_dim: a; width of the network's actions, the robot's own padded with zeros.
         horizon: h; steps in a chunk; None for the embodiment's.
@@ -111,6 +111,11 @@ class Processor(PolicyProcessor):
         return self.prompt_format.past_actions
 
     @property
+    def longest_prompt(self) -> int:
+        """Tokens of a prompt: `prompt_length`, and what the robot's options have."""
+        return self.prompt_length + self.embodiment.action.options_length
+
+    @property
     def words_from(self) -> str:
         """The tokenizer."""
         return self.tokenizer.spec
@@ -179,7 +184,7 @@ class Processor(PolicyProcessor):
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
         given = PromptInput(goal, subgoal, normalised, past)
-        return encode_prompt(self.prompt_format, self.tokenizer, given, self.prompt_length)
+        return encode_prompt(self.prompt_format, self.tokenizer, given, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """Turn recorded actions into what the network should answer.
