@@ -1,8 +1,10 @@
 """Small HDF5 files in the layout of RoboMME's recorder, and small datasets, for tests that need no other data."""
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -23,6 +25,19 @@ def pose_at(number: int) -> np.ndarray:
     return np.array([0.1 * number, 0.2, 0.3, np.pi, 0.0, 0.01 * number, 1.0 if number % 2 else -1.0])
 
 
+OPTIONS = [
+    {"label": "a", "action": "pick up the cube", "need_parameter": True},
+    {"label": "b", "action": "press the button", "need_parameter": False},
+    {"label": "c", "action": "wait", "need_parameter": False},
+]
+
+
+def choice_at(number: int) -> dict[str, Any]:
+    """A choice: pick up, press, press again, nothing at all, and from the start; only picking up has a point."""
+    letter = ("A", "B", "B", "")[number % 4]
+    return {"choice": letter, "point": [64, 128 + number] if letter == "A" else []}
+
+
 def write_file(
     path: Path,
     lengths: Sequence[int],
@@ -31,10 +46,12 @@ def write_file(
     size: int = 16,
     poses: bool = False,
     depth: bool = False,
+    choices: bool = False,
 ) -> list[Recorded]:
     """Write an HDF5 file of random episodes: a square moves over a still background, "Complete" for the last steps.
 
     With `poses` they hold the tool's poses too, and a waypoint every fourth step: the first one after three.
+    With `choices` something is chosen every fourth step, as `choice_at` says, among `OPTIONS`.
     With `depth` both cameras look down from one metre above the table at what stands 20 cm high.
     """
     rng = np.random.default_rng(len(path.stem))
@@ -58,6 +75,8 @@ def write_file(
                 step["action/joint_action"] = actions[t]
                 if depth:
                     _add_depth(episode, step, size)
+                if choices:
+                    _add_choice(episode, step, t, t < length - 2)
                 if poses:
                     since = t - video if t >= video else t
                     step["action/eef_action"] = pose_at(t)
@@ -71,6 +90,14 @@ def write_file(
             state = np.concatenate([joints, np.full((length, 1), 0.04)], axis=1).astype(np.float32)
             recorded.append(Recorded(frames[0], frames[1], state, actions))
     return recorded
+
+
+def _add_choice(episode: h5py.Group, step: h5py.Group, t: int, goes_on: bool) -> None:
+    """What is under way at a step; the last switch, to the end of the task, is marked too, as in the official files."""
+    if t == 0:
+        episode["setup/available_multi_choices"] = json.dumps(OPTIONS)
+    step["action/choice_action"] = json.dumps(choice_at(t // 4))
+    step["info/is_subgoal_boundary"] = t % 4 == 0 or not goes_on
 
 
 def _add_depth(episode: h5py.Group, step: h5py.Group, size: int) -> None:

@@ -149,7 +149,7 @@ def test_angles_do_not_jump_and_the_gripper_of_a_waypoint_is_exactly_open_or_clo
 
 
 def test_only_robots_of_the_benchmark_can_be_evaluated_on_it() -> None:
-    spaces = ("joint_angle", "ee_pose", "waypoint")
+    spaces = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
     for name in [name for name in SHIPPED if name.startswith("robomme")]:
         check_benchmark(shipped(name), spaces)
     with pytest.raises(UserError, match="its action space is None"):

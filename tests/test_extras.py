@@ -91,6 +91,7 @@ NEED = [
     Case((), f"{PLAY} player=qwenvl", "vlm", 2),
     Case((), f"{PLAY} player=gemini", "gemini", 2),
     Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
+    Case((), f"{PLAY} player=openai", "openai", 2),
     Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
     Case((), f"mme_vla.weights.convert {STEP} jax2 --to released", "orbax", 2),
     Case((), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
@@ -114,7 +115,8 @@ def ended(tmp_path_factory: pytest.TempPathFactory) -> dict[Case, tuple[int, str
     write_file(folder / "record_dataset_Alpha.h5", [9, 7])
     path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
     variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(())), "HF_HUB_OFFLINE": "1",
-                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none"}  # fmt: skip
+                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
+                 "OPENAI_API_KEY": "none"}  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-W", "ignore", str(FOLDER / "commands.py")], input=json.dumps(asked), env=variables,
         cwd=folder, capture_output=True, text=True, timeout=550,
@@ -164,8 +166,8 @@ def test_every_command_is_among_the_cases() -> None:
 
 
 def test_each_extra_is_among_the_cases() -> None:
-    # Gemini and Weights & Biases answer only to who has a key.
-    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"dev", "gemini", "wandb"}
+    # What is behind an address answers only to who has a key.
+    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"dev", "gemini", "openai", "wandb"}
 
 
 def test_what_is_hidden_is_what_only_other_extras_bring() -> None:

@@ -13,7 +13,8 @@ from mme_vla.commands.record import record_episode
 from mme_vla.config.composition import compose
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import EpisodeRef, open_episode
+from mme_vla.data.hdf5 import open_episode
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.frames import FrameChoice

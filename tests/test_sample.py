@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import EpisodeRef, open_episode
+from mme_vla.data.hdf5 import open_episode
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.layout import SAMPLE
 from mme_vla.data.shipped_sample import EPISODES
 

@@ -46,8 +46,8 @@ def tiny():
     return VLM.load("tiny", device="cpu")
 
 
-def test_all_four_are_registered_and_built_by_name():
-    assert set(SUBGOALS) == {"oracle", "qwenvl", "gemini", "memer"}
+def test_all_are_registered_and_built_by_name():
+    assert set(SUBGOALS) == {"oracle", "qwenvl", "gemini", "memer", "openai", "notebook"}
     assert isinstance(build_predictor({"name": "oracle", "kind": "simple"}), Oracle)
     assert build_predictor({"name": "none"}) is build_predictor(None) is None
     with pytest.raises(UserError, match="'qwenvl'"):
@@ -226,10 +226,12 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
     from omegaconf import OmegaConf
 
     from mme_vla.config.composition import config_dir
-    from mme_vla.subgoal.models.api import Settings
+    from mme_vla.subgoal.models.connection import Settings
+    from mme_vla.subgoal.models.openai_chat import OpenAISettings
     from mme_vla.subgoal.qwenvl import VLMPredictor
 
     shared = {**dict.fromkeys(("qwenvl", "memer"), VLMPredictor), "gemini": Settings}
+    shared |= dict.fromkeys(("openai", "notebook"), OpenAISettings)
     for name in SUBGOALS:
         keys = dict(OmegaConf.load(config_dir() / "subgoal" / f"{name}.yaml"))
         assert keys.pop("name") == name

@@ -15,7 +15,8 @@ from mme_vla.data.cache.building import build_cache
 from mme_vla.data.cache.store import VisionCache, fingerprint
 from mme_vla.data.conversion import convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import SUBGOALS, find_files, list_episodes, open_episode
+from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.files import write_sums
 from mme_vla.memory.tokendrop import TokenDrop

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.embodiment import Camera, Embodiment
 from mme_vla.errors import UserError, brief, listed
 

@@ -15,8 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.choice_rows import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.data.columns import DRAWN
-from mme_vla.data.hdf5 import SUBGOALS, EpisodeRef, RawEpisode, any_chosen_frames, open_episode, pose_columns
+from mme_vla.data.hdf5 import all_have_choices, any_chosen_frames, open_episode, pose_columns
+from mme_vla.data.hdf5_episode import SUBGOALS, RawEpisode
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries
@@ -37,6 +40,8 @@ class ConvertOptions:
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
     poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
+    choices: a column of what was chosen among a task's options, and these options beside the tables; `convert` keeps
+        them where all episodes have them.
     keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
     partly: say in two more columns which frames were drawn; `convert` does where an episode was recorded at a choice of
         frames. The pictures of the others repeat an earlier one, and readers refuse them.
@@ -49,6 +54,7 @@ class ConvertOptions:
     pix_fmt: str = "yuv444p"
     gop: int = 8
     poses: tuple[str, ...] = ()
+    choices: bool = False
     keyframes: bool = False
     partly: bool = False
 
@@ -62,6 +68,7 @@ class ConvertOptions:
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
     """The dataset's columns, under the names of the released LeRobot datasets."""
     tool = [*POSE, "gripper"]
+    chosen = [CHOICE_ACTIONS] if options.choices else []
     joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
     kind = "video" if options.images == "video" else "image"
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
@@ -71,6 +78,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
+        **{name: {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS} for name in chosen},
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
@@ -91,7 +99,8 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     """
     if not episodes:
         raise UserError("There is no episode to convert.")
-    options = replace(options or ConvertOptions(), poses=pose_columns(episodes), partly=any_chosen_frames(episodes))
+    kept: dict[str, Any] = {"poses": pose_columns(episodes), "choices": all_have_choices(episodes)}
+    options = replace(options or ConvertOptions(), partly=any_chosen_frames(episodes), **kept)
     plan = _plan(episodes, options)
     partial = _work_folder(output)
     if _finished(output, plan) and not partial.exists():
@@ -120,8 +129,8 @@ def _work_folder(output: Path) -> Path:
 
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
-    """The options as a plan holds them; poses and keyframes stand beside them there, as plans from before had none."""
-    return {key: value for key, value in asdict(options).items() if key not in ("poses", "partly", "keyframes")}
+    """The options as a plan holds them; what plans from before had none of stands beside them there."""
+    return {k: value for k, value in asdict(options).items() if k not in ("poses", "choices", "partly", "keyframes")}
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
@@ -139,6 +148,7 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
     return (
         {"options": planned_options(options), "episodes": origins}
         | ({"poses": list(options.poses)} if options.poses else {})
+        | ({"choices": True} if options.choices else {})
         | ({"keyframes": True} if options.keyframes else {})
     )
 
@@ -210,6 +220,7 @@ def _write_part(ref: EpisodeRef, part: Path, options: ConvertOptions) -> None:
             "goals": episode.goals,
             "length": episode.length,
             "exec_start_idx": episode.exec_start,
+            **({"options": episode.options} if options.choices else {}),
             **({"frames": episode.frames} if episode.frames is not None else {}),
         }
     (draft / SIDE_FILE).write_text(json.dumps(side))
@@ -223,6 +234,8 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
     dataset = None
     goal = episode.goals[0]
     tool = {name: episode.pose_actions(name) for name in options.poses}
+    if options.choices:
+        tool[CHOICE_ACTIONS] = episode.choice_actions()
     for step, frame in enumerate(episode):
         if dataset is None:
             video = options.images == "video"

@@ -13,7 +13,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.processing.base import PolicyProcessor, Sample
-from mme_vla.processing.processor import collate as collate
+from mme_vla.processing.collating import collate as collate
 from mme_vla.processing.subgoal_text import SubgoalText
 
 
@@ -192,7 +192,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         return Sample(
             views={name: source.frames(step.episode, window, name) for name in cameras},
             states=states[window - first],
-            goal=step.goal,
+            goal=source.robot.action.worded(step.goal, source.options(step.episode)),
             subgoal=subgoal,
             past_actions=self.past_actions(step),
             actions=step.actions,

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.data.choice_rows import find_choices
 from mme_vla.data.columns import DRAWN, find_columns, width_of
-from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
     content_fingerprint,
@@ -25,7 +26,8 @@ from mme_vla.data.layout import (
 from mme_vla.data.table_files import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_motions
-from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
+from mme_vla.embodiment.options import read_options
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import Sums, decoding, read_json
 
@@ -158,6 +160,22 @@ class EpisodeSource:
         """The episode's goal in words, lower-case."""
         return self._goals[episode]
 
+    def options(self, episode: int) -> tuple[Option, ...]:
+        """What the robot could choose among in an episode; none where it does not choose.
+
+        Raises:
+            UserError: the dataset does not tell.
+        """
+        letters = len(self.robot.action.choice)
+        if not letters:
+            return ()
+        if episode >= len(self.records) or "options" not in self.records[episode]:
+            raise UserError(
+                f"{self.root / SIDE_FILE} does not say which options episode {episode} offered, and the robot "
+                f"{self.robot.name!r} chooses among them. Convert or record the dataset again."
+            )
+        return read_options(self.records[episode]["options"], letters)
+
     def states(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
         """What the robot felt, [stop − start, s] float32."""
         return self._vectors("state", episode, start, stop)
@@ -221,7 +239,8 @@ class EpisodeSource:
     def _motions_of(self, episode: int) -> Motions:
         if episode not in self._motions:
             first = int(self.exec_starts[episode])
-            self._motions[episode] = find_motions(self.actions(episode, first), first)
+            rows, letters = self.actions(episode, first), self.robot.action.choice
+            self._motions[episode] = find_choices(rows, first, letters) if letters else find_motions(rows, first)
         return self._motions[episode]
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:

@@ -1,64 +1,15 @@
-"""Reading the official demonstration files, `record_dataset_<Task>.h5`, one episode at a time."""
+"""The official demonstration files, `record_dataset_<Task>.h5`: which episodes they hold, and opening one."""
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.errors import UserError, brief
-from mme_vla.files import decoding, parse_json, require_file
-
-SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
-_REMEDY = "Download or copy the file again."
-POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
-"""Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
-FRAMES = "setup/frames"
-"""Where a file keeps the choice of frames it was recorded at, as JSON, if not all were drawn."""
-_PICTURES = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
-_REQUIRED = (
-    "obs/joint_state", "obs/gripper_state", "action/joint_action", "info/is_video_demo", "info/is_completed",
-    *(f"info/{name}" for name in SUBGOALS),
-)  # fmt: skip
-
-
-@dataclass(frozen=True)
-class EpisodeRef:
-    """Where one recorded episode lies: `group` (episode_<index>) of `file`; `task` is taken from the file's name."""
-
-    file: Path
-    index: int
-    task: str
-
-    @property
-    def group(self) -> str:
-        return f"episode_{self.index}"
-
-
-@dataclass(frozen=True)
-class RawFrame:
-    """One recorded time step. The observation was taken after the action of the same step.
-
-    front, wrist: [H, W, 3] uint8. state: [8] float32, seven joint angles and the first finger's position.
-    action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
-    is_demo: the step belongs to the conditioning video.
-    subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
-    drawn: the cameras that were drawn at this step; of the others `front` and `wrist` repeat an earlier picture (the
-        first one, before there is any).
-    """
-
-    front: np.ndarray
-    wrist: np.ndarray
-    state: np.ndarray
-    action: np.ndarray
-    is_demo: bool
-    subgoals: dict[str, str]
-    drawn: frozenset[str] = frozenset(CAMERAS)
+from mme_vla.data.hdf5_episode import CHOICES, FRAMES, POSE_ACTIONS, RawEpisode
+from mme_vla.data.hdf5_values import REMEDY, EpisodeRef
+from mme_vla.errors import UserError
+from mme_vla.files import decoding, require_file
 
 
 def find_files(inputs: Sequence[str | Path]) -> list[Path]:
@@ -85,7 +36,7 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     refs = []
     for file in files:
         task = re.sub(r"^record_dataset_", "", file.stem)
-        with _open(file) as handle, decoding(file, "HDF5", _REMEDY):
+        with _open(file) as handle, decoding(file, "HDF5", REMEDY):
             numbers = sorted(int(name[8:]) for name in handle if re.fullmatch(r"episode_\d{1,9}", name))
         if not numbers:
             raise UserError(f"{file} has no episode_<number> group: it is not a RoboMME demonstration file.")
@@ -103,6 +54,16 @@ def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
     return tuple(name for name in POSE_ACTIONS if name in found)
 
 
+def all_have_choices(refs: Sequence[EpisodeRef]) -> bool:
+    """Whether options and choices were recorded with every one of these episodes."""
+    for file in dict.fromkeys(ref.file for ref in refs):
+        with _open(file) as handle:
+            groups = [ref.group for ref in refs if ref.file == file]
+            if not all(f"{group}/{name}" in handle for group in groups for name in CHOICES):
+                return False
+    return True
+
+
 def any_chosen_frames(refs: Sequence[EpisodeRef]) -> bool:
     """Whether one of these episodes was drawn at a choice of its frames only."""
     for file in dict.fromkeys(ref.file for ref in refs):
@@ -110,231 +71,6 @@ def any_chosen_frames(refs: Sequence[EpisodeRef]) -> bool:
             if any(f"{ref.group}/{FRAMES}" in handle for ref in refs if ref.file == file):
                 return True
     return False
-
-
-class RawEpisode:
-    """An open episode. Use `with open_episode(ref) as episode`; frames are read one by one, on demand."""
-
-    def __init__(self, ref: EpisodeRef, group: Any) -> None:
-        self.ref = ref
-        self._group = group
-        with decoding(f"{ref.file} {ref.group}", "an episode", _REMEDY):
-            steps = sorted(int(name[9:]) for name in group if re.fullmatch(r"timestep_\d{1,9}", name))
-        if steps != list(range(len(steps))) or not steps:
-            raise UserError(
-                f"{ref.file} {ref.group}: expected timestep_0 … timestep_{max(len(steps) - 1, 0)} without gaps, found "
-                f"{len(steps)} steps{f', the last is {steps[-1]}' if steps else ''}. The file is damaged."
-            )
-        self.length = len(steps)
-        with decoding(f"{ref.file} {ref.group}", "an episode", _REMEDY):
-            # A recording at a chosen list of frames has pictures at these alone.
-            pictures = () if FRAMES in group else _PICTURES.values()
-            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*pictures, *_REQUIRED)))
-            missing = [name for name in needed if name not in group]
-        if missing:
-            raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
-        demo = np.array([self._flag(k, "info/is_video_demo") for k in range(self.length)])
-        self.exec_start = int(demo.sum())
-        if demo[self.exec_start :].any() or self.exec_start == self.length:
-            raise UserError(f"{ref.file} {ref.group}: video frames must come first, then at least one execution frame.")
-
-    def _step(self, step: int, name: str) -> Any:
-        return self._value(f"timestep_{step}/{name}")
-
-    def _value(self, name: str) -> Any:
-        place = f"{self.ref.file} {self.ref.group}/{name}"
-        with decoding(place, "a dataset of HDF5", _REMEDY):
-            return self._group[name][()]
-
-    def _numbers(self, step: int, name: str, least: int, finite: bool = True) -> np.ndarray:
-        """A list of at least `least` numbers, finite unless told otherwise."""
-        found = np.atleast_1d(np.asarray(self._step(step, name)))
-        right = found.dtype.kind in "fiu" and found.ndim == 1 and len(found) >= least
-        if not right or (finite and not np.isfinite(found).all()):
-            raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected at "
-                f"least {least} {'finite ' if finite else ''}numbers. {_REMEDY}"
-            )
-        return found
-
-    def _picture(self, step: int, camera: str) -> np.ndarray:
-        name = _PICTURES[camera]
-        if self.frames is not None and not self.drawn[camera][step]:
-            raise UserError(
-                f"{self.ref.file} {self.ref.group}: {camera} was not drawn at step {step}; the episode was recorded "
-                f"with frames={self.frames['at']}."
-            )
-        found = np.asarray(self._step(step, name))
-        if found.dtype != np.uint8 or found.ndim != 3 or found.shape[-1] != 3:
-            raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {found.dtype} {list(found.shape)}; "
-                f"expected uint8 [height, width, 3]. {_REMEDY}"
-            )
-        return found
-
-    def _flag(self, step: int, name: str) -> bool:
-        found = np.asarray(self._step(step, name))
-        if found.size != 1 or found.dtype.kind not in "biu":
-            raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected a "
-                f"flag. {_REMEDY}"
-            )
-        return bool(found.reshape(-1)[0])
-
-    def _text(self, value: Any) -> str:
-        if not isinstance(value, bytes | str):
-            raise UserError(f"{self.ref.file} {self.ref.group} has {brief(value)} for a text. {_REMEDY}")
-        try:
-            return value.decode("utf-8") if isinstance(value, bytes) else value.encode().decode()
-        except UnicodeError:
-            raise UserError(f"{self.ref.file} {self.ref.group} has a text that is not UTF-8. {_REMEDY}") from None
-
-    @property
-    def goals(self) -> list[str]:
-        """All wordings of the goal, lower-case; the first is the one to train with."""
-        goals = [self._text(goal).lower() for goal in np.atleast_1d(self._value("setup/task_goal"))]
-        if not goals:
-            raise UserError(f"{self.ref.file} {self.ref.group}/setup/task_goal is empty. {_REMEDY}")
-        return goals
-
-    @property
-    def seed(self) -> int | None:
-        if "setup/seed" not in self._group:
-            return None
-        found = np.asarray(self._value("setup/seed"))
-        if found.size != 1 or found.dtype.kind not in "iu":
-            raise UserError(f"{self.ref.file} {self.ref.group}/setup/seed is {brief(found.tolist())}. {_REMEDY}")
-        return int(found.reshape(-1)[0])
-
-    @property
-    def difficulty(self) -> str | None:
-        return self._text(self._value("setup/difficulty")) if "setup/difficulty" in self._group else None
-
-    def __len__(self) -> int:
-        return self.length
-
-    @cached_property
-    def frames(self) -> dict[str, Any] | None:
-        """The choice of frames it was recorded at; None for one that was drawn whole."""
-        if FRAMES not in self._group:
-            return None
-        found: dict[str, Any] = parse_json(
-            self._text(self._value(FRAMES)), f"{self.ref.file} {self.ref.group}/{FRAMES}"
-        )
-        return found
-
-    @cached_property
-    def drawn(self) -> dict[str, np.ndarray]:
-        """Which steps each camera shows, bool [t]."""
-        if self.frames is None:
-            return {camera: np.ones(self.length, bool) for camera in CAMERAS}
-        return {
-            camera: np.array([f"timestep_{k}/{name}" in self._group for k in range(self.length)])
-            for camera, name in _PICTURES.items()
-        }
-
-    def subgoals(self) -> Iterator[dict[str, str]]:
-        """The four texts of every step, as in `RawFrame`, without reading pictures."""
-        subgoals: dict[str, str] = {}
-        for k in range(self.length):
-            if not subgoals or not self._flag(k, "info/is_completed"):
-                subgoals = {name: self._text(self._step(k, f"info/{name}")).lower() for name in SUBGOALS}
-            yield subgoals
-
-    def joints(self) -> tuple[np.ndarray, np.ndarray]:
-        """Joint angles and joint targets of every step, [t, 7] each, in the file's own precision."""
-        angles = [self._numbers(k, "obs/joint_state", 7)[:7] for k in range(self.length)]
-        targets = [self._numbers(k, "action/joint_action", 7)[:7] for k in range(self.length)]
-        return np.stack(angles), np.stack(targets)
-
-    def pose_actions(self, column: str) -> np.ndarray:
-        """A column of `POSE_ACTIONS`, [t, 7] float32.
-
-        Of waypoints, which are noted when a motion begins: the one under way, and before the first one of the video
-        or the execution that first one; a part without any is one motion to where it ends.
-
-        Raises:
-            UserError: a step has no 7 numbers, or none that are finite where there is no motion to take them from.
-        """
-        steps = [self._numbers(k, POSE_ACTIONS[column], 7, finite=False)[:7] for k in range(self.length)]
-        return known_poses(
-            np.stack(steps), self.exec_start, lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7)[:7]
-        )
-
-    def shot(self, step: int, camera: str) -> dict[str, np.ndarray]:
-        """What a camera (`front`, `wrist`) recorded at a step, and where it stood.
-
-        Returns:
-            `colours` [H, W, 3] uint8; `depth` [H, W] float32 in millimetres; `intrinsic` [3, 3] and the world-to-camera
-            `extrinsic` [3, 4] float64.
-
-        Raises:
-            UserError: the episode holds no depth or no poses of cameras, or something else in their place.
-        """
-        colours = self._picture(step, camera)
-        parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
-                 "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
-        missing = [name for name in parts.values() if name not in self._group]
-        if missing:
-            raise UserError(f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
-        found = {name: np.asarray(self._value(place)) for name, place in parts.items()}
-        found["depth"] = found["depth"].reshape(found["depth"].shape[:2])
-        shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
-        for name, shape in shapes.items():
-            numbers = found[name].dtype.kind in "fiu" and np.isfinite(found[name]).all()
-            if found[name].shape != shape or not numbers:
-                raise UserError(
-                    f"{self.ref.file} {self.ref.group}/{parts[name]} holds {found[name].dtype} "
-                    f"{list(found[name].shape)}; expected {list(shape)} finite numbers. {_REMEDY}"
-                )
-        kinds = {"depth": np.float32, "intrinsic": np.float64, "extrinsic": np.float64}
-        return {"colours": colours, **{name: found[name].astype(kind) for name, kind in kinds.items()}}
-
-    def commanded_open(self, step: int) -> bool:
-        """Whether the gripper's command at a step is to be open."""
-        return bool(self._numbers(step, "action/joint_action", 8)[7] > 0)
-
-    def front(self, step: int) -> np.ndarray:
-        """The front picture of one step, [H, W, 3] uint8."""
-        return self._picture(step, "front")
-
-    def __iter__(self) -> Iterator[RawFrame]:
-        for camera, drawn in self.drawn.items():
-            if not drawn.any():
-                raise UserError(f"{self.ref.file} {self.ref.group} has no picture of the camera {camera!r}. {_REMEDY}")
-        held = {camera: self._picture(int(drawn.argmax()), camera) for camera, drawn in self.drawn.items()}
-        for k, subgoals in enumerate(self.subgoals()):
-            fingers = self._numbers(k, "obs/gripper_state", 1)
-            now = frozenset(camera for camera, drawn in self.drawn.items() if drawn[k])
-            held |= {camera: self._picture(k, camera) for camera in now}
-            yield RawFrame(
-                **held,
-                drawn=now,
-                state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers[:1]]).astype(np.float32),
-                action=self._numbers(k, "action/joint_action", 8),
-                is_demo=k < self.exec_start,
-                subgoals=subgoals,
-            )
-
-
-def known_poses(noted: np.ndarray, exec_start: int, reached: Callable[[int], np.ndarray]) -> np.ndarray:
-    """Poses of every step from those that were noted; see `RawEpisode.pose_actions`.
-
-    Args:
-        noted: [t, 7], NaN where there was none yet. exec_start: the first execution step.
-        reached: the pose [7] that a step's action asks for, by its number.
-
-    Returns:
-        [t, 7] float32.
-    """
-    rows = noted.astype(np.float32)
-    for part in (slice(0, exec_start), slice(exec_start, len(rows))):
-        unknown = np.count_nonzero(np.isfinite(rows[part]), axis=1) < rows.shape[1]
-        if part.stop > part.start and unknown.all():
-            rows[part] = reached(part.stop - 1)
-        elif unknown.any():
-            rows[part][unknown] = rows[part][~unknown][0]
-    return rows
 
 
 @contextmanager
@@ -345,7 +81,7 @@ def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
         UserError: the file or the episode is damaged or has another layout; the message names the place.
     """
     with _open(ref.file) as handle:
-        with decoding(ref.file, "HDF5", _REMEDY):
+        with decoding(ref.file, "HDF5", REMEDY):
             group = handle.get(ref.group)
         if group is None:
             raise UserError(f"{ref.file} has no {ref.group}.")
@@ -356,7 +92,7 @@ def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
 def _open(file: Path) -> Iterator[Any]:
     import h5py
 
-    with decoding(require_file(file, "HDF5"), "HDF5", _REMEDY):
+    with decoding(require_file(file, "HDF5"), "HDF5", REMEDY):
         handle = h5py.File(file, "r")
     with handle:
         yield handle

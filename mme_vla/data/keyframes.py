@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import RawEpisode
+from mme_vla.data.hdf5_episode import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError

@@ -4,7 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mme_vla.data.hdf5 import EpisodeRef, RawFrame, open_episode
+from mme_vla.data.hdf5 import open_episode
+from mme_vla.data.hdf5_episode import RawFrame
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.media import RED, Tile, contact_sheet, film_frame, spread, write_film
 
 if TYPE_CHECKING:

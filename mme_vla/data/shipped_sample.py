@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from mme_vla.data.conversion import ConvertOptions, convert
-from mme_vla.data.hdf5 import EpisodeRef
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.layout import SAMPLE
 from mme_vla.errors import UserError
 

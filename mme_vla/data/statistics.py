@@ -9,7 +9,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.progress import progress
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import ExactStats, NormStats, RunningStats
+from mme_vla.processing.normalisers import ExactStats, NormStats, QuantileStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 
@@ -30,6 +30,7 @@ def compute_norm_stats(
 
     As released: one pass over all execution steps in shuffled order, in batches of 128 of which an incomplete last one
     is left out (unless it is the only one), every step of every chunk counted, repeated last actions included.
+    Numbers of which one is 1, the letters of a choice, go from 0 to 1 whatever the data hold.
 
     Args:
         sources: the datasets.
@@ -58,7 +59,17 @@ def compute_norm_stats(
             states.update(state.numpy())
             actions.update(robot.action.to_relative(chunk, state).numpy())
             advance(1)
-    return NormStats(state=states.result(extremes), actions=actions.result(extremes))
+    letters = list(robot.action.choice)
+    return NormStats(state=states.result(extremes), actions=_of_letters(actions.result(extremes), letters))
+
+
+def _of_letters(stats: QuantileStats, letters: list[int]) -> QuantileStats:
+    """Statistics in which these numbers go from 0 to 1: a letter that is seldom chosen would else have no range."""
+    found = stats.to_dict()
+    for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
+        for place in letters if name in found else ():
+            found[name][place] = value
+    return QuantileStats.from_dict(found)
 
 
 def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:

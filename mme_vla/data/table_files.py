@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import SUBGOALS
+from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.errors import UserError, brief
 from mme_vla.files import decoding, inside, require_file
 

@@ -1,5 +1,6 @@
 """Episodes as a sequence of planned motions: where each was decided, and where it was to end."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,3 +49,23 @@ def find_motions(rows: np.ndarray, first: int) -> Motions:
     if len(decisions):
         decisions[0] = 0
     return Motions(decisions.astype(np.int64) + first, targets[new].astype(np.float32))
+
+
+def known_poses(noted: np.ndarray, exec_start: int, reached: Callable[[int], np.ndarray]) -> np.ndarray:
+    """Poses of every step from those that were noted; see `RawEpisode.pose_actions`.
+
+    Args:
+        noted: [t, 7], NaN where there was none yet. exec_start: the first execution step.
+        reached: the pose [7] that a step's action asks for, by its number.
+
+    Returns:
+        [t, 7] float32.
+    """
+    rows = noted.astype(np.float32)
+    for part in (slice(0, exec_start), slice(exec_start, len(rows))):
+        unknown = np.count_nonzero(np.isfinite(rows[part]), axis=1) < rows.shape[1]
+        if part.stop > part.start and unknown.all():
+            rows[part] = reached(part.stop - 1)
+        elif unknown.any():
+            rows[part][unknown] = rows[part][~unknown][0]
+    return rows

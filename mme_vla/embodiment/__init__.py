@@ -2,6 +2,7 @@
 
 from mme_vla.embodiment.actions import ActionSpace
 from mme_vla.embodiment.base import Camera, Embodiment, State
+from mme_vla.embodiment.options import Option
 from mme_vla.embodiment.robomme import ROBOMME_JOINT
 
-__all__ = ["ROBOMME_JOINT", "ActionSpace", "Camera", "Embodiment", "State"]
+__all__ = ["ROBOMME_JOINT", "ActionSpace", "Camera", "Embodiment", "Option", "State"]

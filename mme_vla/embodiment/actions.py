@@ -1,12 +1,14 @@
 """`ActionSpace`: what the numbers of an action mean, as recorded, as predicted and as commanded."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Self
 
 from mme_vla.config.sections import section_keys
 from mme_vla.embodiment import fields
+from mme_vla.embodiment.options import Option, in_words
 from mme_vla.errors import UserError, brief
 
 if TYPE_CHECKING:
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
 
 _KEYS = (
     "key", "space", "width", "names", "units", "relative", "angles", "binary", "horizon", "execute", "frames",
+    "choice", "point", "options_length",
 )  # fmt: skip
 
 
@@ -29,6 +32,10 @@ class ActionSpace:
     binary: numbers that are commanded as −1 or 1 and nothing between.
     horizon: h; actions of a chunk. execute: how many of them are executed before the policy is asked again.
     frames: camera frames an action takes; None where an action is one planned motion of any length.
+    choice: numbers of which one is 1 and the others 0, the letters a, b, … of the options that an episode offers; what
+        is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1], never by statistics.
+    point: the two numbers that say where in the memory camera's picture: y and x as shares of its height and width.
+    options_length: tokens that the prompt has for the options, beside the processor's `prompt_length`.
     """
 
     width: int
@@ -42,6 +49,9 @@ class ActionSpace:
     horizon: int = 20
     execute: int = 16
     frames: int | None = 1
+    choice: tuple[int, ...] = ()
+    point: tuple[int, ...] = ()
+    options_length: int = 0
 
     @classmethod
     def from_dict(cls, given: Any, state_width: int) -> Self:
@@ -60,6 +70,7 @@ class ActionSpace:
         frames = found.get("frames", 1)
         if frames not in (1, None):
             raise UserError(f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion.")
+        choice, point, length = _choices(found, where, width)
         return cls(
             width=width,
             key=fields.columns(found.get("key"), f"{where}.key"),
@@ -72,13 +83,22 @@ class ActionSpace:
             horizon=horizon,
             execute=execute,
             frames=frames,
+            choice=choice,
+            point=point,
+            options_length=length,
         )
 
     def to_dict(self) -> dict[str, Any]:
         """The section that `from_dict` reads, fit for JSON."""
         listed = {name: list(getattr(self, name)) for name in ("key", "names", "units", "relative", "binary")}
         plain = {name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")}
-        return {**plain, **listed, "angles": {str(place): centre for place, centre in self.angles.items()}}
+        chosen = {"choice": list(self.choice), "point": list(self.point), "options_length": self.options_length}
+        return {
+            **plain,
+            **listed,
+            "angles": {str(place): centre for place, centre in self.angles.items()},
+            **(chosen if self.choice else {}),  # which robots of earlier versions did not say
+        }
 
     def to_relative(self, actions: "Tensor", state: "Tensor") -> "Tensor":
         """Express a chunk as it is predicted: relative to one state, the same reference for all its steps.
@@ -107,3 +127,53 @@ class ActionSpace:
             places = list(self.binary)
             out[..., places] = 1.0 - 2.0 * (out[..., places] < 0).to(out)
         return out
+
+    def worded(self, goal: str, options: Sequence[Option]) -> str:
+        """The goal as the policy reads it: where it chooses among options, they stand behind it.
+
+        Raises:
+            UserError: the episode says nothing of its options.
+        """
+        if not self.choice:
+            return goal
+        if not options:
+            raise UserError(
+                "This policy chooses among options, and the episode offers none: set episode.options. The "
+                "benchmark's are info['available_multi_choices'] of the action space multi_choice."
+            )
+        return f"{goal.rstrip(' .')}. Options: {in_words(options)}"
+
+    def decide(self, actions: "Tensor", options: Sequence[Option]) -> "Tensor":
+        """Turn the scores of letters into choices: the best of those offered is 1, all others are 0.
+
+        Args:
+            actions: [..., w] absolute. options: what the episode offers.
+
+        Returns:
+            [..., w], the point within the picture; `actions` themselves where nothing is chosen.
+        """
+        if not self.choice:
+            return actions
+        out = actions.clone()
+        offered = [self.choice[option.number] for option in options]
+        best = actions[..., offered].argmax(-1, keepdim=True)
+        out[..., list(self.choice)] = 0
+        out[..., offered] = out[..., offered].scatter(-1, best, 1)
+        out[..., list(self.point)] = out[..., list(self.point)].clamp(0, 1)
+        return out
+
+
+def _choices(found: Mapping[str, Any], where: str, width: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+    """`choice`, `point` and `options_length`."""
+    choice = fields.places(found.get("choice"), f"{where}.choice", width)
+    point = fields.places(found.get("point"), f"{where}.point", width)
+    if len(point) not in (0, 2) or set(point) & set(choice) or (point and not choice):
+        raise UserError(
+            f"{where}.point={brief(found.get('point'))}: expected the two numbers y, x beside the choice's."
+        )
+    if len(choice) > len(ascii_lowercase) or (choice and found.get("frames", 1) is not None):
+        raise UserError(
+            f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length: frames=null."
+        )
+    length = found.get("options_length", 0)
+    return choice, point, fields.whole(length, f"{where}.options_length") if length else 0

@@ -1,12 +1,14 @@
 """RoboMME's Panda in joint space: the robot of every checkpoint that does not say what robot it is for."""
 
 from collections.abc import Mapping, Sequence
+from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
 
 from mme_vla.embodiment.actions import ActionSpace
 from mme_vla.embodiment.base import Camera, Embodiment, State
+from mme_vla.embodiment.options import MIDDLE
 from mme_vla.errors import UserError
 
 ARM_JOINTS = 7
@@ -16,6 +18,8 @@ CAMERAS = ("front", "wrist")
 """What the benchmark's environments show."""
 SIDE = 256
 """Of the benchmark's pictures, in pixels; points of subgoals and choices are pixels of its front picture."""
+LETTERS = "abcdefgh"
+"""Of the options that a task can offer."""
 
 ROBOMME_JOINT = Embodiment(
     name="robomme_joint",
@@ -51,6 +55,33 @@ def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
     if {"action_dim", "horizon"} <= set(backbone):
         found.check_network(backbone["action_dim"], backbone["horizon"])
     return found
+
+
+def benchmark_action(space: ActionSpace, action: np.ndarray, stick: bool = False) -> np.ndarray | dict[str, Any]:
+    """What an environment of the benchmark takes for an action [w] of a policy.
+
+    Args:
+        stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
+
+    Returns:
+        The numbers; or `{"choice": "A", "point": [y, x]}`, in pixels of the front picture.
+    """
+    if not space.choice:
+        return action[: space.width - stick]
+    letter = ascii_uppercase[int(np.argmax(action[list(space.choice)]))]
+    return {"choice": letter, "point": [float(share) * SIDE for share in action[list(space.point)]]}
+
+
+def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
+    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of the picture.
+
+    Args:
+        letter: `a` to `h`. point: y and x in pixels of the front picture; empty for a choice that needs none.
+    """
+    row = np.zeros(len(LETTERS) + 2, np.float32)
+    row[LETTERS.index(letter)] = 1
+    row[len(LETTERS) :] = np.divide(point, SIDE) if len(point) else MIDDLE
+    return row
 
 
 def benchmark_state(joints: Sequence[float] | np.ndarray, fingers: Sequence[float] | np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ from mme_vla.errors import UserError, brief
 from mme_vla.files import draft_of, plain, read_json, remove_drafts, sealed, unsealed
 
 RUN_FILE = "run.json"
-INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "timeout", "retries", "backoff",
+INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base_url", "timeout", "retries", "backoff",
                "requests_per_minute", "input_price", "output_price")  # fmt: skip
 """Options of a model that predicts or plays which do not decide what it says, and may differ when a run goes on."""
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment.options import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
@@ -31,15 +32,6 @@ class EpisodeId:
     episode: int
     seed: int
     difficulty: str
-
-
-@dataclass(frozen=True)
-class Option:
-    """One action that can be chosen. label: its lower-case letter. needs_point: a pixel must come with it."""
-
-    label: str
-    action: str
-    needs_point: bool
 
 
 @dataclass(frozen=True)

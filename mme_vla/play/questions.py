@@ -8,10 +8,11 @@ import re
 from collections.abc import Sequence
 from typing import Any
 
+from mme_vla.embodiment.options import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, brief
 from mme_vla.files import parse_json
-from mme_vla.play.game import Decision, Option
+from mme_vla.play.game import Decision
 from mme_vla.subgoal.words.parsing import THOUSAND, MalformedAnswer, to_pixels, to_thousandths
 from mme_vla.subgoal.words.prompts import IMAGE, VIDEO
 

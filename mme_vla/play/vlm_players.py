@@ -6,14 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.play import questions as prompts
 from mme_vla.play.game import ChoiceSession
 from mme_vla.play.players import PLAYERS, NoChoiceError, Player
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.clips import Clip, sample_video
-from mme_vla.subgoal.models.api import Api, ApiFailure, Settings
+from mme_vla.subgoal.models.api import ApiFailure, make_api
 from mme_vla.subgoal.models.qwen3vl import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
 from mme_vla.subgoal.words.parsing import MalformedAnswer
 
@@ -138,13 +137,15 @@ class GeminiPlayer(ModelPlayer):
     Args:
         tries: answers that may be unusable in a row.
         client: an object with google-genai's `client.models.generate_content`; None makes one.
-        settings: keys of `mme_vla.subgoal.models.api.Settings`.
+        settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
 
+    speaks = "gemini"
+
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
-        asked = read_section(Settings, settings, "player")
-        super().__init__(asked.model, tries)
-        self.api = Api(asked, self.usage, client)
+        super().__init__("", tries)
+        self.api = make_api(self.speaks, settings, "player", self.usage, client)
+        self.model = self.api.settings.model
         self._turns: list[tuple[str, list[Any]]] = []
 
     def start(self, session: ChoiceSession) -> None:
@@ -173,6 +174,17 @@ class GeminiPlayer(ModelPlayer):
             frames = session.reveals[-1].frames
             text = prompts.following(session.decisions[-1], session.options, bool(len(frames)))
         return [*_clip(frames), session.frame, text]
+
+
+@PLAYERS.register("openai")
+class OpenAIPlayer(GeminiPlayer):
+    """The same conversation with any endpoint that speaks OpenAI's chat completions; videos are shown as pictures.
+
+    client: an object with openai's `client.chat.completions.create`; None makes one.
+    settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.
+    """
+
+    speaks = "openai"
 
 
 def _clip(frames: Any) -> list[np.ndarray]:

@@ -114,8 +114,10 @@ class Policy(Saved):
             chunk = self.answer(batch, episodes, draws, steps).float().cpu()
         finally:
             self.train(was_training)
-        states = torch.stack([e.state for e in episodes])
-        actions = processor.absolute_actions(chunk, states).numpy()[:, self.skipped :]
+        states, space = torch.stack([e.state for e in episodes]), self.embodiment.action
+        absolute = processor.absolute_actions(chunk, states)
+        decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
+        actions = torch.stack(decided).numpy()[:, self.skipped :]
         for episode, chosen in zip(episodes, actions, strict=True):
             episode.acted(chosen)
         return actions

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.processing.limits import check_reach, finite_array
@@ -49,6 +49,8 @@ class Episode:
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
+        self.options: tuple[Option, ...] = ()
+        """What can be chosen, for policies that choose; set it before `act`."""
         memory = policy.memory
         self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
         self.stream = None if memory is None else memory.start_stream()
@@ -229,7 +231,8 @@ class Episode:
     def prompt(self) -> Any:
         """What the policy reads of the goal, and of the subgoal where it reads one."""
         processor, state = self._policy.require_processor(), self._seen[-1][1] if self._seen else None
-        return processor.prompt(self.goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
+        goal = self._robot.action.worded(self.goal, self.options)
+        return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
 
     def acted(self, chunk: np.ndarray) -> None:
         """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""

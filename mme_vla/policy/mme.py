@@ -299,7 +299,7 @@ class MMEPolicy(Policy):
         )
 
     def _prompt_length(self) -> int:
-        return int(self.config["processor"]["prompt_length"])
+        return int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
 
     def see_empty_frame(self) -> None:
         """Run the vision tower on one black memory frame."""

@@ -12,21 +12,19 @@ from torch import Tensor
 from mme_vla.backbone.shape import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.files import check_sums, inside
-from mme_vla.memory.base import stack_history
-from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, PolicyProcessor, Sample, read_settings
+from mme_vla.errors import UserError, brief
+from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, PolicyProcessor, Sample
+from mme_vla.processing.collating import collate
 from mme_vla.processing.normalisers import NormStats, normalize, unnormalize
 from mme_vla.processing.padding import pad_width
 from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
+from mme_vla.processing.processor_files import TOKENIZER_FILE, constructor_settings, own_settings
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
-from mme_vla.processing.tokenizer import HUB, PALIGEMMA, SAMPLE, Tokenizer
+from mme_vla.processing.tokenizer import HUB, Tokenizer
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch
 
-TOKENIZER_FILE = "tokenizer.model"
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
-OLD_VIEWS = ["base_0_rgb", "left_wrist_0_rgb"]  # what processors named before robots could be chosen: front and wrist
 
 
 @PROCESSORS.register("pi05")
@@ -37,7 +35,7 @@ class Processor(PolicyProcessor):
         image_size: s; side of the square pictures the vision tower takes, in pixels.
         tokenizer: turns prompts into ids.
         prompt: name of the prompt format (`PROMPTS`).
-        prompt_length: l; longest prompt in tokens.
+        prompt_length: longest prompt in tokens, without the options of a robot that chooses.
         subgoal_length: longest subgoal in it, in tokens; None for no limit of its own.
         action_dim: a; width of the network's actions, the robot's own padded with zeros.
         horizon: h; steps in a chunk; None for the embodiment's.
@@ -113,6 +111,11 @@ class Processor(PolicyProcessor):
         return self.prompt_format.past_actions
 
     @property
+    def longest_prompt(self) -> int:
+        """Tokens of a prompt: `prompt_length`, and what the robot's options have."""
+        return self.prompt_length + self.embodiment.action.options_length
+
+    @property
     def words_from(self) -> str:
         """The tokenizer."""
         return self.tokenizer.spec
@@ -181,7 +184,7 @@ class Processor(PolicyProcessor):
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
         given = PromptInput(goal, subgoal, normalised, past)
-        return encode_prompt(self.prompt_format, self.tokenizer, given, self.prompt_length)
+        return encode_prompt(self.prompt_format, self.tokenizer, given, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """Turn recorded actions into what the network should answer.
@@ -268,31 +271,7 @@ class Processor(PolicyProcessor):
         Raises:
             UserError: an unknown, missing or impossible entry.
         """
-        settings = dict(config)
-        known = {*inspect.signature(cls).parameters, "tokenizer_fingerprint", "views"}
-        for key in settings:
-            if key not in known:
-                raise UserError(f"Unknown processor setting {brief(key)}. {did_you_mean(str(key), known)}")
-        for key in ("image_size", "tokenizer"):
-            if key not in settings:
-                raise UserError(f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
-        PROMPTS[str(settings.get("prompt", "plain"))]  # a misspelt name is told before any file is read
-        fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
-        if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
-            raise UserError(f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now.")
-        if (robot := settings.pop("embodiment", None)) is not None:
-            settings["embodiment"] = Embodiment.from_dict(robot)
-        tokenizer = Tokenizer.load(settings.pop("tokenizer"))
-        if fingerprint is not None and tokenizer.fingerprint != fingerprint:
-            raise UserError(
-                f"The tokenizer {tokenizer.spec!r} has fingerprint {tokenizer.fingerprint}, but {brief(fingerprint)} "
-                "was used in training: its ids would mean other words. Give the file that was used."
-            )
-        return cls(
-            **settings,
-            tokenizer=tokenizer,
-            stats=None if stats is None else NormStats.load(stats),
-        )
+        return cls(**constructor_settings(config, inspect.signature(cls).parameters))
 
     def save(self, folder: Path | str) -> list[str]:
         """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the names of the files."""
@@ -313,65 +292,11 @@ class Processor(PolicyProcessor):
         Raises:
             UserError: `folder` holds no processor, a damaged one, or one that names files elsewhere.
         """
-        folder = Path(folder)
-        path, config = folder / CONFIG_FILE, read_settings(folder)
-        named, stats = config.get("tokenizer", ""), config.get("stats")
-        if tokenizer is None:
-            tokenizer = _own_tokenizer(folder, named)
-        if stats is not None:
-            stats = _own_file(folder, stats, "statistics")
+        config = own_settings(Path(folder), tokenizer)
         try:
-            return cls.from_config({**config, "tokenizer": tokenizer, "stats": stats})
+            return cls.from_config(config)
         except UserError as error:
-            raise UserError(f"{path}: {error}") from None
-
-
-def collate(items: Sequence[dict[str, Any]]) -> Batch:
-    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
-
-    def stack(name: str) -> Tensor:
-        return torch.stack([item[name] for item in items])
-
-    images = stack("images")
-    batch = Batch(
-        images=images,
-        image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
-        prompt=stack("prompt"),
-        prompt_mask=stack("prompt_mask"),
-        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
-        actions=stack("actions"),
-        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
-        state=stack("state"),
-    )
-    return batch.without_prompt_padding()
-
-
-def _own_file(folder: Path, name: Any, what: str) -> Path:
-    """The path of a file that a checkpoint names in itself, compared with its checksum where there is one."""
-    if not isinstance(name, str):
-        raise UserError(f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
-    path = inside(folder, name, what)
-    check_sums(folder, [name])
-    return path
-
-
-def _own_tokenizer(folder: Path, name: Any) -> str | Path:
-    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address.
-
-    Raises:
-        UserError: it names another file of the hub, which nothing is asked for on a stranger's word.
-    """
-    if name in (SAMPLE, PALIGEMMA):
-        return str(name)
-    if isinstance(name, str) and name.startswith(HUB):
-        if (folder / TOKENIZER_FILE).is_file():
-            return _own_file(folder, TOKENIZER_FILE, "tokenizer")
-        raise UserError(
-            f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not fetched on a "
-            f"checkpoint's word. If you trust it: from_pretrained(…, tokenizer={brief(name, 200)}), or download that "
-            f"file into the folder as {TOKENIZER_FILE}."
-        )
-    return _own_file(folder, name, "tokenizer")
+            raise UserError(f"{Path(folder) / CONFIG_FILE}: {error}") from None
 
 
 def _float(x: np.ndarray | Tensor) -> Tensor:

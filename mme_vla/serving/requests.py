@@ -10,11 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
+from mme_vla.embodiment.options import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
 from mme_vla.errors import UserError, did_you_mean
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
+OPTIONS = "available_multi_choices"  # beside an observation, for policies that choose; the benchmark's name
 PICTURES = {"front": "observation/image", "wrist": "observation/wrist_image"}  # openpi's names of RoboMME's cameras
 MOST_GOAL = 4000  # characters
 SIDES = (8, 4096)  # pixels of a picture's side
@@ -45,6 +47,7 @@ class Infer:
     pictures: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind, those given.
     frames: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
     first: whether the message begins an episode; None where the schema does not say.
+    options: what can be chosen, for a policy that chooses; none where they stay as they were.
     """
 
     pictures: Mapping[str, np.ndarray]
@@ -53,6 +56,7 @@ class Infer:
     subgoals: Mapping[str, str] = field(default_factory=dict)
     frames: Sequence[np.ndarray] | None = None
     first: bool | None = None
+    options: tuple[Option, ...] = ()
 
 
 Request = Reset | AddBuffer | Infer
@@ -119,7 +123,8 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
     state = _numbers("observation/state", _array(message, "observation/state"))
     if state.shape != (robot.state.width,):
         raise UserError(f"observation/state must be [{robot.state.width}], got {list(state.shape)}.")
-    return Infer(pictures, state, _text("prompt", _get(message, "prompt")), _subgoals(message))
+    goal, options = _text("prompt", _get(message, "prompt")), _options(message, robot)
+    return Infer(pictures, state, goal, _subgoals(message), options=options)
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
@@ -140,11 +145,18 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
     goal = _text("task_goal", _get(message, "task_goal"))
     state = benchmark_state(joints[-1], grippers[-1])
     pictures = {name: view[-1] for name, view in views.items()}
-    return Infer(pictures, state, goal, _subgoals(message), views[robot.memory_camera], bool(first))
+    frames, options = views[robot.memory_camera], _options(message, robot)
+    return Infer(pictures, state, goal, _subgoals(message), frames, bool(first), options)
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:
     return {key: _text(key, message[key]) for key in SUBGOALS if message.get(key) is not None}
+
+
+def _options(message: dict[Any, Any], robot: Embodiment) -> tuple[Option, ...]:
+    """What the message offers to a robot that chooses; others are not offered anything."""
+    letters = len(robot.action.choice)
+    return read_options(message[OPTIONS], letters) if letters and message.get(OPTIONS) is not None else ()
 
 
 def _get(message: dict[Any, Any], key: str) -> Any:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment.robomme import benchmark_action
 from mme_vla.errors import UserError
 from mme_vla.processing.subgoal_text import subgoal_kind
 from mme_vla.serving.codec import unpack
@@ -69,7 +70,9 @@ class Session:
             await self._add(request)
             return {"add_buffer_finished": True, "add_buffer_time_ms": self._took("add_buffer", begun)}
         actions = await self._infer(request)
-        return {"actions": actions, "infer_time_ms": self._took("infer", begun)}
+        space = self._engine.policy.embodiment.action
+        chosen = {"choices": [benchmark_action(space, row) for row in actions]} if space.choice else {}
+        return {"actions": actions, **chosen, "infer_time_ms": self._took("infer", begun)}
 
     def _took(self, kind: str, begun: float) -> float:
         seconds = time.perf_counter() - begun
@@ -104,6 +107,7 @@ class Session:
             )
         episode = self.episode
         episode.goal, episode.subgoal = request.goal, self._subgoal(request)
+        episode.options = request.options or episode.options
         await self._engine.run(self._observe(request), self._pieces(request.frames or ()))
         chunk = await self._engine.act(episode)
         if not np.isfinite(chunk).all():

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from mme_vla.embodiment import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.policy.base import Policy
 from mme_vla.serving.settings import ServeSettings
@@ -12,7 +13,7 @@ def warm_up(policy: Policy, settings: ServeSettings) -> None:
     frames = np.zeros((settings.encode_chunk, SIDE, SIDE, 3), np.uint8)
     episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
     for episode in episodes:
-        episode.subgoal = "warm up"
+        episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
         episode.remember(frames)
         robot = policy.embodiment
         view = dict.fromkeys(robot.camera_names, frames[0])

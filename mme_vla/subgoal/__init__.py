@@ -2,12 +2,14 @@
 
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, Usage, build_predictor
-from mme_vla.subgoal.gemini import Gemini
+from mme_vla.subgoal.gemini import Gemini, OpenAI
 from mme_vla.subgoal.memer import Memer
+from mme_vla.subgoal.notebook import NotebookPredictor
 from mme_vla.subgoal.oracle import Oracle
 from mme_vla.subgoal.qwenvl import QwenVL
 
 __all__ = [
-    "BackgroundPredictor", "Gemini", "Memer", "Oracle", "QwenVL", "Subgoal", "SubgoalEpisode", "SubgoalPredictor",
+    "BackgroundPredictor", "Gemini", "Memer", "NotebookPredictor", "OpenAI", "Oracle", "QwenVL", "Subgoal",
+    "SubgoalEpisode", "SubgoalPredictor",
     "Usage", "build_predictor",
 ]  # fmt: skip

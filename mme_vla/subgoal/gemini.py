@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.models.api import Api, ApiFailure, Reply, Settings, Shown
+from mme_vla.subgoal.models.api import ApiFailure, Reply, make_api
+from mme_vla.subgoal.models.connection import Shown
 from mme_vla.subgoal.models.threads import side_by_side
 from mme_vla.subgoal.words.gemini_prompts import LATE, first_query, gemini_system, next_query
 from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
@@ -62,8 +62,10 @@ class Gemini(SubgoalPredictor):
         wait: for tasks with a long first subgoal, no second question due before this step.
         workers: questions under way at once.
         client: an object with google-genai's `client.models.generate_content`; None makes one.
-        settings: keys of `api.Settings`.
+        settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
+
+    speaks = "gemini"
 
     def __init__(
         self,
@@ -80,7 +82,7 @@ class Gemini(SubgoalPredictor):
         if wait < 0:
             raise UserError(f"wait={wait} must be a number of steps, 0 or more.")
         self.wait, self.workers = wait, workers
-        self.api = Api(read_section(Settings, settings, "subgoal"), self.usage, client)
+        self.api = make_api(self.speaks, settings, "subgoal", self.usage, client)
         self._lock = threading.Lock()
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> GeminiEpisode:
@@ -120,3 +122,14 @@ class Gemini(SubgoalPredictor):
             return self.accepted(pixels_of_pairs(text), reply.text)
         except MalformedAnswer as error:
             return self.kept(episode, "malformed", reply.text, str(error))
+
+
+@SUBGOALS.register("openai")
+class OpenAI(Gemini):
+    """The same questions to any endpoint that speaks OpenAI's chat completions; videos are shown as pictures.
+
+    client: an object with openai's `client.chat.completions.create`; None makes one.
+    settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.
+    """
+
+    speaks = "openai"

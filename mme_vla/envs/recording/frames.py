@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.hdf5 import known_poses
-from mme_vla.data.waypoints import find_motions
+from mme_vla.data.waypoints import find_motions, known_poses
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.episodes import spans

@@ -86,7 +86,7 @@ class Wanted:
     def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:
         """Write these places from the recorded files in `episodes`; each appears whole or not at all."""
         from mme_vla.data.conversion import convert
-        from mme_vla.data.hdf5 import EpisodeRef
+        from mme_vla.data.hdf5_values import EpisodeRef
         from mme_vla.envs.recording.hdf5_writer import join
 
         for place in missing:

@@ -41,6 +41,7 @@ def replay(
         steps = steps[np.linspace(0, len(steps) - 1, most).round().astype(int)]
     text = SubgoalText.from_config(policy.config.get("subgoal_text"))
     running, seen = policy.start_episode(source.goal(episode)), 0
+    running.options = source.options(episode)
     for step in steps.tolist():
         indices = np.arange(seen, step + 1)
         views = {view: source.frames(episode, indices, view) for view in policy.embodiment.camera_names}

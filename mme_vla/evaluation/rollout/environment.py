@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_state
+from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.make import make_env
 from mme_vla.envs.task_names import STICK_TASKS
@@ -22,8 +22,10 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.film import EpisodeVideo, video_name
 from mme_vla.registry import TASKS
 
+OPTIONS = "available_multi_choices"
 REPORTED = (
     "status", "task_goal", "simple_subgoal_online", "grounded_subgoal_online", "error_message", "exception_type",
+    OPTIONS,
 )  # fmt: skip
 """What is passed on of the environment's info."""
 _BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
@@ -81,7 +83,7 @@ class ChunkEnv:
         video: EpisodeVideo | None = None,
         robot: Embodiment = ROBOMME_JOINT,
     ) -> None:
-        self._robot, self._numbers = robot, robot.action.width - stick
+        self._robot, self._stick = robot, stick
         self._max_steps, self._video = max_steps, video
         self._clock = RenderClock()
         self._simulating = self._rendered = 0.0
@@ -124,7 +126,9 @@ class ChunkEnv:
         for number, action in enumerate(actions, 1):
             self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
             with self._simulation():
-                observation, _, ended, cut, info = self._env.step(action[: self._numbers])
+                observation, _, ended, cut, info = self._env.step(
+                    benchmark_action(self._robot.action, action, self._stick)
+                )
             terminated, truncated = bool(ended), bool(cut)
             if info.get("status") == "error":
                 terminated = True
@@ -134,7 +138,7 @@ class ChunkEnv:
             executed += 1
             count = frames.add(observation)
             seen += count
-            self._steps += count
+            self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could go on for ever
             self._draw(frames, count, caption=command.get("subgoal"))
             if not (terminated or truncated) and self._steps > self._max_steps:
                 truncated, info = True, {**info, "status": "timeout"}

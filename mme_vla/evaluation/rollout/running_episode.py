@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from mme_vla.embodiment.options import read_options
 from mme_vla.envs.vector.jobs import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import Seconds
-from mme_vla.evaluation.rollout.environment import Observation
+from mme_vla.evaluation.rollout.environment import OPTIONS, Observation
 from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import Subgoal, SubgoalPredictor
@@ -68,6 +69,8 @@ class RunningEpisode:
         """Take the first observation: a conditioning video, if the task has one, and the current frame."""
         goal = str(info["task_goal"][0])
         self.episode.goal = goal
+        if self._robot.action.choice and OPTIONS in info:
+            self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
             seen = self.video_frames and self._subgoals.sees_video
@@ -95,7 +98,7 @@ class RunningEpisode:
     @property
     def pieces(self) -> int:
         """Pieces still to be read."""
-        return -(-(len(self._frames["state"]) - self._at) // self._piece)
+        return max(0, -(-(len(self._frames["state"]) - self._at) // self._piece))
 
     def read(self) -> None:
         """Take one piece of the waiting frames into memory."""
@@ -108,7 +111,7 @@ class RunningEpisode:
             led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
         some = {} if all(len(places) == len(self._demo[part]) for places in drawn.values()) else {"drawn": drawn}
         self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
-        if self.watched is not None and not self._demo[part][-1]:
+        if self.watched is not None and not self._demo[part][-1:].any():
             camera, demo = self._robot.memory_camera, self._demo[part]
             shown = views[camera][~demo[drawn[camera]]]
             if passed := int((~demo).sum()) - len(shown):

@@ -271,6 +271,7 @@ class MemoryVlaPolicy(Policy):
     def full_batch(self, device: torch.device | str = "cpu") -> GroupBatch:
         """A group of one moment without content, with the longest prompt."""
         size, length = self.sizes.vision.image_size, int(self.config["processor"]["prompt_length"])
+        length += self.embodiment.action.options_length
         return GroupBatch(
             images=torch.zeros(1, 1, 3, size, size, dtype=torch.uint8, device=device),
             prompt=torch.full((1, 1, length), 5, device=device),

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
+from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.layout import SAMPLE
 from mme_vla.data.progress import progress
 from mme_vla.embodiment.robomme import ARM_JOINTS

@@ -3,91 +3,32 @@
 import hashlib
 import json
 import logging
-import math
-import os
 import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError, missing_extra
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, did_you_mean
 from mme_vla.files import read_json, sealed, unsealed
-from mme_vla.media import film_bytes, png_bytes
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.clips import ENCODING
+from mme_vla.subgoal.models.connection import Connection, Settings, Shown, Turn
+from mme_vla.subgoal.models.google import GoogleConnection
+from mme_vla.subgoal.models.openai_chat import OpenAIConnection
 from mme_vla.subgoal.models.threads import within
 
 log = logging.getLogger(__name__)
-Turn = tuple[str, list[Any]]  # role; parts: texts, pictures [H, W, 3], videos [t, H, W, 3], bare or as `Shown`
+CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai": OpenAIConnection}
+"""Ways to speak to models, by the word that settings choose them with."""
 
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
 _LONGEST_PAUSE = 60.0  # seconds
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How the API is used.
-
-    model: its name. key_variable: environment variable that holds the key.
-    temperature: 0 for the likeliest answer. timeout: seconds before an answer is given up.
-    retries: further tries after a passing error. backoff: seconds before the first of them, doubled each time.
-    requests_per_minute: rate limit; None for none. cache: folder of answers; None keeps none.
-    input_price, output_price: US dollars for a million tokens.
-    """
-
-    model: str = "gemini-2.5-pro"
-    key_variable: str = "GEMINI_API_KEY"
-    temperature: float = 0.0
-    timeout: float = 120.0
-    retries: int = 5
-    backoff: float = 2.0
-    requests_per_minute: float | None = 60
-    cache: str | None = None
-    input_price: float = 1.25
-    output_price: float = 10.0
-
-    def __post_init__(self) -> None:
-        for name, wanted in _WANTED.items():
-            value = getattr(self, name)
-            if name == "requests_per_minute" and value is None:
-                continue
-            usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not usable or value < 0 or (value == 0 and "above" in wanted):
-                raise UserError(f"{name}={value!r} must be {wanted}.")
-        if not isinstance(self.retries, int):
-            raise UserError(f"retries={self.retries!r} must be a whole number, 0 or more.")
-
-
-_WANTED = {
-    "temperature": "a number, 0 or more",
-    "timeout": "a number of seconds above 0",
-    "retries": "a whole number, 0 or more",
-    "backoff": "a number of seconds, 0 or more",
-    "requests_per_minute": "a number above 0, or null for no limit",
-    "input_price": "a number of dollars, 0 or more",
-    "output_price": "a number of dollars, 0 or more",
-}
-
-
-class Shown:
-    """A picture [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
-
-    def __init__(self, pixels: np.ndarray) -> None:
-        self.pixels = pixels
-
-    @cached_property
-    def part(self) -> Mapping[str, Any]:
-        """What is sent."""
-        picture = self.pixels.ndim == 3
-        data = png_bytes(self.pixels) if picture else film_bytes(self.pixels, **ENCODING)
-        return {"inline_data": {"mime_type": "image/png" if picture else "video/mp4", "data": data}}
 
 
 @dataclass(frozen=True)
@@ -109,10 +50,12 @@ class ApiFailure(Exception):  # noqa: N818  (an outcome that is expected and cou
 
 @dataclass
 class Api:
-    """One connection. Safe to use from several threads.
+    """Asks one model. Safe to use from several threads.
 
-    client: an object with `models.generate_content(model=, contents=, config=)`, as google-genai's; None makes one.
+    client: what the connection asks, such as google-genai's; None makes one: at once, but with a cache and no key when
+        the first question comes that the cache does not hold.
     clock, sleep: of the rate limit and the pauses.
+    speaks: a key of `CONNECTIONS`.
     """
 
     settings: Settings
@@ -120,12 +63,27 @@ class Api:
     client: Any = None
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
+    speaks: str = "gemini"
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _next: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.client is None:
-            self.client = _make_client(self.settings)
+        self._connection: Connection | None = None
+        if self.client is not None or self.settings.cache is None or self.settings.key:
+            self._connected()
+
+    def _connected(self) -> Connection:
+        with self._lock:
+            if self._connection is None:
+                self._connection = CONNECTIONS[self.speaks](self.settings, self.client)
+            return self._connection
+
+    def _needed(self) -> Connection:
+        try:
+            return self._connected()
+        except UserError as error:
+            kept = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
+            raise UserError(f"{error}{kept}") from None
 
     def ask(self, system: str, turns: Sequence[Turn]) -> Reply:
         """Ask the last turn of a conversation.
@@ -152,8 +110,7 @@ class Api:
         return reply
 
     def _tried(self, system: str, turns: Sequence[Turn]) -> Reply:
-        contents = [{"role": role, "parts": [_part(part) for part in parts]} for role, parts in turns]
-        config = {"system_instruction": system, "temperature": self.settings.temperature}
+        connection = self._needed()
         pause = self.settings.backoff
         failure = ApiFailure("failed", "never asked")
         for attempt in range(self.settings.retries + 1):
@@ -164,7 +121,7 @@ class Api:
                 pause *= 2
             self._wait_for_turn()
             try:
-                return self._once(contents, config)
+                return self._once(connection, system, turns)
             except ApiFailure as error:
                 failure = error
                 if error.problem == "refused":
@@ -182,27 +139,21 @@ class Api:
             log.info("%s: try %d came to nothing (%s)", self.settings.model, attempt + 1, failure)
         raise failure
 
-    def _once(self, contents: list[Any], config: dict[str, Any]) -> Reply:
+    def _once(self, connection: Connection, system: str, turns: Sequence[Turn]) -> Reply:
         started = self.clock()
-        call = self.client.models.generate_content
-        response = within(
-            self.settings.timeout, lambda: call(model=self.settings.model, contents=contents, config=config)
-        )
-        used = getattr(response, "usage_metadata", None)
-        read, written = _count(used, "prompt_token_count"), _count(used, "candidates_token_count")
-        written += _count(used, "thoughts_token_count")
+        heard = within(self.settings.timeout, lambda: connection.ask(system, turns))
+        prices = self.settings.input_price, self.settings.output_price
         with self._lock:
             self.usage.calls += 1
             self.usage.seconds += self.clock() - started
-            self.usage.input_tokens += read
-            self.usage.output_tokens += written
-            self.usage.cost += (read * self.settings.input_price + written * self.settings.output_price) / 1e6
-        if refusal := _refusal(response):
-            raise ApiFailure("refused", refusal)
-        text = (getattr(response, "text", None) or "").strip()
-        if not text:
+            self.usage.input_tokens += heard.input_tokens
+            self.usage.output_tokens += heard.output_tokens
+            self.usage.cost += (heard.input_tokens * prices[0] + heard.output_tokens * prices[1]) / 1e6
+        if heard.refusal:
+            raise ApiFailure("refused", heard.refusal)
+        if not (text := heard.text.strip()):
             raise ApiFailure("empty", "the answer is empty")
-        return Reply(text, read, written)
+        return Reply(text, heard.input_tokens, heard.output_tokens)
 
     def _wait_for_turn(self) -> None:
         if self.settings.requests_per_minute is None:
@@ -216,7 +167,7 @@ class Api:
     def _cache_file(self, system: str, turns: Sequence[Turn]) -> Path | None:
         if self.settings.cache is None:
             return None
-        digest = hashlib.sha256(json.dumps([self.settings.model, self.settings.temperature, system]).encode())
+        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.speaks].cached_as(self.settings), system]).encode())
         for role, parts in turns:
             digest.update(f"\n{role}".encode())
             for shown in parts:
@@ -228,28 +179,10 @@ class Api:
         return Path(self.settings.cache) / name[:2] / f"{name}.json"
 
     def _without_key(self, text: str) -> str:
-        key = os.environ.get(self.settings.key_variable, "")
-        return text.replace(key, "***") if key else text
+        return text.replace(self.settings.key, "***") if self.settings.key else text
 
     def _is_fatal(self, error: Exception) -> bool:
         return _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower())
-
-
-def _make_client(settings: Settings) -> Any:
-    key = os.environ.get(settings.key_variable)
-    if not key:
-        raise UserError(f"Gemini needs a key in the environment variable {settings.key_variable}.")
-    try:
-        from google import genai
-    except ImportError:
-        raise missing_extra("Gemini", "gemini") from None
-    return genai.Client(api_key=key, http_options={"timeout": int(settings.timeout * 1000)})
-
-
-def _part(part: Any) -> Mapping[str, Any]:
-    if isinstance(part, str):
-        return {"text": part}
-    return (part if isinstance(part, Shown) else Shown(part)).part
 
 
 def _read_reply(path: Path) -> Reply | None:
@@ -275,23 +208,19 @@ def _is_passing(error: Exception) -> bool:
 
 
 def _code(error: Exception) -> int:
-    code = getattr(error, "code", 0)
-    return code if isinstance(code, int) else 0
+    codes = (getattr(error, name, 0) for name in ("status_code", "code"))  # as openai has it, as google-genai has it
+    return next((code for code in codes if isinstance(code, int) and code), 0)
 
 
-def _count(used: Any, name: str) -> int:
-    return int(getattr(used, name, None) or 0)
+def make_api(speaks: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
+    """An `Api` out of plain settings.
 
+    Args:
+        speaks: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
 
-def _refusal(response: Any) -> str:
-    """Why the model refused to answer, empty if it did not."""
-    blocked = getattr(getattr(response, "prompt_feedback", None), "block_reason", None)
-    if blocked:
-        return f"the question was blocked: {_name(blocked)}"
-    candidates = getattr(response, "candidates", None) or []
-    reason = _name(getattr(candidates[0], "finish_reason", None)) if candidates else ""
-    return f"the answer was stopped: {reason}" if reason not in ("", "STOP", "MAX_TOKENS") else ""
-
-
-def _name(value: Any) -> str:
-    return "" if value is None else str(getattr(value, "name", value))
+    Raises:
+        UserError: an unknown way, key or value; no key, or a package that is not installed.
+    """
+    if speaks not in CONNECTIONS:
+        raise UserError(f"{where}.api={speaks!r}. {did_you_mean(str(speaks), CONNECTIONS)}")
+    return Api(read_section(CONNECTIONS[speaks].settings_type, settings, where), usage, client, speaks=speaks)

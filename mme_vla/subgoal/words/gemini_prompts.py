@@ -106,13 +106,30 @@ def gemini_system(task: str, kind: str) -> str:
     Args:
         task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
     """
-    templates = VOCABULARY.get(task) or tuple(dict.fromkeys(t for one in VOCABULARY.values() for t in one))
-    written = [_written(template, kind) for template in templates]
-    example = _example(written[0])
+    example = example_of(task, kind)
     parts = [
         "You watch a robot arm at a table through a camera in front of it, and tell it what to do next. You are given "
         "the task in words, then pictures or short videos of what happened. Break the task down into subgoals and name "
         "the one the robot has to work on now.",
+        *what_there_is(task, kind),
+    ]
+    parts.append(
+        "Answer with JSON alone. To the first question: "
+        f'{{"subgoal_sequence": ["{example}", …], "subgoal": "{example}"}}, the whole plan and the first subgoal. To '
+        f'every later one: {{"description": "what happened since", "subgoal": "{example}"}}. Repeat the last subgoal '
+        "while it is not finished yet."
+    )
+    return "\n\n".join(parts)
+
+
+def what_there_is(task: str, kind: str) -> list[str]:
+    """Paragraphs on a task: the subgoals it may have, what points are, and what is special about it.
+
+    Args:
+        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
+    """
+    written = _subgoals(task, kind)
+    parts = [
         "Subgoals of this task, to be used word for word ([ordinal] is first, second, third, …; [colour] is red, blue "
         "or green):\n" + "\n".join(f"- {text}" for text in written),
     ]
@@ -123,13 +140,17 @@ def gemini_system(task: str, kind: str) -> str:
         )
     if task in _NOTES:
         parts.append(_NOTES[task])
-    parts.append(
-        "Answer with JSON alone. To the first question: "
-        f'{{"subgoal_sequence": ["{example}", …], "subgoal": "{example}"}}, the whole plan and the first subgoal. To '
-        f'every later one: {{"description": "what happened since", "subgoal": "{example}"}}. Repeat the last subgoal '
-        "while it is not finished yet."
-    )
-    return "\n\n".join(parts)
+    return parts
+
+
+def example_of(task: str, kind: str) -> str:
+    """One subgoal of a task, as a model is to write it."""
+    return _example(_subgoals(task, kind)[0])
+
+
+def _subgoals(task: str, kind: str) -> list[str]:
+    templates = VOCABULARY.get(task) or tuple(dict.fromkeys(t for one in VOCABULARY.values() for t in one))
+    return [_written(template, kind) for template in templates]
 
 
 def first_query(goal: str, video: bool) -> str:

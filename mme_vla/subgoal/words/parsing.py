@@ -101,7 +101,7 @@ def parse_memer(answer: str, recent: int, side: int = SIDE) -> tuple[Parsed, lis
     Raises:
         MalformedAnswer: no JSON object, no subtask, or positions that are no list of whole numbers.
     """
-    found = _json_object(answer)
+    found = json_object(answer)
     subtask, positions = found.get("current_subtask"), found.get("keyframe_positions", [])
     if not isinstance(subtask, str):
         raise MalformedAnswer("the answer has no current_subtask")
@@ -122,7 +122,7 @@ def parse_gemini(answer: str) -> str:
         quoted = _QUOTED.search(rest)
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
-    text = _json_object(answer).get("subgoal")
+    text = json_object(answer).get("subgoal")
     if not isinstance(text, str) or not text.strip():
         raise MalformedAnswer("the answer names no subgoal")
     return _writable(text.strip())
@@ -163,8 +163,12 @@ def points_of(text: str) -> tuple[Point, ...]:
     return tuple((int(y), int(x)) for y, x in _PIXELS.findall(text))
 
 
-def _json_object(answer: str) -> dict[str, object]:
-    """The outermost braces of an answer as JSON."""
+def json_object(answer: str) -> dict[str, object]:
+    """The outermost braces of an answer as JSON.
+
+    Raises:
+        MalformedAnswer: there are none, or something else between them.
+    """
     start, stop = answer.find("{"), answer.rfind("}")
     if start < 0 or stop < start:
         raise MalformedAnswer("the answer holds no JSON object")
