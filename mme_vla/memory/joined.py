@@ -48,6 +48,7 @@ class JoinedMemory(Memory):
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
+        self.timed = all(member.timed for member in built)
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
@@ -82,7 +83,8 @@ class JoinedMemory(Memory):
         for place, i in enumerate(self._order):
             part = memories[i].recall(views[i], step, rng)
             parts.append(_padded(part, memories[i]) if place else part)
-        return HistoryTokens(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+        features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
+        return HistoryTokens(features, positions, mask, parts[0].step)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
@@ -92,7 +94,8 @@ class JoinedMemory(Memory):
         found: dict[int, MemoryTokens] = {}
         for i, piece in zip(self._order, pieces, strict=True):
             memories[i].reporting = self.reporting
-            found[i] = memories[i](HistoryTokens(*piece))
+            features, positions, mask = piece
+            found[i] = memories[i](HistoryTokens(features, positions, mask, history.step))
         return self._joined([found[i] for i in range(len(memories))])
 
     def start_stream(self) -> tuple[Any, ...]:
@@ -119,7 +122,10 @@ class JoinedMemory(Memory):
             for name, tokens in zip(self.names, found, strict=True)
             for key, value in tokens.metrics.items()
         }
-        return MemoryTokens(torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1), metrics)
+        told = [f.ages for f in found if f.ages is not None]
+        ages = torch.cat(told, 1) if len(told) == len(found) else None
+        tokens, mask = torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1)
+        return MemoryTokens(tokens, mask, metrics, ages)
 
 
 _FIELDS = ("features", "positions", "mask")
@@ -226,7 +232,8 @@ def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:
     missing = member.capacity - len(part.mask)
     ends = (missing, 0) if member.pad_left else (0, missing)
     pad = nn.functional.pad
-    return HistoryTokens(pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends)), pad(part.mask, ends))
+    features, positions = pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends))
+    return HistoryTokens(features, positions, pad(part.mask, ends), part.step)
 
 
 def _distinct(names: Sequence[str]) -> list[str]:

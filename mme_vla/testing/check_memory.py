@@ -1,5 +1,6 @@
 """`check_memory`: does a memory keep the promises that training, streaming and the integrations rely on?"""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -139,16 +140,16 @@ def check_encoding(memory: Memory, frames: int) -> None:
     assert found.mask.any(1).all(), "a row has no valid memory token."
     assert torch.isfinite(_valid(found)).all(), "a valid memory token is not finite."
 
-    hidden = HistoryTokens(history.features.clone(), history.positions.clone(), history.mask)
+    hidden = replace(history, features=history.features.clone(), positions=history.positions.clone())
     hidden.features[~history.mask], hidden.positions[~history.mask] = 1e3, 77.0
     error = float((_valid(_encoded(memory, hidden)) - _valid(found)).abs().max())
     assert error <= TOLERANCE, f"what stands in padding changed the memory tokens by {error:.2g}."
 
-    alone = _encoded(memory, HistoryTokens(*(x[1:] for x in (history.features, history.positions, history.mask))))
+    alone = _encoded(memory, history.rows(slice(1, None)))
     error = float((_valid(alone)[0] - _valid(found)[1]).abs().max())
     assert error <= TOLERANCE, f"beside another sample the same selection gives other tokens (by {error:.2g})."
 
-    changed = HistoryTokens(-history.features, history.positions, history.mask)
+    changed = replace(history, features=-history.features)
     assert not torch.equal(_valid(_encoded(memory, changed)), _valid(found)), "forward does not read the features."
 
     was = {name: parameter.requires_grad for name, parameter in memory.named_parameters()}

@@ -80,7 +80,7 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
     mask[:, slice(n - valid, n) if policy.memory.pad_left else slice(valid)] = True
     features = torch.randn(batch, n, d, generator=generator) * mask[..., None]
     positions = torch.randint(0, 64, (batch, n, 3), generator=generator).float() * mask[..., None]
-    return HistoryTokens(features, positions, mask)
+    return HistoryTokens(features, positions, mask, torch.full((batch,), 64))
 
 
 def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:
