@@ -3,6 +3,6 @@
 Importing this room registers the memories it ships.
 """
 
-from mme_vla.memory import framesamp, joined, rmt, tokendrop, ttt
+from mme_vla.memory import actions, framesamp, gist, joined, learned_topk, moment, retrieval, rmt, tokendrop, ttt
 
-__all__ = ["framesamp", "joined", "rmt", "tokendrop", "ttt"]
+__all__ = ["actions", "framesamp", "gist", "joined", "learned_topk", "moment", "retrieval", "rmt", "tokendrop", "ttt"]

@@ -26,6 +26,7 @@ class Memory(nn.Module):
         pad_left: True puts the padding before the tokens (recurrent memories), False after them.
         timed: whether each memory token speaks of one moment, which `MemoryTokens.ages` tells: what
             `integration.memory_position=time` reads.
+        reads_motion: whether it reads what the robot felt and did (`History.moved`) instead of stored tokens.
 
     `reporting` is set from outside: True asks `forward` for numbers about its inside, as `MemoryTokens.metrics`. The
     training loop sets it for the updates it logs; where it is False, what only these numbers need is not computed.
@@ -38,6 +39,7 @@ class Memory(nn.Module):
     storage: StorageSpec
     pad_left: bool = False
     timed: bool = False
+    reads_motion: bool = False
     reporting: bool = False
 
     def check_grid(self, views: int) -> None:

@@ -1,7 +1,7 @@
 """Several memories under one budget, side by side: their tokens stand one after the other (beyond the paper)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,6 +49,7 @@ class JoinedMemory(Memory):
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
         self.timed = all(member.timed for member in built)
+        self.reads_motion = any(member.reads_motion for member in built)
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
@@ -136,7 +137,7 @@ class CoarserHistory(History):
 
     def __init__(self, stored: History, spec: StorageSpec) -> None:
         super().__init__(spec, stored.exec_start)
-        self._stored = stored
+        self._stored, self.motion = stored, stored.motion
 
     def __len__(self) -> int:
         return len(self._stored)
@@ -148,8 +149,14 @@ class CoarserHistory(History):
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
 
     def gather(self, indices: np.ndarray) -> Tensor:
+        return self._pooled(indices, self._stored.gather)
+
+    def stored(self, indices: np.ndarray) -> Tensor:
+        return self._pooled(indices, self._stored.stored)
+
+    def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
         parts = (self._stored.spec.grid // self.spec.grid) ** 2
-        found = self._stored.gather(finer(indices, self.spec.grid, self._stored.spec.grid))
+        found = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
         if parts == 1:
             return found
         cells = found.unflatten(0, (-1, parts)).float()

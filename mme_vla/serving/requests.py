@@ -32,10 +32,12 @@ class AddBuffer:
 
     frames: t pictures [H, W, 3] uint8 of the camera that feeds memory.
     exec_start: index of the episode's first execution frame; 0 where it is not said.
+    states: what the robot felt at these frames, [t, s].
     """
 
     frames: Sequence[np.ndarray]
     exec_start: int
+    states: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class Infer:
     pictures: the current ones, by camera. state [s]. goal: the task in words. subgoals: by kind, those given.
     frames: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
     first: whether the message begins an episode; None where the schema does not say.
+    states: what the robot felt at `frames`, [t, s].
     """
 
     pictures: Mapping[str, np.ndarray]
@@ -53,6 +56,7 @@ class Infer:
     subgoals: Mapping[str, str] = field(default_factory=dict)
     frames: Sequence[np.ndarray] | None = None
     first: bool | None = None
+    states: np.ndarray | None = None
 
 
 Request = Reset | AddBuffer | Infer
@@ -110,7 +114,7 @@ def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) ->
         start = int(start)
     if type(start) is not int or start < 0:
         raise UserError(f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.")
-    return AddBuffer(frames, start)
+    return AddBuffer(frames, start, states)
 
 
 def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
@@ -138,9 +142,10 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
     if not isinstance(first, bool | np.bool_):
         raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
     goal = _text("task_goal", _get(message, "task_goal"))
-    state = benchmark_state(joints[-1], grippers[-1])
+    states = np.stack([benchmark_state(*felt) for felt in zip(joints, grippers, strict=True)])
     pictures = {name: view[-1] for name, view in views.items()}
-    return Infer(pictures, state, goal, _subgoals(message), views[robot.memory_camera], bool(first))
+    remembered = views[robot.memory_camera]
+    return Infer(pictures, states[-1], goal, _subgoals(message), remembered, bool(first), states)
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:
