@@ -15,11 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
+from mme_vla.memory.attending import ReadingBlock, by_frame, heads_of, not_later, rows_at
 from mme_vla.memory.base import Memory, every_one, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.reading import ReadingBlock, by_frame, heads_of, not_later, rows_at
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.memory.sampling import recurrent_frames
 from mme_vla.registry import MEMORIES

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
+from mme_vla.memory.attending import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.base import Memory, every_one, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder, position_features
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.reading import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens

@@ -27,6 +27,7 @@ from mme_vla.memory.recurrent import (
     Statistics,
     default_hidden,
     full_precision,
+    layer_norm,
     linear,
 )
 from mme_vla.registry import MEMORIES
@@ -42,6 +43,7 @@ class LSTMLayer(RecurrentLayer):
     def __init__(self, hidden: int, layers: int, budget: int) -> None:
         super().__init__()
         self.hidden, self.budget = hidden, budget
+        self.norm = nn.LayerNorm(hidden)  # a fresh encoder's answers are small: the gates would hardly move
         self.inputs = nn.ModuleList(nn.Linear(hidden, 4 * hidden) for _ in range(layers))
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers))
         self.tokens = nn.Linear(hidden, budget * hidden)
@@ -57,7 +59,7 @@ class LSTMLayer(RecurrentLayer):
         self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
     ) -> tuple[State, Statistics]:
         with full_precision(x):
-            seen, (hidden, cells) = x.float()[:, :, 0], state
+            seen, (hidden, cells) = layer_norm(self.norm, x.float()[:, :, 0]), state
             after: list[tuple[Tensor, Tensor]] = []
             for i, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
                 h, c = hidden[:, i], cells[:, i]
