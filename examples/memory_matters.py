@@ -13,6 +13,9 @@ The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 toke
 frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and
 every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
 takes in, and what all slots have in common is learned late.
+
+The memories beyond the paper can be named too (`retrieval_modul`); what they change stands in `OF_KIND`. In the video
+the arm leans aside, for each colour its own way: that is all that the memory `actions` is told.
 """
 
 import argparse
@@ -32,7 +35,7 @@ from mme_vla.config.composition import compose, print_user_errors
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import NEURAL, cached_history
+from mme_vla.testing.small import ALL_BEYOND, NEURAL, cached_history
 from mme_vla.types import Batch
 
 COLOURS = np.array([[220, 40, 40], [40, 200, 60], [50, 70, 230], [230, 210, 40]], np.uint8)
@@ -47,21 +50,30 @@ OF_KIND: dict[str, dict[str, Any]] = {
     "tokendrop": {"stride": 4},
     "ttt": {"stride": 4, "chunk": 1},
     "rmt": {"stride": 4, "chunk": 1, "budget": 16, "attention_dtype": "float32"},
+    "retrieval": {"every": 1, "cut": -1.0, "longest": 4},
+    "moment": {"stride": 4},
+    "gist": {"stride": 2, "anchors": 1, "recent": 1},
+    "learned_topk": {"pool": LENGTH},
+    "actions": {"stride": 1, "max_steps": LENGTH, "max_video": VIDEO, "chunk": 4, "budget": 4, "grid": None},
 }
 
 
 @dataclass
 class Stream:
-    """One synthetic episode: the colour it showed, its frames [t, h, w, 3], and its tokens for a memory."""
+    """One synthetic episode: its colour, its frames [t, h, w, 3], what the arm felt and did [t, 17], and its tokens."""
 
     colour: int
     frames: np.ndarray
+    motion: torch.Tensor
     history: CachedHistory | None = None
 
 
 def memory_options(model: str) -> dict[str, Any]:
     """What this demonstration changes in the shipped memory of a model."""
-    return MEMORY | OF_KIND[model.split("_")[0]] if model in NEURAL else {}
+    if model not in (*NEURAL, *ALL_BEYOND):
+        return {}
+    options = MEMORY | OF_KIND[model.rsplit("_", 1)[0]]
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def models_of(named: Sequence[str]) -> list[str]:
@@ -77,7 +89,9 @@ def make_stream(rng: np.random.Generator) -> Stream:
     for t in range(1, VIDEO - 1):
         top, left = (y + 2 * t) % (SIZE - SQUARE), (x + t) % (SIZE - SQUARE)
         frames[t, top : top + SQUARE, left : left + SQUARE] = COLOURS[colour]
-    return Stream(colour, frames)
+    motion = torch.zeros(LENGTH, 17)
+    motion[1 : VIDEO - 1, :8] = torch.from_numpy(ANSWERS[colour]) * torch.linspace(0, 1, VIDEO - 2)[:, None]
+    return Stream(colour, frames, motion)
 
 
 def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
@@ -87,6 +101,7 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
     if policy.memory is not None:
         for stream in streams:
             stream.history = cached_history(policy, stream.frames, exec_start=VIDEO)
+            stream.history.motion = stream.motion.__getitem__
     return streams
 
 
@@ -142,7 +157,8 @@ def learn(
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)
-    options = {"memory": memory_options(model)} if model in NEURAL else {}
+    changed = memory_options(model)
+    options = {"memory": changed} if changed else {}
     policy = build_policy(
         model, seed=seed, config_dir=config_dir, policy={"augment": False}, backbone=backbone or {}, **options
     )

@@ -31,8 +31,8 @@ class TensorStruct:
         """Return a copy whose tensors went through `Tensor.to` with these arguments."""
         return self._map(lambda x: x.to(*args, **kwargs))
 
-    def rows(self, chosen: Tensor) -> Self:
-        """Return the rows of every tensor that `chosen` names: numbers [n], or a mask."""
+    def rows(self, chosen: Tensor | slice) -> Self:
+        """Return the rows of every tensor that `chosen` names: numbers [n], a mask, or a slice."""
         return self._map(lambda x: x[chosen])
 
     def pin_memory(self) -> Self:
@@ -57,11 +57,20 @@ class HistoryTokens(TensorStruct):
     positions: [b, n, 3]; (frame, row, column) of each token: the frame counted from the episode's first,
         video included, the rest patch centres in sixteenths of a view's side.
     mask: [b, n] bool; False on padding.
+    step: [b] int64; the current frame, counted like the others. None where nobody needs to know.
     """
 
     features: Tensor
     positions: Tensor
     mask: Tensor
+    step: Tensor | None = None
+
+    @property
+    def ages(self) -> Tensor | None:
+        """How many frames before the current one each token's frame lies, [b, n] float32; 0 on padding."""
+        if self.step is None:
+            return None
+        return (self.step[:, None] - self.positions[..., 0]).float() * self.mask
 
 
 @dataclass
@@ -70,11 +79,14 @@ class MemoryTokens(TensorStruct):
 
     tokens: [b, budget, d]; mask: [b, budget] bool. Where the mask is False the token's value is undefined.
     metrics: scalars a memory reports of how it came to these tokens, detached.
+    ages: [b, budget] float32; how many frames ago the moment was that a token speaks of. None where tokens have no
+        moment, or the selection did not say what the current frame is.
     """
 
     tokens: Tensor
     mask: Tensor
     metrics: dict[str, Tensor] = field(default_factory=dict)
+    ages: Tensor | None = None
 
 
 @dataclass

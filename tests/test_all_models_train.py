@@ -16,7 +16,7 @@ from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.sources import open_sources
 from mme_vla.policy.tensor_files import load_tensors
-from mme_vla.testing.small import ALL_MODELS, NEURAL, RECURRENT
+from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
 from mme_vla.training import data as training_data
 from mme_vla.training.logging import read_metrics
 
@@ -33,6 +33,11 @@ SHORT_MEMORY = {
     "tokendrop": ["memory.budget=128"],
     "ttt": ["memory.budget=128", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2"],
     "rmt": ["memory.budget=64", "memory.max_steps=3", "memory.max_video=2", "memory.chunk=2"],
+    "retrieval": ["memory.budget=64"],
+    "moment": ["memory.budget=16", "memory.grid=4"],
+    "gist": ["memory.budget=48", "memory.anchors=1", "memory.recent=1"],
+    "actions": ["memory.max_steps=8", "memory.max_video=4"],
+    "learned_topk": ["memory.budget=48", "memory.pool=4"],
 }
 
 
@@ -68,7 +73,7 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run(model: str, folder: Path, caches: Path, *overrides: str) -> Path:
     """Train in this process; the last checkpoint."""
-    memory = SHORT_MEMORY[model.split("_")[0]] if model in [*NEURAL, "hybrid"] else []
+    memory = SHORT_MEMORY[model.rsplit("_", 1)[0]] if model in [*NEURAL, *BEYOND, "hybrid"] else []
     cfg = compose("train", [f"model={model}", *SMALL, *memory, f"data.cache.root={caches}", *overrides])
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     return train(cfg, config, folder, begun=time.perf_counter())
@@ -78,7 +83,7 @@ def losses(folder: Path) -> list[float]:
     return [line["train/loss"] for line in read_metrics(folder) if "train/loss" in line]
 
 
-@pytest.mark.parametrize("model", ALL_MODELS)
+@pytest.mark.parametrize("model", [*ALL_MODELS, *BEYOND])
 def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Path) -> None:
     run(model, tmp_path, caches, f"train.steps={STEPS}")
     lines = read_metrics(tmp_path)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mme_vla.backbone.layers.blocks import PI05_VISIBILITY
 from mme_vla.backbone.pi05.backbone import Pi05Backbone
+from mme_vla.config.composition import config_dir
 from mme_vla.integration.context import Context
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import History
@@ -20,10 +21,18 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 SIZES: dict[str, dict[str, Any]] = {
     "framesamp": {"budget": 256}, "tokendrop": {"budget": 256},
     "ttt": {"budget": 16, "max_steps": 8, "max_video": 4}, "rmt": {"budget": 16, "max_steps": 8, "max_video": 4},
+    "retrieval": {"budget": 64, "every": 2, "longest": 3}, "moment": {"budget": 16, "moments": 2, "grid": 2},
+    "gist": {"budget": 48, "anchors": 1, "recent": 1, "gists": 4, "stride": 8},
+    "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "learned_topk": {"budget": 32, "pool": 6},
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["framesamp", "tokendrop", "ttt", "rmt"])
+def test_every_memory_that_ships_is_asked() -> None:
+    shipped = {file.stem for file in (config_dir() / "memory").glob("*.yaml")}
+    assert set(SIZES) == shipped - {"none", "joined"}  # the latter is made of others
+
+
+@pytest.mark.parametrize("name", SIZES)
 def test_every_memory_of_the_library_keeps_a_memorys_promises(name: str) -> None:
     check_memory(name, **SIZES[name])
 

@@ -6,6 +6,8 @@ import pytest
 from conftest import REPOSITORY
 from test_training import SMALL
 
+from mme_vla.testing.small import BEYOND
+
 GUESSING = 0.75
 
 
@@ -19,6 +21,11 @@ def learn(monkeypatch):
 
 def test_a_memory_learns_what_only_the_video_showed(learn):
     assert learn("framesamp_expert")["error"] < 0.5 * GUESSING
+
+
+@pytest.mark.parametrize("model", BEYOND)
+def test_so_does_each_memory_beyond_the_paper(learn, model):
+    assert learn(model)["error"] < 0.5 * GUESSING
 
 
 def test_without_memory_it_stays_a_guess(learn):

@@ -51,7 +51,8 @@ class Backbone(nn.Module):
         sample_steps: of an iterative head, unless told otherwise.
         image_size: side of the square pictures it reads.
         vocab_size: words it knows; None where it does not say.
-        hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition` and `beside`.
+        hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside` and
+            `positions` (blocks that stand at rotary positions of their own).
 
     and implements the methods below. Losses and samples are its own affair (a flow, a regression, a diffusion): whoever
     trains or evaluates hands back the numbers it asked for in `loss_draws` and `sample_draws`.

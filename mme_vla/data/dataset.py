@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.data import Dataset
 
 from mme_vla.data.cache.store import VisionCache
@@ -180,8 +182,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             item["action_mask"] = torch.from_numpy(step.recorded)
         if self.memory is not None:
             history = self.caches[step.source].history(step.episode)
+            if self.memory.reads_motion:
+                history.motion = partial(self._motion, step.source, step.episode)
             item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
         return item
+
+    def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
+        return self.processor.motion(*self.sources[source].own_motion(episode, frames, self.action_offset))
 
     def _sample(self, step: Step, subgoal: str | None) -> Sample:
         """A step with the frames of its window; before the episode's first frame that one is repeated."""

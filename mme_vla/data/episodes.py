@@ -236,6 +236,19 @@ class EpisodeSource:
             return np.zeros((0, self.robot.action.width), np.float32)
         return self.actions(episode, first, stop)
 
+    def own_motion(self, episode: int, frames: np.ndarray, offset: int = 0) -> tuple[np.ndarray, ...]:
+        """What the robot felt and did at frames [n] of an episode.
+
+        Returns:
+            states [n, s]; the actions [n, w] that led to these frames, as `past_actions` pairs them; and bool [n],
+            whether there is one: not at frames of the video, nor at the first of the execution, and nowhere where an
+            action is a motion of many frames.
+        """
+        stop = int(np.max(frames, initial=0)) + 1
+        own = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
+        led = np.clip(frames - 1 + offset, 0, stop - 1)
+        return self.states(episode, 0, stop)[frames], self.actions(episode, 0, stop)[led], own
+
     def _motions_of(self, episode: int) -> Motions:
         if episode not in self._motions:
             first = int(self.exec_starts[episode])

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from mme_vla.backbone.base import Hook, Injection
 from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Block, Visibility
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.types import MemoryTokens
 
 MEMORY_VISIBILITY: Visibility = {
@@ -24,6 +25,21 @@ def memory_visibility(prompt_sees_memory: bool) -> Visibility:
     return MEMORY_VISIBILITY if prompt_sees_memory else {**MEMORY_VISIBILITY, "prompt": PI05_VISIBILITY["prompt"]}
 
 
+POSITIONS = ("slot", "time")
+
+
+def checked_position(memory_position: str) -> str:
+    """The value of `integration.memory_position`.
+
+    Raises:
+        UserError: it is neither `slot` nor `time`.
+    """
+    if memory_position not in POSITIONS:
+        known = did_you_mean(str(memory_position), POSITIONS)
+        raise UserError(f"integration.memory_position={brief(memory_position)}: choose slot or time. {known}")
+    return memory_position
+
+
 class Integration(nn.Module):
     """Where memory tokens enter the backbone. This base class adds nothing: π0.5 without memory.
 
@@ -36,11 +52,14 @@ class Integration(nn.Module):
         condition: what becomes of the condition of the action expert's norms (the embedded flow time).
         beside: blocks that stand beside the actions in every step; `visibility` needs rows for them.
         brings: doors it goes through by no method of this class, where only other kinds of policy have them.
+        memory_position: `time` where its attention on memory counts frames, which needs a memory whose tokens tell
+            their ages; `slot` where it counts tokens.
     """
 
     memory_width: int = 0
     visibility: Visibility = PI05_VISIBILITY
     brings: ClassVar[frozenset[str]] = frozenset()
+    memory_position: str = "slot"
 
     def __init__(self, backbone: BackboneConfig) -> None:
         super().__init__()
@@ -66,6 +85,24 @@ class Integration(nn.Module):
             self.blocks(observation, memory), self.visibility, self.hook(memory), self.condition(memory),
             self.beside(memory),
         )  # fmt: skip
+
+
+def own_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
+    """Where a memory block stands whose tokens are placed in time, [b, budget] float32; None numbers it by slots.
+
+    The current frame is the last place before the blocks that follow, and every frame before it is a place further
+    back: how far one token stands from another, or from what follows, does not depend on what else is remembered.
+    """
+    if memory_position == "slot":
+        return None
+    return memory.mask.sum(1, keepdim=True) - 1 - ages_of(memory)
+
+
+def ages_of(memory: MemoryTokens) -> Tensor:
+    """How many frames ago each memory token's moment was, or say that they do not tell."""
+    if memory.ages is None:
+        raise ValueError("memory_position=time: these memory tokens tell no ages (HistoryTokens.step was not given).")
+    return memory.ages
 
 
 DOORS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}

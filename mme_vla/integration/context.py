@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.pi05.sizes import BackboneConfig
 from mme_vla.errors import UserError
-from mme_vla.integration.base import Integration, memory_visibility, required
+from mme_vla.integration.base import Integration, checked_position, memory_visibility, own_positions, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
 
@@ -14,16 +14,29 @@ from mme_vla.types import MemoryTokens
 class Context(Integration):
     """[memory | images | prompt] in the VLM expert, then actions."""
 
-    def __init__(self, backbone: BackboneConfig, prompt_sees_memory: bool = True) -> None:
+    def __init__(
+        self, backbone: BackboneConfig, prompt_sees_memory: bool = True, memory_position: str = "slot"
+    ) -> None:
+        """Take the VLM expert's width.
+
+        Args:
+            prompt_sees_memory: as released; False as the paper's text.
+            memory_position: `slot` numbers memory tokens one after the other, as released; `time` places them as many
+                positions before the images as their frames lie in the past.
+
+        Raises:
+            UserError: a choice that there is not, or that this backbone does not have.
+        """
         super().__init__(backbone)
         if not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False):
             raise UserError(
                 "integration.prompt_sees_memory=false hides memory from the prompt, but in this backbone every token "
                 "sees every other: leave it true."
             )
-        self.memory_width = backbone.vlm.width
+        self.memory_width, self.memory_position = backbone.vlm.width, checked_position(memory_position)
         self.visibility = memory_visibility(prompt_sees_memory)
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         memory = required(memory)
-        return [Block("memory", memory.tokens, memory.mask, "vlm"), *observation]
+        positions = own_positions(memory, self.memory_position)
+        return [Block("memory", memory.tokens, memory.mask, "vlm", positions), *observation]

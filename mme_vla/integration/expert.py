@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
-from mme_vla.integration.base import Integration, memory_visibility, required
+from mme_vla.integration.base import Integration, checked_position, memory_visibility, own_positions, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
 
@@ -19,10 +19,15 @@ class MemoryExpert(Integration):
         width: int | None = None,
         mlp_dim: int | None = None,
         prompt_sees_memory: bool = True,
+        memory_position: str = "slot",
     ) -> None:
-        """`width` defaults to the action expert's, `mlp_dim` to twice the width: 1024 and 2048 at full size."""
+        """`width` defaults to the action expert's, `mlp_dim` to twice the width: 1024 and 2048 at full size.
+
+        The others are as `Context` has them.
+        """
         super().__init__(backbone)
         self.memory_width = width or backbone.action.width
+        self.memory_position = checked_position(memory_position)
         self.visibility = memory_visibility(prompt_sees_memory)
         self._expert = ExpertConfig(self.memory_width, mlp_dim or 2 * self.memory_width)
 
@@ -31,4 +36,5 @@ class MemoryExpert(Integration):
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         memory = required(memory)
-        return [Block("memory", memory.tokens, memory.mask, "memory"), *observation]
+        positions = own_positions(memory, self.memory_position)
+        return [Block("memory", memory.tokens, memory.mask, "memory", positions), *observation]

@@ -9,7 +9,7 @@ from mme_vla.backbone.layers.norms import EPS, RMSNorm, rms_normalise
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.layers.rope import rotate, rotation
 from mme_vla.backbone.pi05.sizes import BackboneConfig
-from mme_vla.integration.base import Integration, required
+from mme_vla.integration.base import Integration, ages_of, checked_position, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
 
@@ -30,11 +30,14 @@ class ModulatorLayer(nn.Module):
         nn.init.normal_(self.modulation.weight, std=0.0 if exact_identity else 0.002)
         nn.init.zeros_(self.modulation.bias)
 
-    def keys_values(self, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the number of steps."""
+    def keys_values(self, memory: Tensor, positions: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Memory [b, m, d] → rotated keys and values [b, m, K, h]: once per chunk, whatever the number of steps.
+
+        Queries stand after all memory slots, padding included; positions [b, m] of the memory's own are on that line.
+        """
         kv = self.kv(self.norm(memory)[0]).unflatten(-1, (-1, self.head_dim))
         k, v = kv.chunk(2, dim=-2)
-        return rotate(k, rotation(_positions(0, memory), self.head_dim)), v
+        return rotate(k, rotation(_positions(0, memory) if positions is None else positions, self.head_dim)), v
 
     def recall(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding included."""
@@ -62,22 +65,29 @@ class Modulator(Integration):
         num_kv_heads: int = 1,
         head_dim: int | None = None,
         exact_identity: bool = False,
+        memory_position: str = "slot",
     ) -> None:
         """Build one `ModulatorLayer` per layer.
 
         Args:
             num_heads, num_kv_heads, head_dim: of the cross-attention; `head_dim` defaults to the backbone's.
             exact_identity: start as the memoryless policy to the bit; as released (False) it starts near it.
+            memory_position: `slot` numbers memory tokens one after the other, as released; `time` places a token as
+                many positions before the first action as its frame lies in the past, and one.
+
+        Raises:
+            UserError: a choice of `memory_position` that there is not.
         """
         super().__init__(backbone)
-        self.memory_width = backbone.action.width
+        self.memory_width, self.memory_position = backbone.action.width, checked_position(memory_position)
         sizes = (self.memory_width, num_heads, num_kv_heads, head_dim or backbone.head_dim, exact_identity)
         self.layers = nn.ModuleList(ModulatorLayer(*sizes) for _ in range(backbone.depth))
 
     def hook(self, memory: MemoryTokens | None) -> Hook:
         memory = required(memory)
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
-        cached = [layer.keys_values(tokens) for layer in self.layers]  # type: ignore[operator]
+        positions = None if self.memory_position == "slot" else tokens.shape[1] - 1 - ages_of(memory)
+        cached = [layer.keys_values(tokens, positions) for layer in self.layers]  # type: ignore[operator]
         mask = additive_mask(memory.mask[:, None], tokens.dtype)  # b 1 1 m: every action sees the same keys
         return lambda layer, x: self.layers[layer](x, *cached[layer], mask)
 

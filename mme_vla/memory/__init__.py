@@ -3,6 +3,19 @@
 Importing this room registers the memories it ships.
 """
 
-from mme_vla.memory import framesamp, joined, rmt, tokendrop, ttt
+from mme_vla.memory import (
+    framesamp,
+    gist,
+    joined,
+    learned_topk,
+    moment,
+    own_actions,
+    retrieval,
+    rmt,
+    tokendrop,
+    ttt,
+)
 
-__all__ = ["framesamp", "joined", "rmt", "tokendrop", "ttt"]
+__all__ = [
+    "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "tokendrop", "ttt",
+]  # fmt: skip

@@ -24,6 +24,9 @@ class Memory(nn.Module):
             are padded to it unless `padded_length` says otherwise.
         storage: what has to be stored of each frame.
         pad_left: True puts the padding before the tokens (recurrent memories), False after them.
+        timed: whether each memory token speaks of one moment, which `MemoryTokens.ages` tells: what
+            `integration.memory_position=time` reads.
+        reads_motion: whether it reads what the robot felt and did (`History.moved`) instead of stored tokens.
 
     `reporting` is set from outside: True asks `forward` for numbers about its inside, as `MemoryTokens.metrics`. The
     training loop sets it for the updates it logs; where it is False, what only these numbers need is not computed.
@@ -35,6 +38,8 @@ class Memory(nn.Module):
     capacity: int
     storage: StorageSpec
     pad_left: bool = False
+    timed: bool = False
+    reads_motion: bool = False
     reporting: bool = False
 
     def check_grid(self, views: int) -> None:
@@ -111,6 +116,7 @@ class Memory(nn.Module):
             features=nn.functional.pad(features, (0, 0, before, after)),
             positions=nn.functional.pad(positions, (0, 0, before, after)),
             mask=nn.functional.pad(mask, (before, after)),
+            step=torch.tensor(step, device=features.device),
         )
 
     def full_history(self, d_vision: int, device: torch.device | str = "cpu") -> HistoryTokens:
@@ -120,6 +126,7 @@ class Memory(nn.Module):
             torch.zeros(1, n, d_vision, device=device),
             torch.zeros(1, n, 3, device=device),
             torch.ones(1, n, dtype=torch.bool, device=device),
+            torch.zeros(1, dtype=torch.int64, device=device),
         )
 
     def start_stream(self) -> Any:
@@ -164,4 +171,6 @@ def stack_history(items: Sequence[HistoryTokens], device: torch.device | None = 
         around = [0, 0] * (rows[0].ndim - 1)
         return torch.stack([nn.functional.pad(row, (*around, length - len(row), 0)) for row in rows]).to(device)
 
-    return HistoryTokens(stack("features"), stack("positions"), stack("mask"))
+    steps = [item.step for item in items if item.step is not None]
+    step = torch.stack(steps).to(device) if len(steps) == len(items) else None
+    return HistoryTokens(stack("features"), stack("positions"), stack("mask"), step)

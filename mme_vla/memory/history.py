@@ -78,7 +78,13 @@ class FrameScores:
 
 
 class History:
-    """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video)."""
+    """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video).
+
+    `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised; it is there for memories that
+    say `reads_motion`.
+    """
+
+    motion: Callable[[np.ndarray], Tensor] | None = None
 
     def __init__(self, spec: StorageSpec, exec_start: int = 0) -> None:
         self.spec = spec
@@ -99,6 +105,23 @@ class History:
             UserError: a frame lies beyond the history or was not kept.
         """
         raise NotImplementedError
+
+    def stored(self, indices: np.ndarray) -> Tensor:
+        """`gather` without what a prompt does to tokens: what a selection may look at, in training as in episodes."""
+        return self.gather(indices)
+
+    def moved(self, frames: np.ndarray) -> Tensor:
+        """What the robot felt and did at frames [n]: [n, w] float32.
+
+        Raises:
+            UserError: nobody noted it.
+        """
+        if self.motion is None:
+            raise UserError(
+                "This memory reads the robot's own states and actions, and this history has none of them: give states "
+                "with the frames (`Episode.observe`)."
+            )
+        return self.motion(frames)
 
     def _row_of(self, frames: np.ndarray, kept: np.ndarray) -> np.ndarray:
         rows = np.minimum(np.searchsorted(kept, frames), max(len(kept) - 1, 0))
@@ -229,7 +252,7 @@ class MarkedHistory(History):
 
     def __init__(self, whole: History, mark: Callable[[Tensor], Tensor]) -> None:
         super().__init__(whole.spec, whole.exec_start)
-        self._whole, self._mark = whole, mark
+        self._whole, self._mark, self.motion = whole, mark, whole.motion
 
     def __len__(self) -> int:
         return len(self._whole)
@@ -240,3 +263,6 @@ class MarkedHistory(History):
 
     def gather(self, indices: np.ndarray) -> Tensor:
         return self._mark(self._whole.gather(indices))
+
+    def stored(self, indices: np.ndarray) -> Tensor:
+        return self._whole.stored(indices)

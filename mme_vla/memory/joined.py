@@ -1,7 +1,7 @@
 """Several memories under one budget, side by side: their tokens stand one after the other (beyond the paper)."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,8 @@ class JoinedMemory(Memory):
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
+        self.timed = all(member.timed for member in built)
+        self.reads_motion = any(member.reads_motion for member in built)
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
@@ -82,7 +84,8 @@ class JoinedMemory(Memory):
         for place, i in enumerate(self._order):
             part = memories[i].recall(views[i], step, rng)
             parts.append(_padded(part, memories[i]) if place else part)
-        return HistoryTokens(*(torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS))
+        features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
+        return HistoryTokens(features, positions, mask, parts[0].step)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
@@ -92,7 +95,8 @@ class JoinedMemory(Memory):
         found: dict[int, MemoryTokens] = {}
         for i, piece in zip(self._order, pieces, strict=True):
             memories[i].reporting = self.reporting
-            found[i] = memories[i](HistoryTokens(*piece))
+            features, positions, mask = piece
+            found[i] = memories[i](HistoryTokens(features, positions, mask, history.step))
         return self._joined([found[i] for i in range(len(memories))])
 
     def start_stream(self) -> tuple[Any, ...]:
@@ -119,7 +123,10 @@ class JoinedMemory(Memory):
             for name, tokens in zip(self.names, found, strict=True)
             for key, value in tokens.metrics.items()
         }
-        return MemoryTokens(torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1), metrics)
+        told = [f.ages for f in found if f.ages is not None]
+        ages = torch.cat(told, 1) if len(told) == len(found) else None
+        tokens, mask = torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1)
+        return MemoryTokens(tokens, mask, metrics, ages)
 
 
 _FIELDS = ("features", "positions", "mask")
@@ -130,7 +137,7 @@ class CoarserHistory(History):
 
     def __init__(self, stored: History, spec: StorageSpec) -> None:
         super().__init__(spec, stored.exec_start)
-        self._stored = stored
+        self._stored, self.motion = stored, stored.motion
 
     def __len__(self) -> int:
         return len(self._stored)
@@ -142,8 +149,14 @@ class CoarserHistory(History):
         return FrameScores(scores.frames, rows.reshape(-1, grid**2))
 
     def gather(self, indices: np.ndarray) -> Tensor:
+        return self._pooled(indices, self._stored.gather)
+
+    def stored(self, indices: np.ndarray) -> Tensor:
+        return self._pooled(indices, self._stored.stored)
+
+    def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
         parts = (self._stored.spec.grid // self.spec.grid) ** 2
-        found = self._stored.gather(finer(indices, self.spec.grid, self._stored.spec.grid))
+        found = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
         if parts == 1:
             return found
         cells = found.unflatten(0, (-1, parts)).float()
@@ -226,7 +239,8 @@ def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:
     missing = member.capacity - len(part.mask)
     ends = (missing, 0) if member.pad_left else (0, missing)
     pad = nn.functional.pad
-    return HistoryTokens(pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends)), pad(part.mask, ends))
+    features, positions = pad(part.features, (0, 0, *ends)), pad(part.positions, (0, 0, *ends))
+    return HistoryTokens(features, positions, pad(part.mask, ends), part.step)
 
 
 def _distinct(names: Sequence[str]) -> list[str]:

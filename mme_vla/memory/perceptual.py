@@ -9,6 +9,8 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 class PerceptualMemory(Memory):
     """Selected tokens, right-padded to the budget and encoded one by one; subclasses choose."""
 
+    timed = True
+
     def __init__(
         self,
         d_vision: int,
@@ -31,4 +33,5 @@ class PerceptualMemory(Memory):
         self.encoder = FeatureEncoder(d_vision, width, position_dim, position_hidden)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        return MemoryTokens(self.encoder(history.features, history.positions, history.mask), history.mask)
+        tokens = self.encoder(history.features, history.positions, history.mask)
+        return MemoryTokens(tokens, history.mask, ages=history.ages)

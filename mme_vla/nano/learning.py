@@ -92,7 +92,8 @@ class Decisions(Dataset[int]):
         values = {name: value for name, value in vars(self.batch).items() if isinstance(value, Tensor)}
         values["far"] = self.far
         if self.batch.history is not None:
-            values |= {f"{_PAST}{name}": value for name, value in vars(self.batch.history).items()}
+            past = vars(self.batch.history).items()
+            values |= {f"{_PAST}{name}": value for name, value in past if isinstance(value, Tensor)}
         with write_atomically(path) as draft:
             save_file({name: value.contiguous() for name, value in values.items()}, draft)
 

@@ -53,9 +53,12 @@ class Episode:
         """What can be chosen, for policies that choose; set it before `act`."""
         memory = policy.memory
         self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
+        if self.history is not None and memory is not None and memory.reads_motion:
+            self.history.motion = lambda frames: torch.stack([self._moved[int(frame)] for frame in frames])
         self.stream = None if memory is None else memory.start_stream()
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.frames_seen = 0
+        self._moved: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
         self._chunk: np.ndarray | None = None
         self._robot = policy.embodiment
         self._executed = self._no_actions
@@ -109,11 +112,16 @@ class Episode:
             if i == count - 1 or not demo[i]
         ]
         camera = self._robot.memory_camera
-        self._take(views[camera], demo, executed, None if drawn is None else np.asarray(drawn[camera], np.int64))
+        seen_at = None if drawn is None else np.asarray(drawn[camera], np.int64)
+        self._take(views[camera], demo, executed, seen_at, states)
         self._see(seen)
 
     def remember(
-        self, frames: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
+        self,
+        frames: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+        states: np.ndarray | None = None,
     ) -> None:
         """Take frames into memory alone, for a client that sends past frames and the current view apart.
 
@@ -121,18 +129,21 @@ class Episode:
 
         Args:
             frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
-            is_demo, actions: as for `observe`.
+            is_demo, actions: as for `observe`. states: [t, s]; only a memory of the robot's own motion needs them.
 
         Raises:
-            UserError: a wrong dtype or shape, or a video frame after execution has begun.
+            UserError: a wrong dtype or shape, a video frame after execution has begun, or a memory that needs states.
         """
         camera = self._robot.memory_camera
         frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
         if demo.shape not in ((), (len(frames),)):
             raise UserError(f"is_demo must be one flag or {len(frames)}, one a frame; got {demo.shape}.")
+        if states is not None and np.shape(states) != (len(frames), self._robot.state.width):
+            raise UserError(f"states must be [{len(frames)}, {self._robot.state.width}]; got {list(np.shape(states))}.")
         if len(frames):
-            self._take(frames, *self._checked_course(len(frames), demo, actions))
+            felt = None if states is None else finite_array(states, "states")
+            self._take(frames, *self._checked_course(len(frames), demo, actions), states=felt)
 
     def look(self, pictures: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
@@ -165,10 +176,16 @@ class Episode:
         return demo, self._executed_now(int((~demo).sum()), actions)
 
     def _take(
-        self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray, drawn: np.ndarray | None = None
+        self,
+        frames: np.ndarray,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        drawn: np.ndarray | None = None,
+        states: np.ndarray | None = None,
     ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
+            self._moved += self._motion(demo, executed, states)
             wanted = self.history.wanted(len(demo), drawn)
             places = wanted if drawn is None else np.searchsorted(drawn, wanted)
             self.history.append(frames, self._policy.encode_frames(frames[places]), drawn, len(demo))
@@ -180,6 +197,25 @@ class Episode:
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
         self.frames_seen += len(demo)
+
+    def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
+        """Rows of motion of the next frames, for a memory that reads them.
+
+        Raises:
+            UserError: it does, and there are no states, or no statistics.
+        """
+        if not self._policy.require_memory().reads_motion:
+            return []
+        if states is None:
+            raise UserError(
+                "This policy's memory reads the robot's own states and actions: give past frames with their states "
+                "(`Episode.observe`), not as pictures alone."
+            )
+        actions, own = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
+        if self._robot.action.frames is not None:
+            places = np.flatnonzero(~demo)[: len(executed)]
+            actions[places], own[places] = executed[: len(places)], True
+        return list(self._policy.require_processor().motion(states, actions, own))
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""

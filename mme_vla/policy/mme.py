@@ -1,6 +1,6 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -114,6 +114,8 @@ class MMEPolicy(Policy):
         if (memory is None) != (integration.memory_width == 0):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
+        if memory is not None:
+            _check_positions(config, integration, memory, backbone_cls.hosts)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
     def autocast(self) -> torch.autocast:
@@ -323,6 +325,22 @@ class MMEPolicy(Policy):
         parts = {part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items()}
         experts = f"|{parts['memory']}" if "memory" in parts else ""
         return {**parts, "memory": rf"memory\.|integration\.{experts}"}
+
+
+def _check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, hosts: Set[str]) -> None:
+    """Make sure that a memory that shall be placed in time can be: its tokens have one, the backbone a place for it."""
+    if integration.memory_position != "time":
+        return
+    if not memory.timed:
+        raise UserError(
+            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} stand for no one "
+            "moment each. Take memory_position=slot, or a memory that says `timed`."
+        )
+    if "blocks" in doors_of(type(integration)) and "positions" not in hosts:
+        raise UserError(
+            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
+            "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
+        )
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:

@@ -13,7 +13,7 @@ from torch import Tensor
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
 from mme_vla.files import check_sums, inside, read_json
-from mme_vla.processing.normalisers import NormStats
+from mme_vla.processing.normalisers import NormStats, normalize
 from mme_vla.registry import PROCESSORS
 
 CONFIG_FILE = "processor.json"
@@ -172,6 +172,26 @@ class PolicyProcessor:
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
         """The network's answer [..., h, a] at raw states [..., s] as actions [..., h, w] that the robot takes."""
         raise NotImplementedError
+
+    def motion(self, states: np.ndarray, actions: np.ndarray, known: np.ndarray) -> Tensor:
+        """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
+
+        Args:
+            states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False
+                where none of the robot's own did; what stands in `actions` there does not matter.
+
+        Returns:
+            [state | action relative to it | known], normalised; actions are 0 where they are not known.
+
+        Raises:
+            UserError: there are no statistics.
+        """
+        stats = self.require_stats()
+        felt = torch.from_numpy(np.asarray(states, np.float32))
+        done = torch.from_numpy(np.asarray(actions, np.float32))
+        own = torch.from_numpy(np.asarray(known, np.float32))[:, None]
+        relative = self.embodiment.action.to_relative(done[:, None], felt)[:, 0]
+        return torch.cat([normalize(felt, stats.state), normalize(relative, stats.actions) * own, own], 1)
 
     # Batches
 

@@ -34,10 +34,12 @@ class AddBuffer:
 
     frames: t pictures [H, W, 3] uint8 of the camera that feeds memory.
     exec_start: index of the episode's first execution frame; 0 where it is not said.
+    states: what the robot felt at these frames, [t, s].
     """
 
     frames: Sequence[np.ndarray]
     exec_start: int
+    states: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,7 @@ class Infer:
     frames: frames to remember first, the current one last (challenge); None where they came by `add_buffer`.
     first: whether the message begins an episode; None where the schema does not say.
     options: what can be chosen, for a policy that chooses; none where they stay as they were.
+    states: what the robot felt at `frames`, [t, s].
     """
 
     pictures: Mapping[str, np.ndarray]
@@ -57,6 +60,7 @@ class Infer:
     frames: Sequence[np.ndarray] | None = None
     first: bool | None = None
     options: tuple[Option, ...] = ()
+    states: np.ndarray | None = None
 
 
 Request = Reset | AddBuffer | Infer
@@ -114,7 +118,7 @@ def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) ->
         start = int(start)
     if type(start) is not int or start < 0:
         raise UserError(f"exec_start_idx must be a whole number from 0, got {str(start)[:40]!r}.")
-    return AddBuffer(frames, start)
+    return AddBuffer(frames, start, states)
 
 
 def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
@@ -143,10 +147,10 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
     if not isinstance(first, bool | np.bool_):
         raise UserError(f"is_first_step must be true or false, got {type(first).__name__}.")
     goal = _text("task_goal", _get(message, "task_goal"))
-    state = benchmark_state(joints[-1], grippers[-1])
+    states = np.stack([benchmark_state(*felt) for felt in zip(joints, grippers, strict=True)])
     pictures = {name: view[-1] for name, view in views.items()}
     frames, options = views[robot.memory_camera], _options(message, robot)
-    return Infer(pictures, state, goal, _subgoals(message), frames, bool(first), options)
+    return Infer(pictures, states[-1], goal, _subgoals(message), frames, bool(first), options, states)
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:

@@ -83,7 +83,7 @@ class Session:
         if request.exec_start > 0:
             self._exec_start = request.exec_start
         self._check_room(len(request.frames))
-        await self._engine.run(self._remember(request.frames), self._pieces(request.frames))
+        await self._engine.run(self._remember(request.frames, request.states), self._pieces(request.frames))
 
     async def _infer(self, request: Infer) -> np.ndarray:
         policy = self._engine.policy
@@ -118,11 +118,11 @@ class Session:
 
     def _observe(self, request: Infer) -> Iterator[None]:
         if request.frames is not None:
-            yield from self._remember(request.frames)
+            yield from self._remember(request.frames, request.states)
         self.episode.look(request.pictures, request.state)
         _ = self.episode.prompt  # a goal that cannot be read fails here, and not in a batch with others
 
-    def _remember(self, frames: Sequence[np.ndarray]) -> Iterator[None]:
+    def _remember(self, frames: Sequence[np.ndarray], states: np.ndarray | None) -> Iterator[None]:
         """Take frames into memory, pausing after every `encode_chunk` frames that have to be encoded."""
         episode, piece = self.episode, self._piece
         for start in range(0, len(frames), piece):
@@ -130,7 +130,8 @@ class Session:
                 yield
             taken = np.stack(frames[start : start + piece])
             demo = episode.frames_seen + np.arange(len(taken)) < self._exec_start
-            episode.remember(taken, demo)
+            felt = None if states is None else states[start : start + piece]
+            episode.remember(taken, demo, states=felt)
 
     @property
     def _piece(self) -> int:

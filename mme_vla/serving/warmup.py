@@ -14,8 +14,8 @@ def warm_up(policy: Policy, settings: ServeSettings) -> None:
     episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
     for episode in episodes:
         episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
-        episode.remember(frames)
         robot = policy.embodiment
+        episode.remember(frames, states=np.zeros((len(frames), robot.state.width), np.float32))
         view = dict.fromkeys(robot.camera_names, frames[0])
         episode.look(view, np.zeros(robot.state.width, np.float32))
     policy.act(episodes[:1], settings.flow_steps)

@@ -1,5 +1,6 @@
 """`check_integration`: does memory reach the action through an integration, and only as it should?"""
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -60,16 +61,16 @@ def _loss(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: Mem
     for row in (slice(i, i + 1) for i in range(len(batch.prompt))):
         seen = (batch.images[row], batch.image_mask[row], batch.prompt[row], batch.prompt_mask[row])
         one = Batch(*seen, history=None, actions=batch.actions[row])
-        mine = MemoryTokens(memory.tokens[row], memory.mask[row])
+        mine = memory.rows(row)
         rows.append(policy(one, {name: value[row] for name, value in draws.items()}, memory=mine)[0])
     return torch.stack(rows)
 
 
 def check_reach(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], found: MemoryTokens, before: Tensor) -> None:
     """Other memories give other losses; what stands where the mask is False gives none."""
-    other = _loss(policy, batch, draws, MemoryTokens(-found.tokens, found.mask))
+    other = _loss(policy, batch, draws, replace(found, tokens=-found.tokens))
     assert (other - before).abs().min() > 0, "memory does not reach the action: other tokens, the same loss."
-    padded = MemoryTokens(found.tokens.masked_fill(~found.mask[..., None], 1e3), found.mask)
+    padded = replace(found, tokens=found.tokens.masked_fill(~found.mask[..., None], 1e3))
     assert (~found.mask).any(), "the check needs padding among the memory tokens"
     error = float((_loss(policy, batch, draws, padded) - before).abs().max())
     assert error <= TOLERANCE, f"what stands in the memory's padding changed the loss by {error:.2g}."

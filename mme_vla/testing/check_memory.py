@@ -1,6 +1,7 @@
 """`check_memory`: does a memory keep the promises that training, streaming and the integrations rely on?"""
 
-from typing import Any
+from dataclasses import replace
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -13,8 +14,9 @@ from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
 from mme_vla.types import HistoryTokens, MemoryTokens
 
-D_VISION, WIDTH = 32, 48
+D_VISION, WIDTH, MOTION = 32, 48, 17
 TOLERANCE = 1e-4
+_Kind = TypeVar("_Kind", bound=History)
 
 
 def check_memory(name: str, frames: int = 48, **options: Any) -> None:
@@ -48,6 +50,7 @@ class Episode:
         self.pictures = moving_frames(frames, seed=seed)
         generator = torch.Generator().manual_seed(seed)
         self.tokens = torch.randn(frames, memory.storage.grid**2, D_VISION, generator=generator)
+        self.motion = torch.randn(frames, MOTION, generator=generator)
 
     def cached(self, length: int | None = None) -> CachedHistory:
         """The whole episode, or its first `length` frames, as read from a cache."""
@@ -57,17 +60,23 @@ class Episode:
         rows = [] if scorer is None else [(t, scorer(t, self.pictures[t])) for t in range(length)]
         scored = [(t, values) for t, values in rows if values is not None]
         scores = FrameScores(np.array([t for t, _ in scored]), np.stack([v for _, v in scored])) if scored else None
-        return CachedHistory(spec, self.tokens[kept].numpy(), kept, length, scores, self.exec_start)
+        history = CachedHistory(spec, self.tokens[kept].numpy(), kept, length, scores, self.exec_start)
+        return self._moving(history)
+
+    def _moving(self, history: _Kind) -> _Kind:
+        """The history with what the robot felt and did, where its memory reads that."""
+        history.motion = self.motion.__getitem__ if self.memory.reads_motion else None
+        return history
 
     def online(self, piece: int, until: int | None = None) -> OnlineHistory:
         """The first `until` frames as an environment delivers them, `piece` at a time."""
-        history = OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start)
+        history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
         self.extend(history, piece, self.length if until is None else until)
         return history
 
     def sparse(self, drawn: np.ndarray, until: int) -> OnlineHistory:
         """The first `until` frames, of which only some have a picture."""
-        history = OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start)
+        history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
         tokens = self.tokens[history.wanted(until, drawn)]
         history.append(self.pictures[drawn], tokens, drawn, until)
         return history
@@ -96,13 +105,14 @@ def check_selection(memory: Memory, frames: int) -> None:
         assert chosen.min() >= 0 and chosen[:, 1].max() < patches, f"patches must lie in 0 to {patches - 1}."
         assert (np.diff(chosen[:, 0]) >= 0).all(), f"at step {step} the selection is not in time order."
         kept = set(memory.storage.kept_frames(step + 1).tolist())
-        assert set(chosen[:, 0].tolist()) <= kept, "select chose frames that the StorageSpec does not keep."
+        pictures = set() if memory.reads_motion else set(chosen[:, 0].tolist())
+        assert pictures <= kept, "select chose frames that the StorageSpec does not keep."
         again = memory.select(whole, step)
         assert np.array_equal(chosen, again), "without rng, select must make the same choice every time."
         short = memory.select(episode.cached(step + 1), step)
         assert np.array_equal(chosen, short), f"what comes after step {step} changed what select chose there."
         read = memory.frames_read([step], episode.exec_start)
-        assert set(chosen[:, 0].tolist()) <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
+        assert pictures <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
         sparse = memory.select(episode.sparse(read, step + 1), step)
         assert np.array_equal(chosen, sparse), f"at step {step} select differs where only frames_read was drawn."
     for piece in (1, 16, 23):
@@ -139,16 +149,16 @@ def check_encoding(memory: Memory, frames: int) -> None:
     assert found.mask.any(1).all(), "a row has no valid memory token."
     assert torch.isfinite(_valid(found)).all(), "a valid memory token is not finite."
 
-    hidden = HistoryTokens(history.features.clone(), history.positions.clone(), history.mask)
+    hidden = replace(history, features=history.features.clone(), positions=history.positions.clone())
     hidden.features[~history.mask], hidden.positions[~history.mask] = 1e3, 77.0
     error = float((_valid(_encoded(memory, hidden)) - _valid(found)).abs().max())
     assert error <= TOLERANCE, f"what stands in padding changed the memory tokens by {error:.2g}."
 
-    alone = _encoded(memory, HistoryTokens(*(x[1:] for x in (history.features, history.positions, history.mask))))
+    alone = _encoded(memory, history.rows(slice(1, None)))
     error = float((_valid(alone)[0] - _valid(found)[1]).abs().max())
     assert error <= TOLERANCE, f"beside another sample the same selection gives other tokens (by {error:.2g})."
 
-    changed = HistoryTokens(-history.features, history.positions, history.mask)
+    changed = replace(history, features=-history.features)
     assert not torch.equal(_valid(_encoded(memory, changed)), _valid(found)), "forward does not read the features."
 
     was = {name: parameter.requires_grad for name, parameter in memory.named_parameters()}

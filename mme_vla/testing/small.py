@@ -18,6 +18,11 @@ from mme_vla.types import Batch, HistoryTokens
 PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
 RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
 NEURAL = [*PERCEPTUAL, *RECURRENT]
+"""The paper's."""
+BEYOND_MEMORIES = ("retrieval", "moment", "gist", "actions", "learned_topk")
+ALL_BEYOND = [f"{m}_{i}" for m in BEYOND_MEMORIES for i in ("context", "modul", "expert")]
+BEYOND = ["retrieval_modul", "moment_context", "gist_expert", "actions_expert", "learned_topk_context"]
+"""Of each memory beyond the paper one composition, for tests that go through all models."""
 MODELS = ["pi05", *NEURAL]
 # The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
 ALL_MODELS = ["pi05", "pi05_past_actions", "simplesg", "groundsg", *NEURAL, "hybrid"]
@@ -80,7 +85,7 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
     mask[:, slice(n - valid, n) if policy.memory.pad_left else slice(valid)] = True
     features = torch.randn(batch, n, d, generator=generator) * mask[..., None]
     positions = torch.randint(0, 64, (batch, n, 3), generator=generator).float() * mask[..., None]
-    return HistoryTokens(features, positions, mask)
+    return HistoryTokens(features, positions, mask, torch.full((batch,), 64))
 
 
 def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:

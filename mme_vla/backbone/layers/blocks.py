@@ -25,12 +25,14 @@ class Block:
     """A run of tokens that share a name, hence a row of the table, and an expert whose weights process them.
 
     tokens: [b, n, d] at the expert's width. mask: [b, n] bool, False on padding.
+    positions: [b, n] rotary positions of its own, on the line on which the others are numbered; None numbers it too.
     """
 
     name: str
     tokens: Tensor
     mask: Tensor
     expert: str
+    positions: Tensor | None = None
 
     def __len__(self) -> int:
         return self.tokens.shape[1]
@@ -73,3 +75,12 @@ def token_positions(mask: Tensor, past_mask: Tensor | None = None) -> Tensor:
     """Rotary positions [b, n]: valid tokens are numbered on, padding repeats the number before it (−1 at the start)."""
     positions = mask.long().cumsum(1) - 1
     return positions if past_mask is None else positions + past_mask.long().sum(1, keepdim=True)
+
+
+def placed(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
+    """Rotary positions [b, n] of blocks in sequence order: those of a block's own, where it has some."""
+    if all(block.positions is None for block in blocks):
+        return numbered
+    parts = numbered.float().split([len(block) for block in blocks], 1)
+    own = [part if block.positions is None else block.positions for part, block in zip(parts, blocks, strict=True)]
+    return torch.cat(own, 1)

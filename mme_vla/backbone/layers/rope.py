@@ -20,7 +20,7 @@ class Rotation(NamedTuple):
 
 
 def rotation(positions: Tensor, head_dim: int) -> Rotation:
-    """Angles p·10000^(−2i/h) for integer positions [b, n]."""
+    """Angles p·10000^(−2i/h) for positions [b, n], whole numbers or not."""
     exponent = torch.arange(head_dim // 2, device=positions.device, dtype=torch.float32) * (2 / head_dim)
     angles = (positions[..., None, None].float() / BASE**exponent).repeat(1, 1, 1, 2)
     return Rotation(angles.cos(), angles.sin())

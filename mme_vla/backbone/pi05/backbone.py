@@ -29,7 +29,7 @@ class Pi05Backbone(Backbone):
 
     Config = BackboneConfig
     sample_steps = EULER_STEPS
-    hosts = frozenset({"blocks", "expert", "hook", "condition", "beside"})
+    hosts = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions"})
     heads = ("action_in", "action_out", "time_in", "time_out")
     # `kv` is what the VLM's last layer has in place of `qkv`.
     adapted = tuple(

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 
 from mme_vla.backbone.base import Hook
 from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, token_positions
+from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, placed, token_positions
 from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.layers.rope import Rotation, rotate, rotation
@@ -226,7 +226,7 @@ class JointTransformer(nn.Module):
         """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
         spans = [Span(block.name, len(block)) for block in blocks]
         asking = torch.cat([block.mask for block in blocks], 1)
-        positions = token_positions(asking, past.mask if past else None)
+        positions = placed(token_positions(asking, past.mask if past else None), blocks)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
         seen = attention_mask(spans, all_spans, asking, valid, table)
         mask = additive_mask(seen, compute_dtype(blocks[0].tokens))

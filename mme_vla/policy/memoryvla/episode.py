@@ -39,7 +39,12 @@ class MemoryVlaEpisode(Episode):
         self._due: np.ndarray | None = None
 
     def _take(
-        self, frames: np.ndarray, demo: np.ndarray, executed: np.ndarray, drawn: np.ndarray | None = None
+        self,
+        frames: np.ndarray,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        drawn: np.ndarray | None = None,
+        states: np.ndarray | None = None,
     ) -> None:
         if self.asked is not None:
             self.banks = self._writer.core.store(self.banks, *self.asked)
@@ -53,7 +58,7 @@ class MemoryVlaEpisode(Episode):
                 self._due = None
             if demo[i] and (self.frames_seen + i) % VIDEO_STRIDE == 0:
                 self._due = pictures[i].copy()
-        super()._take(frames, demo, executed, drawn)
+        super()._take(frames, demo, executed, drawn, states)
         if moments:
             self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
 
