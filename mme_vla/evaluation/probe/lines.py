@@ -11,7 +11,8 @@ from typing import Any
 from mme_vla.errors import UserError
 from mme_vla.files import parse_json, read_bytes
 
-LINES = "offline.jsonl"
+LINES = "offline*.jsonl"
+"""The files of all shards."""
 LIMIT = 2**30
 
 
@@ -94,6 +95,15 @@ def read(path: Path) -> tuple[list[Line], set[str]]:
             read_line = _line(row, f"{path}, line {number}")
             found.setdefault(read_line.recording, []).append(read_line)
     return [line for lines in done.values() for line in lines], set(done)
+
+
+def read_all(folder: Path) -> list[Line]:
+    """The lines of every shard.
+
+    Raises:
+        UserError: a line that is none.
+    """
+    return [line for path in sorted(folder.glob(LINES)) for line in read(path)[0]]
 
 
 def _line(row: dict[str, Any], where: str) -> Line:

@@ -1,19 +1,22 @@
 """A probe on recorded episodes: how the chunk that a policy would choose changes with what it remembers."""
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws
+from mme_vla.config.sections import read_section
 from mme_vla.evaluation.probe import lines
 from mme_vla.evaluation.probe.arms import UNPROBED, Arm
 from mme_vla.evaluation.probe.channels import Recollection
 from mme_vla.evaluation.probe.feed import Feed
+from mme_vla.evaluation.probe.interventions import whole
 from mme_vla.evaluation.probe.lending import Lenders
 from mme_vla.evaluation.probe.lines import EntryLine, Line, MomentLine
 from mme_vla.evaluation.probe.measure import compare_chunks
@@ -39,26 +42,40 @@ class OfflineSettings:
     scan: bool = True
     flow_steps: int | None = None
 
+    def __post_init__(self) -> None:
+        least = {"seed": 0, "draws": 1, **({} if self.moments is None else {"moments": 1})}
+        for name, smallest in least.items():
+            whole(name, getattr(self, name), smallest)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read the keys of a configuration that are settings; others are ignored.
+
+        Raises:
+            UserError: a value that cannot be.
+        """
+        return read_section(cls, config, others=True)
+
 
 def probe_offline(
     policy: Policy,
     arms: Sequence[Arm],
     recordings: Sequence[Recording],
     lend: Sequence[Recording],
-    folder: Path,
+    path: Path,
     settings: OfflineSettings,
     after: Callable[[int], None] = lambda count: None,
 ) -> list[Line]:
-    """Probe every recorded episode that `folder` holds no lines of yet; all lines, old and new.
+    """Probe every recorded episode that the file holds no lines of yet; all its lines, old and new.
 
     Args:
-        recordings: episodes to probe. lend: episodes to take from, the same or others. after: told of each that is done.
+        recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines.
+        after: told of each episode that is done.
 
     Raises:
         UserError: the policy cannot be shown recorded episodes.
     """
     check_robot(policy)
-    path = folder / lines.LINES
     _, done = lines.read(path)
     lenders = Lenders(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
     for recording in recordings:
