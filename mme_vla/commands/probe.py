@@ -47,7 +47,7 @@ def main(cfg: DictConfig) -> None:
         return
     if not (plain["offline"] or plain["online"]):
         raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
-    if plain["offline"] and plain["data"] is None:
+    if plain["offline"] and plain["recordings"] is None:
         raise UserError(NO_DATA)
     settings = RolloutSettings.from_config(plain)
     offline = OfflineSettings.from_config(plain)
@@ -58,7 +58,7 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
-    recordings = _recordings(plain["data"], policy)
+    recordings = _recordings(plain["recordings"], policy)
     probed = _chosen(recordings, plain["recorded"]) if plain["offline"] else []
     subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]), device) if jobs else None
     facts = RunFacts(

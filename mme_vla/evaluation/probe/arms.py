@@ -176,10 +176,10 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
-    told = []
+    told: list[dict[str, Any]] = []
     for part in arm.parts:
-        options = {option.name: getattr(part, option.name) for option in fields(part)} if is_dataclass(part) else {}
-        told.append({"intervention": type(part).__name__, **options})
+        names: list[str] = [option.name for option in fields(part)] if is_dataclass(part) else []
+        told.append({"intervention": type(part).__name__, **{name: getattr(part, name) for name in names}})
     return told
 
 

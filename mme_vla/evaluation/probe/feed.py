@@ -33,7 +33,7 @@ class Feed:
         """
         frames = np.asarray(frames, np.int64)
         video = exec_start if self.video else 0
-        later = np.where(frames > exec_start + self.at, self.stills, 0)
+        later = np.where(frames >= exec_start + self.at, self.stills, 0)  # the frame that stands still: its last repeat
         executed = before + video + frames - exec_start + later
         return np.where(frames >= exec_start, executed, before + frames if self.video else -1)
 

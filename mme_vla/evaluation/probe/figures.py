@@ -26,12 +26,11 @@ def decay(findings: Findings) -> str:
     with picture((5.6, 3.4)) as (canvas, (axes,)):
         for name, video, colour in (("video", True, COLOURS[0]), ("execution", False, COLOURS[1])):
             points = findings.decay(video)
-            dots = [(e.age, e.change) for e in findings.entries if e.video == video]
-            if dots:
-                axes.scatter(*zip(*dots, strict=True), s=8, color=colour, alpha=0.25, lw=0)
-                axes.plot(
-                    [age for age, _ in points], [f.change for _, f in points], "-o", color=colour, ms=5, label=name
-                )
+            mine = [e for e in findings.entries if e.video == video]
+            if mine:
+                axes.scatter([e.age for e in mine], [e.change for e in mine], s=8, color=colour, alpha=0.25, lw=0)
+                means = [found.change for _, found in points]
+                axes.plot([age for age, _ in points], means, "-o", color=colour, ms=5, label=name)
         spread = [entry.spread for entry in findings.entries]
         if spread:
             axes.axhline(sum(spread) / len(spread), color=FAINT, lw=1, ls="--", label="own spread")

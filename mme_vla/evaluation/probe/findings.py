@@ -80,9 +80,8 @@ class Findings:
 
     def decay(self, video: bool) -> list[tuple[float, Effect]]:
         """Mean age and effect of the entries of each bin of age, those of the video or of the execution."""
-        bins = _grouped(
-            [e for e in self.entries if e.video == video], lambda e: int(np.searchsorted(AGES, e.age, "right"))
-        )
+        mine = [entry for entry in self.entries if entry.video == video]
+        bins = _grouped(mine, lambda entry: int(np.searchsorted(AGES, entry.age, "right")))
         return [(float(np.mean([e.age for e in lines])), effect(lines)) for _, lines in sorted(bins.items())]
 
     def reach(self) -> float | None:
@@ -129,16 +128,7 @@ def arms_table(findings: Findings) -> Table:
         times = "–" if found.times is None else f"{found.times:.1f}×"
         rows.append([name, str(found.moments), touched, f"{found.change:.3f}", f"{found.spread:.3f}", times,
                      f"{100 * found.beyond:.0f} %", f"{found.distance:.3f}"])  # fmt: skip
-    columns = (
-        "arm",
-        "moments",
-        "age touched",
-        "change",
-        "own spread",
-        "change / spread",
-        "beyond it",
-        "energy distance",
-    )
+    columns = ("arm", "moments", "age touched", "change", "own spread", "times that", "beyond it", "energy distance")
     return Table("What each intervention does to the chunk", columns, rows)
 
 

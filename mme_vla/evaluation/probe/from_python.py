@@ -22,7 +22,7 @@ from mme_vla.subgoal import SubgoalPredictor, build_predictor
 
 def probe(
     policy: Policy | str | Path,
-    data: Any = None,
+    recordings: Any = None,
     arms: Sequence[Any] | None = None,
     *,
     output: str | Path,
@@ -41,11 +41,12 @@ def probe(
 
     Args:
         policy: one with statistics; or a folder or hub repository to load one from.
-        data: recorded episodes: folders of datasets, as `data=` of the command. Without them the closed loop is probed.
+        recordings: recorded episodes: folders of datasets, as for the command. Without them the closed loop is probed.
         arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that are possible.
         output: the probe's folder, for its lines and its page.
         tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
-        seed: of noise and of what is drawn at random. draws: chunks sampled at each moment. moments: most of an episode.
+        seed: of noise and of what is drawn at random.
+        draws: chunks sampled at each moment. moments: most of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
         shown: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
@@ -56,16 +57,16 @@ def probe(
     Raises:
         UserError: nothing to probe on, an intervention that does not exist or does not fit, or a setting likewise.
 
-    >>> probe("outputs/mine/latest", "outputs/val", ["shuffle"], output="outputs/probe").findings.arms()  # doctest: +SKIP
+    >>> probe("outputs/mine/latest", "outputs/val", output="outputs/probe").page  # doctest: +SKIP
     """
     known = [option.name for option in fields(RolloutSettings) if option.name != "seed"]
     if unknown := [key for key in settings if key not in known]:
         raise UserError(f"probe() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
-    if data is None and tasks is None:
-        raise UserError(f"probe() needs data=…, tasks=…, or both. {NO_DATA}")
+    if recordings is None and tasks is None:
+        raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
     chosen = RolloutSettings(seed=seed, **settings)
     loaded, source = load(policy)
-    recordings = [] if data is None else all_recordings(open_sources(data, loaded.embodiment))
+    recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
     jobs = [] if tasks is None else choose_episodes(tasks, episodes, chosen.split)
     if jobs and base is make_env and chosen.env == "mme_vla":
         require_simulator()
@@ -74,6 +75,6 @@ def probe(
         name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, chosen.split,
         chosen.max_steps, subgoal if isinstance(subgoal, str) else None, memory_budget(loaded),
     )  # fmt: skip
-    wanted = Wanted(arms, recordings, recordings, jobs, OfflineSettings(seed, draws, moments), source=source)
+    wanted = Wanted(arms, recorded, recorded, jobs, OfflineSettings(seed, draws, moments), source=source)
     folder = Path(output).expanduser()
     return run_probe(loaded.eval(), wanted, folder, facts, chosen, subgoals=predictor, base=base, shown=shown)

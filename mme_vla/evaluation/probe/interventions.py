@@ -20,7 +20,7 @@ NEEDS = {
     "clock": "entries that have a time",
     "pauses": "a memory that sees frames at which nothing is decided",
     "subgoal": "a policy that reads subgoals",
-    "recordings": "recorded episodes to take from: name them with data=…",
+    "recordings": "recorded episodes to take from: name them with recordings=…",
     "boundaries": "recorded sub-tasks, which an episode in closed loop does not tell; offline=true has them",
 }
 """What an intervention can ask for, in words."""

@@ -14,6 +14,7 @@ from mme_vla.files import parse_json, read_bytes
 LINES = "offline*.jsonl"
 """The files of all shards."""
 LIMIT = 2**30
+DONE = b'{"kind":"done"'
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,19 @@ def append(path: Path, lines: Iterable[Line], recording: str) -> None:
     rows.append({"kind": "done", "recording": recording})
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
+        file.truncate(_whole(path.read_bytes()))
         file.write("".join(json.dumps(row, separators=(",", ":")) + "\n" for row in rows).encode())
         file.flush()
         os.fsync(file.fileno())
+
+
+def _whole(content: bytes) -> int:
+    """How many bytes there are up to the last recorded episode that is done: what follows was cut off."""
+    end = kept = 0
+    for line in content.splitlines(keepends=True):
+        end += len(line)
+        kept = end if line.startswith(DONE) and line.endswith(b"\n") else kept
+    return kept
 
 
 def read(path: Path) -> tuple[list[Line], set[str]]:

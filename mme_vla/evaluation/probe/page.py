@@ -39,11 +39,8 @@ def remembered_picture(lines: Sequence[EntryLine], recording: Recording) -> "Ima
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):
         label = f"{line.age} ago: {line.change:.2f}"
-        frame = min(max(line.time, 0), recording.length - 1)
-        tiles.append(
-            Tile(recording.source.frames(recording.episode, [frame])[0], label, VIDEO if line.video else EXECUTION)
-        )
-    tiles.append(Tile(recording.source.frames(recording.episode, [step])[0], f"now: frame {step}", NOW))
+        tiles.append(Tile(recording.frame(line.time), label, VIDEO if line.video else EXECUTION))
+    tiles.append(Tile(recording.frame(step), f"now: frame {step}", NOW))
     title = f"{lines[0].task or recording.name}: change of the chunk without each entry"
     return contact_sheet(tiles, min(len(tiles), 8), title, None)
 

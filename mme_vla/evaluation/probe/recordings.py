@@ -50,6 +50,10 @@ class Recording:
         """What is said at a step, or None where the dataset has no such column."""
         return self.source.subgoals(self.episode, step).get(column)
 
+    def frame(self, number: int) -> np.ndarray:
+        """A picture [H, W, 3] uint8 of the camera that feeds memory."""
+        return self.source.frames(self.episode, [number])[0]
+
     def boundaries(self) -> list[int]:
         """Frames at which a sub-task begins, the execution's first among them."""
         if not self.tells_subtasks:

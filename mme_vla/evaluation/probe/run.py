@@ -28,9 +28,9 @@ from mme_vla.subgoal import SubgoalPredictor
 
 OFFLINE = "offline"
 NO_DATA = (
-    "A probe on recorded episodes needs some: data=<dataset>. Those of the benchmark are recorded by "
-    "`python -m mme_vla.envs.record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false probes in closed "
-    "loop alone."
+    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made by "
+    "`python -m mme_vla.envs.record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false online=true "
+    "probes in closed loop alone."
 )
 
 
