@@ -21,7 +21,7 @@ class MadeUpSource:
     """What a probe asks of a dataset: every frame's brightness is its episode's and its number's."""
 
     subgoal_names = ("simple_subgoal",)
-    name = "made-up"
+    name = fingerprint = "made-up"
 
     def __init__(self, lengths: tuple[int, ...] = (60, 70, 80), video: int = 20, robot: Embodiment = ROBOMME_JOINT):
         self.lengths, self.exec_starts = np.array(lengths), np.full(len(lengths), video)

@@ -77,6 +77,7 @@ class ProbedPolicy(Policy):
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         for episode in map(own, episodes):
+            episode.said.append(episode.subgoal)
             episode.told(self.arm.say(episode.subgoal, self.moment(episode)))
         return self.inner.observation([own(episode).inner for episode in episodes])
 
@@ -108,7 +109,7 @@ class ProbedPolicy(Policy):
 
     def moment(self, episode: ProbedEpisode, weigh: Any = None) -> Moment:
         """What the arm may know now."""
-        now = episode.inner.frames_seen - 1
+        now = max(episode.inner.frames_seen - 1, 0)
         kept = np.zeros(0, np.int64) if self.memory is None else self.memory.storage.kept_frames(now + 1)
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
         known: dict[str, Any] = {}
