@@ -8,6 +8,7 @@ from mme_vla.evaluation.results import plots
 from mme_vla.evaluation.results.aggregate import USUAL_BUDGET, Results
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.cost_table import chunk_flops
+from mme_vla.evaluation.results.process_scores import CAPTION, process_tables
 from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
 from mme_vla.evaluation.rollout.subgoal_score import subgoal_tables
 
@@ -75,6 +76,10 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     if subgoals:
         text = "Words are right when they equal the environment's, points aside; distances are of the points then."
         parts.append(section("Subgoals", "".join(f"<h3>{escape(t.title)}</h3>{html_table(t)}" for t in subgoals), text))
+    chains = process_tables(results)
+    if chains:
+        text = "".join(f"<h3>{escape(table.title)}</h3>{html_table(table)}" for table in chains)
+        parts.append(section("Where the chain broke", text, CAPTION))
     details = "".join(
         f"<details><summary>{escape(method.label)}</summary>{html_table(detail(method, results))}</details>"
         for method in results.methods
