@@ -16,7 +16,7 @@ Written by `python docs/api.py` from the docstrings; a test keeps the two equal.
 """
 GROUPS = {
     "A policy": ["build_policy", "MMEPolicy", "Policy", "Episode", "load_weights"],
-    "Evaluation": ["evaluate", "make_env", "make_vec_env"],
+    "Evaluation": ["evaluate", "probe", "make_env", "make_vec_env"],
     "Parts to subclass": [
         "Memory", "PerceptualMemory", "RecurrentMemory", "Integration", "Backbone", "Task", "SubgoalPredictor",
         "register",

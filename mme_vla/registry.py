@@ -120,9 +120,11 @@ PROCESSORS: Registry[Any] = Registry(
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")
 PLAYERS: Registry[Any] = Registry("player")
+INTERVENTIONS: Registry[Any] = Registry("intervention")
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
+    "intervention": INTERVENTIONS,
 }  # fmt: skip
 
 
@@ -130,7 +132,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     """Return a decorator that files a part of one's own under `name`, for YAML files and command lines to call it by.
 
     Args:
-        kind: `memory`, `integration`, `backbone`, `policy`, `processor`, `subgoal` (a predictor), `task` or `player`.
+        kind: `memory`, `integration`, `backbone`, `policy`, `processor`, `subgoal` (a predictor), `task`,
+            `player` or `intervention` (of a probe).
 
     Raises:
         UserError: an unknown kind, or the name is taken.

@@ -9,6 +9,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "evaluate": ("evaluate", "run a policy on the benchmark"),
     "results": ("results", "tables, comparisons and a report from finished runs"),
     "analyse": ("analyse", "what a memory attends to, selects, modulates and costs"),
+    "probe": ("probe", "what a policy takes from its memory, on recorded episodes and in closed loop"),
     "inspect": ("inspect", "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it"),
     "serve": ("serve", "put a policy behind a port"),
     "play": ("play", "play the tasks yourself, or let a model play"),

@@ -15,6 +15,7 @@ from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.demo import demo_records
+from mme_vla.evaluation.results.process_scores import process_tables
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.submission import read_runs, training_details
 from mme_vla.evaluation.results.tables import (
@@ -94,7 +95,8 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         texts[args.latex] = "\n".join(to_latex(table) for table in _tables(results, comparisons))
     if args.markdown:
         boards = [table for method in results.methods for table in leaderboard(method, results)]
-        parts = ["## Results\n", *map(to_markdown, [overview(results), *boards, *subgoal_tables(results)])]
+        tables = [overview(results), *boards, *process_tables(results), *subgoal_tables(results)]
+        parts = ["## Results\n", *map(to_markdown, tables)]
         parts.append(training_details(results.methods, read_runs(find_records(args.runs))))
         if comparisons:
             parts.append(to_markdown(comparison_table(comparisons)))
@@ -115,6 +117,7 @@ def _tables(results: Results, comparisons: list[Comparison], detailed: bool = Tr
     if detailed:
         tables = [
             *(detail(method, results) for method in results.methods),
+            *process_tables(results),
             *subgoal_tables(results),
             runs_table(results),
             *tables,

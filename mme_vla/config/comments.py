@@ -21,6 +21,7 @@ COMMANDS = {
     "nano": "python -m mme_vla.nano",
     "vision_pretrain": "python -m mme_vla.nano.vision_pretrain",
     "evaluate": "python -m mme_vla.evaluate",
+    "probe": "python -m mme_vla.probe",
     "subgoal_build": "python -m mme_vla.subgoal.build",
     "subgoal_train": "python -m mme_vla.subgoal.train",
 }

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 NO_RECORD = "NO RECORD"
 """Text of the stretches that belong to no sub-task: their frames are neither stored nor shown."""
 COMPLETED = "All tasks completed"
+OPERATIONS = ("which", "where", "how many", "order", "how")
+"""What a sub-task can ask of memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +35,8 @@ class SubTask:
     """Belongs to the conditioning video."""
     pick: bool = False
     """A grasp from the table: what a recovery demonstration may fail once."""
+    operation: str | Callable[[], str] = ""
+    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. Asked at the moment of the failure."""
 
     @property
     def grounded_text(self) -> str:
@@ -53,6 +57,8 @@ class Progress:
         self.planned = 0
         """The demonstrator's view of the pointer: moves only when a sub-task's routine has ended."""
         self.failed = False
+        self.mistaken = ""
+        """What the last failure was a mistake of: one of `OPERATIONS`, or empty."""
         self._latch = latch_failure
 
     def update(self, failed: bool = False) -> None:
@@ -61,8 +67,10 @@ class Progress:
             self.failed = False
         if self.succeeded:  # and stays so, whatever happens next
             return
-        now = self.subtasks[self.index]
+        now, before = self.subtasks[self.index], self.failed
         self.failed = self.failed or failed or (now.failed is not None and now.failed())
+        if self.failed and not before:
+            self.mistaken = now.operation if isinstance(now.operation, str) else now.operation()
         if not self.failed and now.done():
             self.index += 1
 

@@ -62,7 +62,7 @@ def evaluate(
     jobs = choose_episodes(tasks, episodes, chosen.split)
     if base is make_env and chosen.env == "mme_vla":
         require_simulator()
-    loaded, source = _loaded(policy)
+    loaded, source = load(policy)
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     said = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
     facts = RunFacts(
@@ -75,7 +75,8 @@ def evaluate(
     )
 
 
-def _loaded(policy: Policy | str | Path) -> tuple[Policy, str | None]:
+def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
+    """A policy, and where its weights are from; one that is given keeps to itself."""
     if isinstance(policy, Policy):
         return policy, None
     from mme_vla.policy.run_folders import resolve_checkpoint

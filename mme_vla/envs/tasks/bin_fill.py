@@ -122,6 +122,7 @@ class BinFill(Task):
             grounded="press the button at <>",
             targets=[self.button],
             choice="c",
+            operation="how many",
         )
         return [*steps, press]
 
@@ -134,6 +135,7 @@ class BinFill(Task):
             targets=[cube],
             choice="a",
             pick=True,
+            operation="how many",
         )
 
     def _drop(self) -> SubTask:
@@ -144,6 +146,7 @@ class BinFill(Task):
             grounded="put it into the bin at <>",
             targets=[self.board],
             choice="b",
+            operation="how many",
         )
 
     def choices(self) -> list[Choice]:

@@ -162,6 +162,7 @@ class InsertPeg(Task):
                 targets=[grasped],
                 choice="a",
                 video=video,
+                operation="which",
             ),
             SubTask(
                 f"Insert the peg from the {side} side{of_box}",
@@ -172,6 +173,7 @@ class InsertPeg(Task):
                 targets=[self.box],
                 choice="b" if self.side == 1 else "c",
                 video=video,
+                operation=lambda: "which" if any_picked_up(self, others) else "how",
             ),
         ]
 

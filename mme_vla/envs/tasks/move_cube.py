@@ -137,6 +137,7 @@ class MoveCube(Task):
                 targets=[self.peg.tail],
                 choice="a",
                 video=video,
+                operation="how",
             ),
             SubTask(
                 "Hook the cube to the target with the peg",
@@ -164,6 +165,7 @@ class MoveCube(Task):
                 targets=[self.cube, self.target],
                 choice="c",
                 video=video,
+                operation="how",
             )
         ]
 
@@ -178,6 +180,7 @@ class MoveCube(Task):
                 targets=[self.cube],
                 choice="d",
                 video=video,
+                operation="how",
             ),
             SubTask(
                 "place the cube onto the target",

@@ -107,6 +107,7 @@ class PatternLock(Task):
             failed=lambda: any(over(self.tcp_pose.p, disc) for disc in others),
             choice="abcdefgh"[list(DIRECTIONS).index(word)],
             video=video,
+            operation="order",
         )
 
     def choices(self) -> list[Choice]:

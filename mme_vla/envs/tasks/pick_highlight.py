@@ -79,6 +79,7 @@ class PickHighlight(Task):
             targets=[cube],
             choice="b",
             pick=True,
+            operation="which",
         )
 
     def _place(self, cube: Cube) -> SubTask:
@@ -88,6 +89,7 @@ class PickHighlight(Task):
             run=lambda demo: demo.put_down(RELEASE_Z),
             targets=[cube],
             choice="c",
+            operation="which",
         )
 
     def choices(self) -> list[Choice]:

@@ -55,6 +55,7 @@ class PickXtimes(Task):
             failed=lambda: any_picked_up(self, self.cubes),
             targets=[self.button],
             choice="c",
+            operation="how many",
         )
         return [*steps, press]
 
@@ -68,6 +69,7 @@ class PickXtimes(Task):
             targets=[self.cube],
             choice="a",
             pick=True,
+            operation=self._mistaken,
         )
 
     def _place(self) -> SubTask:
@@ -79,11 +81,16 @@ class PickXtimes(Task):
             failed=self._strayed,
             targets=[self.target],
             choice="b",
+            operation=self._mistaken,
         )
 
     def _strayed(self) -> bool:
         others = [cube for cube in self.cubes if cube is not self.cube]
         return any_picked_up(self, others) or pressed(self.button)
+
+    def _mistaken(self) -> str:
+        """Stopping too early is a count forgotten; which cube, the goal says."""
+        return "how many" if pressed(self.button) else ""
 
     def choices(self) -> list[Choice]:
         return [

@@ -122,6 +122,7 @@ class RouteStick(Task):
             failed=failed,
             choice="abcd"[SIDES.index((side, turn))],
             video=video,
+            operation=lambda: "how" if there() else "order",
         )
 
     @staticmethod

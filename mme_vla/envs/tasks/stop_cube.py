@@ -99,6 +99,7 @@ class StopCube(Task):
             grounded="move to the top of the button at <> to prepare",
             targets=[self.button],
             choice="a",
+            operation=self._mistaken,
         )
         press = SubTask(
             "press the button to stop the cube on the target",
@@ -107,8 +108,13 @@ class StopCube(Task):
             grounded="press the button to stop the cube on the target at <>",
             targets=[self.target],
             choice="c",
+            operation=self._mistaken,
         )
         return [hover, *map(self._wait, self.checkpoints()), press]
+
+    def _mistaken(self) -> str:
+        """On the right visit the cube was only missed; on another one the count was forgotten."""
+        return "" if self._in_time() else "how many"
 
     def _press(self, demo: "Demonstrator") -> None:
         """Press; if the wait before it ended so late that the cube would have passed, without closing the fingers."""
@@ -126,6 +132,7 @@ class StopCube(Task):
             done=lambda: self.steps_done >= until,
             run=lambda demo: demo.hold_until(until),
             choice="b",
+            operation=self._mistaken,
         )
 
     def _next_checkpoint(self) -> int:

@@ -101,6 +101,7 @@ class SwingXtimes(Task):
             targets=[cube],
             choice="a",
             pick=True,
+            operation=self._mistaken,
         )
         put_down = SubTask(
             f"put the {colour} cube on the table",
@@ -108,6 +109,7 @@ class SwingXtimes(Task):
             run=lambda demo: demo.put_down(),
             targets=[cube],
             choice="c",
+            operation=self._mistaken,
         )
         press = SubTask(
             "press the button",
@@ -116,6 +118,7 @@ class SwingXtimes(Task):
             grounded="press the button at <>",
             targets=[self.button],
             choice="d",
+            operation=self._mistaken,
         )
         sides = [("right", self.right, self.swings[0]), ("left", self.left, self.swings[1])]
         moves = [self._move(i, *side) for i in range(self.repetitions) for side in sides]
@@ -129,7 +132,12 @@ class SwingXtimes(Task):
             grounded=f"move to the top of the {side}-side target at <> for the {ordinal(i)} time",
             targets=[target],
             choice="b",
+            operation=self._mistaken,
         )
+
+    def _mistaken(self) -> str:
+        """Swings too few or too many are a count forgotten; which cube, the goal says."""
+        return "" if any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube]) else "how many"
 
     def choices(self) -> list[Choice]:
         targets = [self.right, self.left]

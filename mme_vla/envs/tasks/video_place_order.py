@@ -17,6 +17,7 @@ class VideoPlaceOrder(VideoPlace):
     shared_draws = True
     recovery_drawn_per_episode = True
     spot_radius = 0.1
+    operation = "order"
     target_counts: ClassVar[dict[str, int]] = {"easy": 4, "medium": 4, "hard": 4}
 
     def draw_script(self, draws: Draws) -> None:

@@ -130,6 +130,7 @@ class VideoRepick(Task):
             failed=lambda: any_picked_up(self, self.cubes),
             targets=[self.button],
             choice="c",
+            operation="how many",
         )
         return [*(step for i in range(self.repetitions) for step in (self._pick(i), self._put())), press]
 
@@ -143,6 +144,7 @@ class VideoRepick(Task):
             targets=[self.cube],
             choice="a",
             pick=True,
+            operation=self._mistaken,
         )
 
     def _put(self) -> SubTask:
@@ -153,7 +155,11 @@ class VideoRepick(Task):
             failed=lambda: self._other_picked_up() or self._pressed_early("put"),
             targets=[self.cube],
             choice="b",
+            operation=self._mistaken,
         )
+
+    def _mistaken(self) -> str:
+        return "which" if self._other_picked_up() else "how many"
 
     def _other_picked_up(self) -> bool:
         return any_picked_up(self, [cube for cube in self.cubes if cube is not self.cube])

@@ -8,6 +8,7 @@ from mme_vla.evaluation.results import plots
 from mme_vla.evaluation.results.aggregate import USUAL_BUDGET, Results
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.cost_table import chunk_flops
+from mme_vla.evaluation.results.process_scores import CAPTION, process_tables
 from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
 from mme_vla.evaluation.rollout.subgoal_score import subgoal_tables
 
@@ -49,40 +50,49 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     parts = [f"<h1>{escape(title)}</h1><p class=sub>{sub}</p>"]
     if results.notes:
         parts.append("<div class=note>" + "".join(f"<p>{escape(note)}</p>" for note in results.notes) + "</div>")
-    parts.append(_section("Overview", _table(overview(results)), overview(results).title + "."))
+    parts.append(section("Overview", html_table(overview(results)), overview(results).title + "."))
     whiskers = f"Whiskers: {100 * protocol.confidence:g} % intervals. Black lines: the paper."
     difficulty = "Mean over tasks of the episodes of a difficulty."
     parts.append(
-        _pair(
+        pair(
             ("Suites", plots.bars(results, "suite"), whiskers),
             ("Difficulty", plots.bars(results, "difficulty"), difficulty),
         )
     )
-    parts.append(_section("Functional groups", plots.bars(results, "group", wide=True), whiskers))
-    parts.append(_section("Tasks", plots.heat_map(results), "Success rate in percent."))
+    parts.append(section("Functional groups", plots.bars(results, "group", wide=True), whiskers))
+    parts.append(section("Tasks", plots.heat_map(results), "Success rate in percent."))
     rings = "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames are counted."
     cost = ("Efficiency", plots.efficiency(results, chunk_flops()), rings)
     points = plots.budget_points(results.methods, USUAL_BUDGET)
     if points:
         curve = plots.budget_curve(results, points)
-        parts.append(_pair(cost, ("Memory budget", curve, "Dashed: the paper's sweep.")))
+        parts.append(pair(cost, ("Memory budget", curve, "Dashed: the paper's sweep.")))
     else:
-        parts.append(_section(*cost))
+        parts.append(section(*cost))
     if comparisons:
         verdicts = "; ".join(comparison.verdict for comparison in comparisons) + "."
-        parts.append(_section("Paired comparison", _table(comparison_table(comparisons)), verdicts))
+        parts.append(section("Paired comparison", html_table(comparison_table(comparisons)), verdicts))
     subgoals = subgoal_tables(results)
     if subgoals:
         text = "Words are right when they equal the environment's, points aside; distances are of the points then."
-        parts.append(_section("Subgoals", "".join(f"<h3>{escape(t.title)}</h3>{_table(t)}" for t in subgoals), text))
+        parts.append(section("Subgoals", "".join(f"<h3>{escape(t.title)}</h3>{html_table(t)}" for t in subgoals), text))
+    chains = process_tables(results)
+    if chains:
+        text = "".join(f"<h3>{escape(table.title)}</h3>{html_table(table)}" for table in chains)
+        parts.append(section("Where the chain broke", text, CAPTION))
     details = "".join(
-        f"<details><summary>{escape(method.label)}</summary>{_table(detail(method, results))}</details>"
+        f"<details><summary>{escape(method.label)}</summary>{html_table(detail(method, results))}</details>"
         for method in results.methods
     )
-    parts.append(_section("Every method in full", details))
-    runs_details = f"<details><summary>{runs} runs</summary>{_table(runs_table(results))}</details>"
-    parts.append(_section("Runs", runs_details))
-    parts.append(_section("How the numbers are made", _method_text(results)))
+    parts.append(section("Every method in full", details))
+    runs_details = f"<details><summary>{runs} runs</summary>{html_table(runs_table(results))}</details>"
+    parts.append(section("Runs", runs_details))
+    parts.append(section("How the numbers are made", _method_text(results)))
+    return document(title, parts)
+
+
+def document(title: str, parts: Sequence[str]) -> str:
+    """A page of these parts, in the report's style."""
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{_CSS}</style></head>\n'
@@ -105,16 +115,19 @@ def _method_text(results: Results) -> str:
     )
 
 
-def _pair(left: tuple[str, str, str], right: tuple[str, str, str]) -> str:
-    return f"<div class=two>{_section(*left)}{_section(*right)}</div>"
+def pair(left: tuple[str, str, str], right: tuple[str, str, str]) -> str:
+    """Two boxes beside each other, each title, body and caption."""
+    return f"<div class=two>{section(*left)}{section(*right)}</div>"
 
 
-def _section(title: str, body: str, caption: str = "") -> str:
+def section(title: str, body: str, caption: str = "") -> str:
+    """A box of a page."""
     below = f"<p class=caption>{escape(caption)}</p>" if caption else ""
     return f"<section><h2>{escape(title)}</h2><div class=scroll>{body}</div>{below}</section>"
 
 
-def _table(table: Table) -> str:
+def html_table(table: Table) -> str:
+    """A table of a page."""
     head = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
     rows = []
     for i, row in enumerate(table.rows):

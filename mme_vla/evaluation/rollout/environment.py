@@ -17,6 +17,8 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.make import make_env
+from mme_vla.envs.process import process_score
+from mme_vla.envs.subtasks import Progress
 from mme_vla.envs.task_names import STICK_TASKS
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.film import EpisodeVideo, video_name
@@ -173,6 +175,9 @@ class ChunkEnv:
 
     def _report(self, info: dict[str, Any]) -> dict[str, Any]:
         report = {key: info[key] for key in REPORTED if key in info}
+        progress = getattr(getattr(self._env, "task", None), "progress", None)
+        if isinstance(progress, Progress):
+            report["process"] = process_score(progress, str(report.get("status"))).to_dict()
         report["seconds"] = {"sim": self._simulating, "render": self._rendered}
         self._simulating = self._rendered = 0.0
         self._goal = str((report.get("task_goal") or [getattr(self, "_goal", "")])[0])

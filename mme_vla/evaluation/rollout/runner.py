@@ -17,6 +17,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.vector.jobs import Job, Reply
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.process_scores import EXTRA as PROCESS
 from mme_vla.evaluation.rollout.pictures import Pictures
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.running_episode import RunningEpisode
@@ -223,6 +224,7 @@ class Rollout:
                 "video_frames": running.video_frames, "actions_sha256": running.actions_sha256,
                 **({"refused": error} if error and outcome != "error" else {}),
                 **({"video": running.video} if running.video else {}),
+                **({PROCESS: running.process} if running.process else {}),
                 **({EXTRA: running.trace.score.to_dict()} if running.trace else {}),
             },
         )  # fmt: skip

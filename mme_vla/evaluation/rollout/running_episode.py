@@ -52,6 +52,8 @@ class RunningEpisode:
         self.steps = self.chunks = 0
         self.video_frames = 0
         self.video = ""
+        self.process: dict[str, Any] = {}
+        """Where the chain of sub-tasks broke, once the episode is over; empty where the environment does not tell."""
         self.redrawn: int | None = None
         """Frames of the conditioning video, once it is being simulated again for its pictures."""
         self._actions = hashlib.sha256()
@@ -88,6 +90,7 @@ class RunningEpisode:
         """Take the report of the last actions; their frames are not needed any more."""
         self._count(info)
         self.video = str(info.get("video", ""))
+        self.process = info.get("process", {})
 
     def tick(self, info: dict[str, Any]) -> None:
         """Add up the environment's time."""

@@ -88,6 +88,11 @@ class KeyframeEpisode(Episode):
         """Note what is remembered once the frame that was decided at lies behind: when the next ones are observed."""
         self._after = remembered
 
+    @property
+    def awaiting(self) -> BankState | None:
+        """What `decided` noted last, until the next frames are observed."""
+        return self._after
+
     def _remember_video(self) -> None:
         most = self._policy.require_processor().video_frames
         count = min(len(self._video), most)

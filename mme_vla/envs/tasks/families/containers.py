@@ -63,6 +63,7 @@ def pick_up_container(colour: str, container: Container, containers: Sequence[Co
         targets=[container],
         choice=choice,
         pick=True,
+        operation="where",
     )
 
 
@@ -75,6 +76,7 @@ def put_down_container(env: Task, container: Container, containers: Sequence[Con
         failed=lambda: others_lifted(container, containers),
         targets=[container],
         choice=choice,
+        operation="where",
     )
 
 

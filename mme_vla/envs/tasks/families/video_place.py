@@ -39,6 +39,8 @@ class VideoPlace(Task):
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of its region."""
     target_counts: ClassVar[dict[str, int]]
+    operation: ClassVar[str] = "which"
+    """What is mistaken by who puts the cube on another target."""
 
     def build(self, draws: Draws) -> None:
         spot = draw_disc(draws, Region((-0.1, 0), 0.1), self.spot_radius, [], gap=H)
@@ -181,6 +183,7 @@ class VideoPlace(Task):
                 failed=lambda: any(dropped_onto(self, cube, other) for other in other_targets),
                 targets=[target],
                 choice="b",
+                operation=self.operation,
             ),
         ]
 

@@ -1,0 +1,146 @@
+"""Recorded episodes as a probe uses them: shown as they were, or lent to others as sessions and contents."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.policy.base import Policy
+
+SUBGOAL = "simple_subgoal"
+"""The column that tells sub-tasks apart."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One episode of a dataset."""
+
+    source: EpisodeSource
+    episode: int
+
+    @property
+    def length(self) -> int:
+        return int(self.source.lengths[self.episode])
+
+    @property
+    def exec_start(self) -> int:
+        """The first execution frame."""
+        return int(self.source.exec_starts[self.episode])
+
+    @property
+    def task(self) -> str:
+        return self.source.task(self.episode)
+
+    @property
+    def goal(self) -> str:
+        return self.source.goal(self.episode)
+
+    @property
+    def name(self) -> str:
+        return f"{self.source.name}/{self.episode}"
+
+    @property
+    def tells_subtasks(self) -> bool:
+        return SUBGOAL in self.source.subgoal_names
+
+    def subgoal(self, step: int, column: str = SUBGOAL) -> str | None:
+        """What is said at a step, or None where the dataset has no such column."""
+        return self.source.subgoals(self.episode, step).get(column)
+
+    def frame(self, number: int) -> np.ndarray:
+        """A picture [H, W, 3] uint8 of the camera that feeds memory."""
+        return self.source.frames(self.episode, [number])[0]
+
+    def boundaries(self) -> list[int]:
+        """Frames at which a sub-task begins, the execution's first among them."""
+        if not self.tells_subtasks:
+            return [self.exec_start]
+        said = [self.subgoal(step) for step in range(self.length)]
+        changes = [step for step in range(1, self.length) if said[step] != said[step - 1]]
+        return sorted({0, self.exec_start, *changes})
+
+    def decisions(self, stride: int, most: int | None) -> list[int]:
+        """Steps at which chunks are chosen: every `stride`-th of those the robot decides at, spread, `most` at most."""
+        every = 1 if self.source.robot.action.frames is None else stride
+        steps = np.asarray(self.source.decisions(self.episode))[::every]
+        if most is not None and len(steps) > most:
+            steps = steps[np.linspace(0, len(steps) - 1, most).round().astype(int)]
+        return [int(step) for step in steps]
+
+    def views(
+        self, start: int, stop: int, wanted: np.ndarray | None
+    ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
+        """Pictures of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
+
+        Args:
+            wanted: frames that the memory camera shows beside the last, which all cameras do; None for every frame.
+        """
+        robot = self.source.robot
+        if wanted is None:
+            whole = np.arange(start, stop)
+            return {name: self.source.frames(self.episode, whole, name) for name in robot.camera_names}, None
+        here = np.union1d(wanted[(wanted >= start) & (wanted < stop)], [stop - 1])
+        shown = {name: here if name == robot.memory_camera else here[-1:] for name in robot.camera_names}
+        views = {name: self.source.frames(self.episode, frames, name) for name, frames in shown.items()}
+        return views, {name: frames - start for name, frames in shown.items()}
+
+    def show(self, running: Any, start: int, stop: int, wanted: np.ndarray | None = None, video: bool = False) -> None:
+        """Let an episode observe frames start … stop − 1.
+
+        Args:
+            wanted: as for `views`. video: all of it as if it were a conditioning video.
+        """
+        if stop <= start:
+            return
+        views, drawn = self.views(start, stop, wanted)
+        frames = np.arange(start, stop)
+        executed = frames[frames >= self.exec_start]
+        if video:
+            actions = None
+        elif self.source.robot.action.frames is None:
+            actions = self.source.past_actions(self.episode, stop - 1, self.length)
+        else:
+            actions = self.source.actions(self.episode)[np.maximum(executed - 1, 0)]
+        demo = np.ones(len(frames), bool) if video else frames < self.exec_start
+        states = self.source.states(self.episode, start, stop)
+        running.observe(views, states, demo, actions, **({} if drawn is None else {"drawn": drawn}))
+
+
+def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
+    """Every episode of some datasets."""
+    return [Recording(source, episode) for source in sources for episode in range(len(source))]
+
+
+def others(recordings: Sequence[Recording], own: Recording | None, goal: str) -> list[Recording]:
+    """The other episodes, those with the most words of the goal in common first."""
+    words = set(goal.split())
+
+    def unlike(recording: Recording) -> float:
+        their = set(recording.goal.split())
+        return 1 - len(words & their) / max(len(words | their), 1)
+
+    return sorted((recording for recording in recordings if recording != own), key=unlike)
+
+
+def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
+    """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for all."""
+    if policy.memory is None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
+        return None
+    memory = policy.memory
+    return np.union1d(memory.storage.kept_frames(length), memory.frames_scored(length))
+
+
+def check_robot(policy: Policy) -> None:
+    """Make sure that recorded episodes can be shown to a policy.
+
+    Raises:
+        UserError: its cameras read more than pictures, which datasets do not hold.
+    """
+    if policy.embodiment.readings:
+        raise UserError(
+            f"{policy.config.get('name', 'This policy')} reads {', '.join(policy.embodiment.readings)} beside its "
+            "pictures, which recorded datasets do not hold: probe it in closed loop, with offline=false."
+        )
