@@ -10,6 +10,7 @@ from torch import Tensor
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
+from mme_vla.policy.promises import Promise, checked_promise
 from mme_vla.processing.limits import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
 from mme_vla.types import HistoryTokens
@@ -55,6 +56,8 @@ class Episode:
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.frames_seen = 0
         self._chunk: np.ndarray | None = None
+        self.promised: Promise | None = None
+        """What the next chunk is to agree with; see `promise`."""
         self._robot = policy.embodiment
         self._executed = self._no_actions
 
@@ -231,9 +234,23 @@ class Episode:
         processor, state = self._policy.require_processor(), self._seen[-1][1] if self._seen else None
         return processor.prompt(self.goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
 
+    def promise(self, actions: np.ndarray, delay: int = 0) -> None:
+        """Let the next chunk, and it alone, agree with actions that the robot executes while it is chosen.
+
+        Args:
+            actions: [n, w], as the embodiment executes them: those of the chunk before that are still to come, the
+                first one now. delay: how many of them will be executed before the next chunk is there; these count in
+                full, the others less and less.
+
+        Raises:
+            UserError: actions of another form, more than a chunk, or a delay that they do not cover.
+        """
+        space = self._robot.action
+        self.promised = checked_promise(actions, delay, space.horizon, space.width)
+
     def acted(self, chunk: np.ndarray) -> None:
         """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""
-        self._chunk = chunk
+        self._chunk, self.promised = chunk, None
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
         """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
