@@ -11,8 +11,11 @@ PLUGINS = Path(__file__).resolve().parent.parent / "plugins"
 
 
 @contextmanager
-def plugin(folder: str, name: str) -> Iterator[ModuleType]:
-    """The package `name` of plugins/`folder`; afterwards there is none again, as other tests expect."""
+def plugin(folder: str, name: str, keep: bool = False) -> Iterator[ModuleType]:
+    """The package `name` of plugins/`folder`; afterwards there is none again, as other tests expect.
+
+    With `keep` what was imported stays so: a package that has registered itself elsewhere cannot do so twice.
+    """
     source = str(PLUGINS / folder / "src")
     sys.path.insert(0, source)
     importlib.invalidate_caches()
@@ -20,5 +23,5 @@ def plugin(folder: str, name: str) -> Iterator[ModuleType]:
         yield importlib.import_module(name)
     finally:
         sys.path.remove(source)
-        for module in [module for module in sys.modules if module.split(".")[0] == name]:
+        for module in [] if keep else [module for module in sys.modules if module.split(".")[0] == name]:
             del sys.modules[module]
