@@ -9,11 +9,15 @@ import numpy as np
 import pytest
 import torch
 from lerobot_pi05 import reduce_sizes
+from safetensors.torch import save_file
 
 from mme_vla.commands.weights import convert
+from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.tokenizer import PALIGEMMA, Tokenizer
 from mme_vla.testing.small import moving_frames, small_policy
+from mme_vla.weights.load import load_weights, transfer
+from mme_vla.weights.ports import to_lerobot
 
 GOAL = "pick up the red cube"
 
@@ -99,3 +103,22 @@ def test_what_lerobot_has_no_step_for_is_said(tmp_path: Path, changes: dict[str,
         convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     assert not (tmp_path / "lerobot/policy_preprocessor.json").exists()
     assert json.loads((tmp_path / "lerobot/config.json").read_text())["type"] == "pi05"
+
+
+@pytest.mark.parametrize("setting", ["use_visual_memory", "use_proprioceptive_memory"])
+def test_lerobots_short_window_memory_is_named_and_its_weights_are_a_start(tmp_path: Path, setting: str) -> None:
+    policy = small_policy("pi05")
+    tensors = {name: tensor.clone() for name, tensor in to_lerobot(policy, policy.state_dict()).items()}
+    if setting == "use_proprioceptive_memory":
+        tensors["model.proprio_history_proj.weight"] = torch.ones(8, 32)
+        tensors["model.proprio_history_proj.bias"] = torch.ones(8)
+    save_file(tensors, tmp_path / "model.safetensors")
+    about = {"type": "pi05", setting: True, "memory_frames": 6, "memory_stride": 10}
+    (tmp_path / "config.json").write_text(json.dumps(about))
+    with pytest.raises(UserError, match=r"short-window memory: memory_frames=6.*init_from"):
+        load_weights(small_policy("pi05", seed=1), tmp_path)
+    fresh = small_policy("framesamp_modul", seed=1)
+    start = transfer(fresh, tmp_path)
+    assert start.left == sorted(name.removeprefix("model.") for name in tensors if "proprio_history_proj" in name)
+    given, found = policy.state_dict(), fresh.state_dict()
+    assert all(torch.equal(found[name], tensor) for name, tensor in given.items())
