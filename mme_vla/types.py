@@ -90,6 +90,18 @@ class MemoryTokens(TensorStruct):
 
 
 @dataclass
+class Overlap(TensorStruct):
+    """What a new chunk is to agree with, as it is sampled: actions of the chunk before that are still to be executed.
+
+    actions: [b, h, a]; normalised as the network answers. weight: [b, h, a] in [0, 1]: how firmly each number is meant;
+        0 where nothing was promised.
+    """
+
+    actions: Tensor
+    weight: Tensor
+
+
+@dataclass
 class Batch(TensorStruct):
     """What the network reads, and for training what it should answer.
 
@@ -102,6 +114,7 @@ class Batch(TensorStruct):
     state: [b, s]; raw state of the robot: it anchors relative actions, and backbones may read it.
     proprio: [b, s]; normalised state, for the networks that read it.
     view_tokens: [b, v, n, d]; a frozen tower's tokens of `images`, where they were made beforehand.
+    overlap: what a sampled chunk is to agree with; None where it is free.
     """
 
     images: Tensor
@@ -114,6 +127,7 @@ class Batch(TensorStruct):
     state: Tensor | None = None
     proprio: Tensor | None = None
     view_tokens: Tensor | None = None
+    overlap: Overlap | None = None
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.

@@ -45,6 +45,22 @@ def test_png_conversion_is_exact(tmp_path: Path, recorded) -> None:
     assert not (tmp_path / "out.partial").exists()
 
 
+def test_columns_may_be_spelt_as_lerobots_policies_ask_for(tmp_path: Path, recorded) -> None:
+    refs, episodes = recorded
+    convert(refs, tmp_path / "out", ConvertOptions(images="png", names="lerobot"))
+    source = EpisodeSource(tmp_path / "out")
+    check(source, episodes, tolerance=0)
+    assert dict(source.columns) == {"front": "observation.images.image", "wrist": "observation.images.wrist_image"}
+    features = json.loads((tmp_path / "out/meta/info.json").read_text())["features"]
+    assert {"observation.state", "action", "is_demo"} <= set(features)
+    assert not {"image", "wrist_image", "state", "actions"} & set(features)
+    assert convert(refs, tmp_path / "out", ConvertOptions(images="png", names="lerobot")) == 0
+    with pytest.raises(UserError, match="is not the result of this conversion"):
+        convert(refs, tmp_path / "out", PNG)
+    with pytest.raises(UserError, match=r"names='lerobbot'.*lerobot"):
+        ConvertOptions(names="lerobbot")
+
+
 def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(tmp_path: Path, recorded) -> None:
     refs, episodes = recorded
     convert(refs, tmp_path / "out")

@@ -62,6 +62,7 @@ SUFFICE = [
     Case((), "mme_vla.processing.train_tokenizer run", "tokenizer.model"),
     Case((), "mme_vla.data.sample --help", "full"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
+    Case(("harness",), "mme_vla.serving.vla_eval --help", "flow_steps"),
     Case(("orbax",), f"mme_vla.weights.convert {STEP} jax --to released", ""),
     Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
                          "train.open_loop_chunks=0 output=diffused", "checkpoint"),
@@ -93,6 +94,7 @@ NEED = [
     Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
     Case((), f"{PLAY} player=openai", "openai", 2),
     Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
+    Case((), "mme_vla.serving.vla_eval --help", "harness", 2),
     Case((), f"mme_vla.weights.convert {STEP} jax2 --to released", "orbax", 2),
     Case((), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
     Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),

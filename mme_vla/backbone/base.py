@@ -51,6 +51,7 @@ class Backbone(nn.Module):
         sample_steps: of an iterative head, unless told otherwise.
         image_size: side of the square pictures it reads.
         vocab_size: words it knows; None where it does not say.
+        agrees: whether its samples can agree with actions that are already promised (`Batch.overlap`).
         hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside` and
             `positions` (blocks that stand at rotary positions of their own).
 
@@ -71,6 +72,7 @@ class Backbone(nn.Module):
     image_size: int
     vocab_size: int | None = None
     hosts: frozenset[str] = frozenset({"blocks"})
+    agrees: bool = False
 
     @property
     def device(self) -> torch.device:

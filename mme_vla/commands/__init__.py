@@ -12,6 +12,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "probe": ("probe", "what a policy takes from its memory, on recorded episodes and in closed loop"),
     "inspect": ("inspect", "what is in a checkpoint, a dataset or an episode, and what a memory remembers of it"),
     "serve": ("serve", "put a policy behind a port"),
+    "harness": ("harness", "put a policy behind AI2's vla-evaluation-harness"),
     "play": ("play", "play the tasks yourself, or let a model play"),
     "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
     "cache": ("cache", "the vision tokens of a dataset, computed once"),

@@ -177,7 +177,7 @@ def run(cfg: "DictConfig") -> None:
 
     if not cfg.lerobot and cfg.hdf5 is None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
-    options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps)
+    options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names)
     jobs = plan(cfg)
     wanted = Wanted(jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5))
     places = ", ".join(map(str, wanted.places))

@@ -12,6 +12,16 @@ from mme_vla.errors import UserError, brief, listed
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
 DRAWN = "_drawn"
 """After a camera's name: the column that says which frames it was drawn at, where not at all."""
+NAMES: Mapping[str, Mapping[str, str]] = {
+    "robomme": {},
+    "lerobot": {
+        "image": "observation.images.image",
+        "wrist_image": "observation.images.wrist_image",
+        "state": "observation.state",
+        "actions": "action",
+    },
+}
+"""Spellings of a dataset's columns, each by how it differs from the released datasets'."""
 _USUAL = {"state": ("observation.state",), "action": ("action", "actions")}
 
 

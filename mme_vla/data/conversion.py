@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.choice_rows import CHOICE_ACTIONS, CHOICE_NUMBERS
-from mme_vla.data.columns import DRAWN
+from mme_vla.data.columns import DRAWN, NAMES
 from mme_vla.data.hdf5 import all_have_choices, any_chosen_frames, open_episode, pose_columns
 from mme_vla.data.hdf5_episode import SUBGOALS, RawEpisode
 from mme_vla.data.hdf5_values import EpisodeRef
@@ -24,7 +24,7 @@ from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, did_you_mean
 from mme_vla.files import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
@@ -36,6 +36,8 @@ class ConvertOptions:
     """How pictures are stored.
 
     images: `video`, or `png` for lossless pictures inside the tables (about ten times larger).
+    names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own policies ask for
+        (`columns.NAMES`). Readers here take either.
     fps: frames per second; 20 is the simulator's control rate.
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
@@ -57,22 +59,25 @@ class ConvertOptions:
     choices: bool = False
     keyframes: bool = False
     partly: bool = False
+    names: str = "robomme"
 
     def __post_init__(self) -> None:
         if self.images not in ("video", "png"):
             raise UserError(f"images={self.images!r}: expected 'video' or 'png'.")
+        if self.names not in NAMES:
+            raise UserError(f"names={self.names!r} is no spelling of columns. {did_you_mean(str(self.names), NAMES)}")
         if self.fps < 1 or self.gop < 1:
             raise UserError(f"fps={self.fps} and video.gop={self.gop} must be positive.")
 
 
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
-    """The dataset's columns, under the names of the released LeRobot datasets."""
+    """The dataset's columns, spelt as `options.names` says."""
     tool = [*POSE, "gripper"]
     chosen = [CHOICE_ACTIONS] if options.choices else []
     joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
     kind = "video" if options.images == "video" else "image"
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
-    return {
+    columns = {
         "image": dict(view),
         "wrist_image": dict(view),
         "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
@@ -85,6 +90,12 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
         **{f"{c}{DRAWN}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
     }
+    return _spelt(columns, options)
+
+
+def _spelt(columns: dict[str, Any], options: ConvertOptions) -> dict[str, Any]:
+    spelling = NAMES[options.names]
+    return {spelling.get(name, name): value for name, value in columns.items()}
 
 
 def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOptions | None = None) -> int:
@@ -129,8 +140,9 @@ def _work_folder(output: Path) -> Path:
 
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
-    """The options as a plan holds them; what plans from before had none of stands beside them there."""
-    return {k: value for k, value in asdict(options).items() if k not in ("poses", "choices", "partly", "keyframes")}
+    """The options as a plan holds them; what plans from before had none of stands beside them, or where it is said."""
+    beside = ("poses", "choices", "partly", "keyframes", *(["names"] if options.names == "robomme" else []))
+    return {key: value for key, value in asdict(options).items() if key not in beside}
 
 
 def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, Any]:
@@ -255,19 +267,18 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
             )
         scalars = {"is_demo": frame.is_demo, "exec_start_idx": episode.exec_start, "step_idx": step}
         dtypes = {"is_demo": np.bool_, "exec_start_idx": np.int32, "step_idx": np.int32}
-        dataset.add_frame(
-            {
-                "image": frame.front,
-                "wrist_image": frame.wrist,
-                "state": frame.state,
-                "actions": frame.action.astype(np.float32),
-                **{name: rows[step] for name, rows in tool.items()},
-                **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
-                **frame.subgoals,
-                **{f"{c}{DRAWN}": np.array([c in frame.drawn]) for c in CAMERAS if options.partly},
-                "task": goal,
-            }
-        )
+        row = {
+            "image": frame.front,
+            "wrist_image": frame.wrist,
+            "state": frame.state,
+            "actions": frame.action.astype(np.float32),
+            **{name: rows[step] for name, rows in tool.items()},
+            **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
+            **frame.subgoals,
+            **{f"{c}{DRAWN}": np.array([c in frame.drawn]) for c in CAMERAS if options.partly},
+            "task": goal,
+        }
+        dataset.add_frame(_spelt(row, options))
     assert dataset is not None  # an episode has at least one frame
     dataset.save_episode(parallel_encoding=False)
     dataset.finalize()

@@ -140,6 +140,23 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         decisions = self.decisions(source, episode)
         return source, episode, int(decisions[len(decisions) - (int(self._ends[at]) - index)])
 
+    def item_at(self, source: int, episode: int, frame: int) -> int:
+        """The item of a frame; frames at which the robot does not decide share their episode's items evenly.
+
+        Such are those of the conditioning video, for a sampler that draws from all frames alike.
+
+        Raises:
+            UserError: none of this episode's frames is an item.
+        """
+        at = np.flatnonzero((self._source == source) & (self._episode == episode))
+        decisions = np.asarray(self.decisions(source, episode))
+        if not len(at) or not len(decisions):
+            raise UserError(f"{self.sources[source].name}: no step of episode {episode} is among the chosen ones.")
+        place = int(np.searchsorted(decisions, frame))
+        if place == len(decisions) or decisions[place] != frame:
+            place = frame * len(decisions) // int(self.sources[source].lengths[episode])
+        return int(self._ends[at[0]]) - len(decisions) + place
+
     def step(self, index: int) -> Step:
         """Return what is recorded of a step, unprocessed."""
         return self.step_at(*self.locate(index))

@@ -128,6 +128,13 @@ class EpisodeSource:
             raise UserError(f"{side} holds no list of episodes. {REMEDY}")
         return found
 
+    def locate(self, row: int) -> tuple[int, int]:
+        """The episode and the frame in it of a row of the tables; LeRobot calls the row `index`."""
+        if not 0 <= row < int(self.lengths.sum()):
+            raise IndexError(f"row {row} of {int(self.lengths.sum())}")
+        episode = int(np.searchsorted(self._starts, row, side="right")) - 1
+        return episode, row - int(self._starts[episode])
+
     def task(self, episode: int) -> str:
         """Name of the episode's task (`VideoUnmask`), empty if the dataset does not tell."""
         task = self.records[episode].get("task", "") if episode < len(self.records) else ""

@@ -194,6 +194,11 @@ class RoboMMEEnv(gymnasium.Env):
         return self._open_task()
 
     @property
+    def difficulty(self) -> str:
+        """`easy`, `medium` or `hard`; the released evaluation script asks for it."""
+        return self._open_task().difficulty
+
+    @property
     def steps_counted(self) -> int:
         """Control steps that count towards the limit."""
         return 0 if self._run is None else self._run.count

@@ -72,10 +72,10 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
         return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(SPLITS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
-        return _official(Path(folder), task, split)
+        return read_official(_file(Path(folder), task, split), task, split)
     installed = _installed_folder()
     if installed is not None and _file(installed, task, split).is_file():
-        return _official(installed, task, split)
+        return read_official(_file(installed, task, split), task, split)
     return list(_table(split)[task])
 
 
@@ -109,7 +109,12 @@ def _installed_folder() -> Path | None:
 
 
 def _file(folder: Path, task: str, split: str) -> Path:
-    return folder / split / f"record_dataset_{task}_metadata.json"
+    return folder / split / file_name(task)
+
+
+def file_name(task: str) -> str:
+    """Name of the file that describes a task's episodes in the official layout."""
+    return f"record_dataset_{task}_metadata.json"
 
 
 def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
@@ -126,8 +131,12 @@ def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
     return numbers[0], numbers[1], difficulty
 
 
-def _official(folder: Path, task: str, split: str) -> list[EpisodeSpec]:
-    path = _file(folder, task, split)
+def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
+    """The episodes that an official metadata file describes, in order.
+
+    Raises:
+        UserError: the file is missing, or of another layout.
+    """
     records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
     if not isinstance(records, list) or not records:
         raise UserError(f"{path} is not official metadata: it has no list of records. Get the file again.")

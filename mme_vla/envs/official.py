@@ -95,6 +95,11 @@ def make_official_env(
     include = Include.from_options(options)
     if find_spec("robomme") is None:
         raise UserError(_INSTALL_HINT)
+    if hasattr(import_module("robomme"), "STANDS_IN"):
+        raise UserError(
+            "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those "
+            "of env='mme_vla'. Uninstall it and install the official one, or leave out env='official'."
+        )
     import_module(_ENVIRONMENTS)  # registers the tasks
     builder = import_module(_BUILDER).BenchmarkEnvBuilder(
         env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps

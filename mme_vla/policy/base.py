@@ -41,6 +41,8 @@ class Policy(Saved):
     """Steps at a chunk's beginning that lie in the past and are never executed."""
     sample_steps: int = 1
     """Steps of its sampler unless told otherwise."""
+    agrees: bool = False
+    """Whether its chunks can agree with actions that are already promised (`Episode.promise`)."""
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
 
@@ -105,6 +107,12 @@ class Policy(Saved):
         if not episodes:
             return np.zeros((0, self.horizon - self.skipped, self.embodiment.action.width), np.float32)
         processor = self.require_processor()
+        if not self.agrees and any(e.promised is not None for e in episodes):
+            name = self.config.get("name", type(self).__name__)
+            raise UserError(
+                f"{name} answers without regard to what was promised: real-time chunking needs a policy whose actions "
+                "are a flow, such as π0.5's. Leave out promise()."
+            )
         processor.require_stats()  # before any episode's noise or memory moves on
         batch = self.observation(episodes)
         draws = stack_draws([e.draw() for e in episodes])

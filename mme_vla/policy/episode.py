@@ -10,6 +10,7 @@ from torch import Tensor
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
+from mme_vla.policy.promises import Promise, checked_promise
 from mme_vla.processing.limits import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
 from mme_vla.types import HistoryTokens
@@ -60,6 +61,8 @@ class Episode:
         self.frames_seen = 0
         self._moved: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
         self._chunk: np.ndarray | None = None
+        self.promised: Promise | None = None
+        """What the next chunk is to agree with; see `promise`."""
         self._robot = policy.embodiment
         self._executed = self._no_actions
 
@@ -270,9 +273,23 @@ class Episode:
         goal = self._robot.action.worded(self.goal, self.options)
         return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
 
+    def promise(self, actions: np.ndarray, delay: int = 0) -> None:
+        """Let the next chunk, and it alone, agree with actions that the robot executes while it is chosen.
+
+        Args:
+            actions: [n, w], as the embodiment executes them: those of the chunk before that are still to come, the
+                first one now. delay: how many of them will be executed before the next chunk is there; these count in
+                full, the others less and less.
+
+        Raises:
+            UserError: actions of another form, more than a chunk, or a delay that they do not cover.
+        """
+        space = self._robot.action
+        self.promised = checked_promise(actions, delay, space.horizon, space.width)
+
     def acted(self, chunk: np.ndarray) -> None:
         """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""
-        self._chunk = chunk
+        self._chunk, self.promised = chunk, None
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
         """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""

@@ -22,6 +22,7 @@ from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
+from mme_vla.policy.promises import promised_overlap
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import INTEGRATIONS, MEMORIES, POLICIES
@@ -79,6 +80,7 @@ class MMEPolicy(Policy):
         self.augment = augment
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         self.sample_steps = backbone.sample_steps
+        self.agrees = backbone.agrees
         self.adapted, self.heads, self.unadaptable = backbone.adapted, backbone.heads, backbone.unadaptable
 
     @classmethod
@@ -237,12 +239,15 @@ class MMEPolicy(Policy):
     def observation(self, episodes: Sequence[Episode]) -> Batch:
         """The current views and prompts of running episodes."""
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
+        states = torch.stack([e.state for e in episodes])
+        promises = [e.promised for e in episodes]
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),
             image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
-            state=torch.stack([e.state for e in episodes]),
+            state=states,
+            overlap=promised_overlap(promises, states, self.require_processor(), self.action_dim),
         )
         return batch.without_prompt_padding().to(self.device)
 

@@ -20,7 +20,7 @@ from mme_vla.weights.diffusion_policy import diffusion_adapter
 from mme_vla.weights.foreign_statistics import read_stats, stats_files
 from mme_vla.weights.memoryvla import memoryvla_adapter
 from mme_vla.weights.openvla import openvla_adapter
-from mme_vla.weights.ports import port_adapter
+from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
 from mme_vla.weights.sam2act_files import sam2act_adapter
 from mme_vla.weights.source import Source, open_source
@@ -37,7 +37,7 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
 
 # What a memory adds to π0.5, as our names and the released leaves tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
-_MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
+_MEMORY_LEAF = re.compile(rf"(^|/)mem_|_mem(/|$)|^{HISTORY}\.")
 
 
 def load_weights(
@@ -93,6 +93,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     """
     if source.format == "ours":
         return merge_state(source.tensors(), source.config.get("adapters"))
+    if source.format == "lerobot":
+        check_window(source.config, str(source.folder))
     adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
     tensors = source.tensors(lambda found: adapter.check_fit(found, state, str(source.folder)))
     return adapter.translate(tensors, state, str(source.folder))

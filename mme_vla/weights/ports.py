@@ -7,10 +7,11 @@ without (transformers 5.23); modules without the inner `model.` (before transfor
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.weights.adapter import Adapter, pi05_of
 from mme_vla.weights.name_tables import prefixed
@@ -25,6 +26,10 @@ _SPELLINGS = [
     (rf"{_VLM}(vision_tower|multi_modal_projector)\.", rf"{names.ROOT}.paligemma.model.\1."),
     (rf"{_VLM}model\.vision_tower\.(?!vision_model\.)", f"{names.VISION}."),
 ]
+WINDOW_MEMORY = {"use_visual_memory": "past pictures in its vision tower", "use_proprioceptive_memory": "past states"}
+"""LeRobot's short-window memory of π0.5, by the settings that turn it on; the first adds no tensors."""
+HISTORY = "proprio_history_proj"
+"""The tensors that the second adds."""
 _PI0 = re.compile(r"^(state_proj|action_time_mlp_(in|out))\.")
 
 
@@ -61,6 +66,22 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
     if names.EMBEDDING not in found and names.HEAD in found:
         found[names.EMBEDDING] = found[names.HEAD]
     return found
+
+
+def check_window(config: Mapping[str, Any], source: str) -> None:
+    """Refuse a checkpoint of LeRobot's π0.5 that was trained to look at several frames, which this network cannot.
+
+    Raises:
+        UserError: its `config.json` turns a short-window memory on.
+    """
+    seen = [what for setting, what in WINDOW_MEMORY.items() if config.get(setting)]
+    if seen:
+        frames, stride = (brief(config.get(key)) for key in ("memory_frames", "memory_stride"))
+        raise UserError(
+            f"{source} reads {' and '.join(seen)} (LeRobot's short-window memory: memory_frames={frames}, "
+            f"memory_stride={stride}), which this library's π0.5 does not: whole, it would act on less than it was "
+            "trained with. To begin training from its weights use start_from() (on the command line: init_from=…)."
+        )
 
 
 def to_lerobot(policy: MMEPolicy, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -1,6 +1,7 @@
 """A policy as a folder that another library loads: one writer a format."""
 
 import json
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.normalisers import NormStats
 from mme_vla.processing.processor import STATS_FILE
 from mme_vla.weights.diffusion_policy import diffusion_adapter, write_diffusion_policy
+from mme_vla.weights.lerobot_pipelines import write_pipelines
 from mme_vla.weights.memoryvla import memoryvla_adapter, write_memoryvla
 from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.openvla import openvla_adapter, write_openvla
@@ -24,7 +26,6 @@ from mme_vla.weights.released import released_table, to_released
 from mme_vla.weights.sam2act_files import sam2act_adapter, write_sam2act
 from mme_vla.weights.source import VARIANTS
 
-VIEWS = {"front": "base_0_rgb", "wrist": "left_wrist_0_rgb"}  # π0.5's names of RoboMME's cameras
 ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's statistics
 _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 
@@ -57,13 +58,14 @@ def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStat
 
 
 def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """Weights and `config.json` for LeRobot's `PI05Policy`; statistics as openpi writes them, beside them.
+    """Weights, `config.json` and processors for LeRobot's `PI05Policy`; statistics as openpi writes them, beside them.
 
-    LeRobot's own processors write the state into the prompt, and know no RoboMME statistics: they are not part of this.
+    LeRobot adds the state of the moment to relative actions, also to later ones of a chunk: where there are such, the
+    folder says that one action of a chunk is executed. Cameras are called as in LeRobot's RoboMME environment.
     """
     policy = mme_of(policy, "LeRobot's layout of π0.5")
     size, robot = policy.backbone.image_size, policy.embodiment
-    views = [VIEWS.get(name, name) for name in robot.camera_names]
+    views = [camera.key or camera.name for camera in robot.cameras]
     features = {f"observation.images.{view}": {"type": "VISUAL", "shape": [3, size, size]} for view in views}
     absolute = [name for i, name in enumerate(robot.action.names) if i not in robot.action.relative]
     about = {
@@ -74,7 +76,7 @@ def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormS
         **_SIZES,
         "dtype": _name(dtype),
         "chunk_size": policy.horizon,
-        "n_action_steps": policy.horizon,
+        "n_action_steps": 1 if robot.action.relative else robot.action.execute,
         "max_state_dim": policy.action_dim,
         "max_action_dim": policy.action_dim,
         "image_resolution": [size, size],
@@ -83,6 +85,11 @@ def write_lerobot(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormS
         "relative_exclude_joints": absolute,
     }
     _write_json(folder / "config.json", about)
+    if (reason := write_pipelines(policy, folder, about, stats)) is not None:
+        warnings.warn(
+            f"Written without processors: {reason}. LeRobot's commands cannot open it; PI05Policy.from_pretrained can.",
+            stacklevel=2,
+        )
     _write_safetensors(to_lerobot(policy, policy.state_dict()), folder, dtype)
     if stats is not None:
         stats.save(folder / STATS_FILE)

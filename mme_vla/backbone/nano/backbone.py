@@ -19,6 +19,7 @@ from mme_vla.backbone.nano.sizes import NanoConfig
 from mme_vla.backbone.nano.tower import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.backbone import initialise
+from mme_vla.backbone.pi05.overlap import agreeing
 from mme_vla.backbone.pi05.siglip import pool_grid
 from mme_vla.backbone.pi05.sizes import ExpertConfig
 from mme_vla.registry import BACKBONES
@@ -102,6 +103,7 @@ class NanoBackbone(Backbone):
     vision: ConvTower
     Config = NanoConfig
     hosts = frozenset({"blocks", "expert", "hook"})
+    agrees = True
     adapted = ("qkv", "read_q", "out", "read_out", "up", "down")
     heads = ("action_in", "action_out", "state_in", "prompt_in")
     unadaptable = r"\.\w*norm\.dense$"
@@ -240,7 +242,7 @@ class NanoBackbone(Backbone):
             time = times[index].expand(len(x))
             return (x - self._clean(batch, *prepared, x, time, 1)) / time[:, None, None].clamp(min=1 / steps)
 
-        return flow.euler(draws["noise"], steps, velocity)
+        return flow.euler(draws["noise"], steps, agreeing(velocity, batch.overlap, times))
 
     def _prepare(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[Tensor, Tensor, Tensor, Injection]:
         """What does not depend on the noise: each layer's keys and values, their mask, what the goal says."""

@@ -12,6 +12,7 @@ from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.layers.precision import float32_linear
 from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.gemma import Conditioning, JointTransformer, KVCache, Layout
+from mme_vla.backbone.pi05.overlap import agreeing
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 from mme_vla.registry import BACKBONES
@@ -30,6 +31,7 @@ class Pi05Backbone(Backbone):
     Config = BackboneConfig
     sample_steps = EULER_STEPS
     hosts = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions"})
+    agrees = True
     heads = ("action_in", "action_out", "time_in", "time_out")
     # `kv` is what the VLM's last layer has in place of `qkv`.
     adapted = tuple(
@@ -175,7 +177,11 @@ class Pi05Backbone(Backbone):
             rows = len(noise)
             condition = torch.cat([injection.condition(one.expand(rows, -1)) for one in condition])
         conditions = self.transformer.conditioning(condition)
-        return flow.euler(noise, steps, lambda x, i: self.denoise(x, conditions.at(i, rows), layout, prefix, injection))
+
+        def velocity(x: Tensor, i: int) -> Tensor:
+            return self.denoise(x, conditions.at(i, rows), layout, prefix, injection)
+
+        return flow.euler(noise, steps, agreeing(velocity, batch.overlap, times))
 
     def prefill(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[KVCache, Injection]:
         """Run what a chunk's steps share: keys and values of the prefix, and what the memory injects."""

@@ -1,0 +1,14 @@
+"""`python -m mme_vla.serving.vla_eval --args.checkpoint=…`: a policy behind AI2's vla-evaluation-harness."""
+
+
+def main() -> None:
+    """Serve as the harness's own model servers do; `--help` lists its words.
+
+    Raises:
+        UserError: the extra `harness` is not installed, or a checkpoint that cannot be served.
+    """
+    from vla_eval.model_servers.serve import run_server
+
+    from mme_vla.serving.harness import MMEVLAModelServer
+
+    run_server(MMEVLAModelServer)

@@ -1,0 +1,152 @@
+"""A policy behind AI2's vla-evaluation-harness (package `vla-eval`): every frame is remembered, sessions act together.
+
+The harness sends one observation a step and asks for one action. Most are answered out of the chunk under way; their
+frames count all the same, and are handed to the episode when the next chunk is chosen.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from mme_vla.config.devices import find_device
+from mme_vla.embodiment.robomme import CAMERAS, check_benchmark
+from mme_vla.errors import UserError, missing_extra
+from mme_vla.policy.base import Policy
+from mme_vla.policy.episode import Episode
+from mme_vla.processing.subgoal_text import subgoal_kind
+from mme_vla.serving.settings import ServeSettings
+
+try:
+    from vla_eval.model_servers.base import SessionContext
+    from vla_eval.model_servers.predict import PredictModelServer
+    from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW, DimSpec
+except ImportError as error:
+    raise missing_extra("A model server of vla-evaluation-harness", "harness") from error
+
+VIEWS = {"front": "agentview", "wrist": "wrist"}
+"""The harness's names of the cameras."""
+SPACES = ("joint_angle", "ee_pose")
+"""Action spaces of its RoboMME in which a step is a frame."""
+
+
+@dataclass
+class Running:
+    """One session's episode, and the observations since its last chunk: pictures by camera, and states."""
+
+    episode: Episode
+    pictures: list[dict[str, np.ndarray]] = field(default_factory=list)
+    states: list[np.ndarray] = field(default_factory=list)
+
+
+class MMEVLAModelServer(PredictModelServer):
+    """Serves a checkpoint of this library to RoboMME in the harness.
+
+    Args:
+        checkpoint: folder, or owner/name of a hub repository; or a policy that is there already.
+        device: auto, cpu or cuda. dtype: of the weights; bfloat16 halves the memory.
+        execute: actions of a chunk that are executed; by default the embodiment's.
+        flow_steps: of an iterative head; by default its own.
+        seed: of every episode's noise.
+        trust_plugins: import the modules that the checkpoint names: code of whoever wrote it.
+        max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of them.
+
+    Raises:
+        UserError: no such checkpoint, or a policy that cannot act from what the harness sends.
+    """
+
+    def __init__(
+        self,
+        checkpoint: str | Policy,
+        device: str = "auto",
+        dtype: str = "float32",
+        execute: int | None = None,
+        flow_steps: int | None = None,
+        seed: int = 42,
+        trust_plugins: bool = False,
+        *,
+        max_batch_size: int = 16,
+        max_wait_time: float = 0.01,
+    ) -> None:
+        if not isinstance(checkpoint, Policy):
+            place = find_device(device)
+            checkpoint = Policy.from_pretrained(checkpoint, device=place, dtype=dtype, trust_plugins=trust_plugins)
+        self.policy = checkpoint.eval()
+        robot = self.policy.embodiment
+        check_benchmark(robot, SPACES)
+        settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
+        settings.check_robot(robot, self.policy.require_processor().past_actions)
+        self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
+        self.sessions: dict[str, Running] = {}
+        super().__init__(
+            chunk_size=settings.executed(robot), max_batch_size=max_batch_size, max_wait_time=max_wait_time
+        )
+
+    def get_observation_params(self) -> dict[str, Any]:
+        """What the benchmark is to send."""
+        robot = self.policy.embodiment
+        wanted: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
+        wanted["send_wrist_image"] = CAMERAS[1] in robot.camera_names
+        if self.subgoal is not None:
+            wanted |= {"send_subgoal": True, "subgoal_mode": self.subgoal.removesuffix("_subgoal")}
+        return wanted
+
+    def get_action_spec(self) -> dict[str, DimSpec]:
+        """One action, as the benchmark's action space has it."""
+        return {"action": RAW}
+
+    def get_observation_spec(self) -> dict[str, DimSpec]:
+        """The pictures, the state and the words that are read."""
+        pictures = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
+        words = {"language": LANGUAGE} | ({} if self.subgoal is None else {"subgoal": LANGUAGE})
+        return {**pictures, "state": RAW, **words}
+
+    async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
+        """Begin a session's episode; its goal comes with the first observation."""
+        await super().on_episode_start(config, ctx)
+        self.sessions[ctx.session_id] = Running(self.policy.start_episode("", seed=self.seed))
+
+    async def on_episode_end(self, result: dict[str, Any], ctx: SessionContext) -> None:
+        """Forget the session's episode."""
+        await super().on_episode_end(result, ctx)
+        self.sessions.pop(ctx.session_id, None)
+
+    async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
+        """Take a frame, and answer with the next action.
+
+        Raises:
+            UserError: it lacks a picture or the state; the harness ends such an episode as an error.
+        """
+        running = self.sessions.get(ctx.session_id)
+        if running is None:
+            raise UserError("an observation came before the start of an episode.")
+        pictures, state = obs.get("images") or {}, obs.get("states", obs.get("state"))
+        names = self.policy.embodiment.camera_names
+        lacking = [VIEWS[name] for name in names if pictures.get(VIEWS[name]) is None]
+        if lacking or state is None:
+            raise UserError(
+                f"the observation lacks {', '.join([*lacking, *(['states'] if state is None else [])])}: the "
+                "environment failed, or the benchmark does not send what get_observation_params() asks for."
+            )
+        running.pictures.append({name: np.asarray(pictures[VIEWS[name]]) for name in names})
+        running.states.append(np.asarray(state, np.float32))
+        await super().on_observation(obs, ctx)
+
+    def predict_batch(
+        self, obs_batch: list[dict[str, Any]], ctx_batch: list[SessionContext]
+    ) -> list[dict[str, np.ndarray]]:
+        """Choose the chunks of these sessions in one batch."""
+        episodes = [self._caught_up(obs, ctx) for obs, ctx in zip(obs_batch, ctx_batch, strict=True)]
+        return [{"actions": chunk} for chunk in self.policy.act(episodes, self.flow_steps)]
+
+    def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
+        """A session's episode, after it has taken the frames since its last chunk."""
+        running = self.sessions[ctx.session_id]
+        episode, pictures, states = running.episode, running.pictures, running.states
+        running.pictures, running.states = [], []
+        episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
+        video = obs.get("video_history")
+        if video is not None and len(video):
+            episode.remember(np.stack(video), is_demo=True)
+        episode.observe({name: np.stack([p[name] for p in pictures]) for name in pictures[0]}, np.stack(states))
+        return episode

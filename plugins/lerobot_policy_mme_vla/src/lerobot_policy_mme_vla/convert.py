@@ -1,0 +1,69 @@
+"""`python -m lerobot_policy_mme_vla.convert SRC DST`: a checkpoint of mme-vla for LeRobot's commands, and back."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from lerobot.configs import FeatureType, PolicyFeature
+
+from lerobot_policy_mme_vla.configuration_mme_vla import STATE, MMEVLAConfig
+from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
+from lerobot_policy_mme_vla.processor_mme_vla import make_mme_vla_pre_post_processors
+from mme_vla import Policy
+from mme_vla.config.composition import print_user_errors
+from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.robomme import SIDE
+from mme_vla.errors import UserError
+from mme_vla.policy.hub import local_folder
+from mme_vla.policy.saving import read_config
+
+
+def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:
+    """A policy of mme-vla as LeRobot's commands know it."""
+    pictures, numbers = features_of(policy.embodiment)
+    config = MMEVLAConfig(
+        model=str(policy.config.get("name")), device=device, input_features=pictures, output_features=numbers
+    )
+    return MMEVLAPolicy(config, model=policy).to(device).eval()
+
+
+def features_of(robot: Embodiment) -> tuple[dict[str, PolicyFeature], dict[str, PolicyFeature]]:
+    """What LeRobot is told that a robot's policy reads and answers; pictures may have any size."""
+    pictures = {
+        f"observation.images.{camera.key or camera.name}": PolicyFeature(FeatureType.VISUAL, (3, SIDE, SIDE))
+        for camera in robot.cameras
+    }
+    state = PolicyFeature(FeatureType.STATE, (robot.state.width,))
+    return {**pictures, STATE: state}, {"action": PolicyFeature(FeatureType.ACTION, (robot.action.width,))}
+
+
+def convert(source: str, target: Path) -> None:
+    """Write a checkpoint of the one kind as one of the other, into a new folder.
+
+    Raises:
+        UserError: the folder exists, or the source is neither.
+    """
+    if target.exists():
+        raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
+    folder = local_folder(source)
+    if read_config(folder).get("type") == MMEVLAPolicy.name:
+        MMEVLAPolicy.from_pretrained(folder).model.save_pretrained(target)
+        return
+    theirs = for_lerobot(Policy.from_pretrained(folder))
+    theirs.save_pretrained(target)
+    for pipeline in make_mme_vla_pre_post_processors(theirs.config):
+        pipeline.save_pretrained(target)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Read the command line and convert."""
+    parser = argparse.ArgumentParser(prog="python -m lerobot_policy_mme_vla.convert", description=__doc__)
+    parser.add_argument("source", help="checkpoint folder, or owner/name on the hub; of mme-vla, or of this plugin")
+    parser.add_argument("target", type=Path, help="new folder")
+    given = parser.parse_args(arguments)
+    with print_user_errors():
+        convert(given.source, given.target)
+
+
+if __name__ == "__main__":
+    main()

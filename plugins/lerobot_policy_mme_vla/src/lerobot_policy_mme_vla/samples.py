@@ -1,0 +1,66 @@
+"""Training samples: LeRobot says which steps, mme-vla reads them.
+
+LeRobot's samples hold a fixed number of neighbouring frames, and its pipelines drop what marks the conditioning video.
+So a step is looked up by its `index` in the dataset as mme-vla opens it: history from the vision cache, statistics and
+chunks as in mme-vla's own training.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from mme_vla import Policy
+from mme_vla.data.dataset import TrainingDataset
+from mme_vla.errors import UserError
+from mme_vla.training.data import prepare_data
+
+if TYPE_CHECKING:
+    from lerobot_policy_mme_vla.configuration_mme_vla import MMEVLAConfig
+
+
+class Samples:
+    """The steps of one dataset as batches; it is opened when the first one is asked for, with the weights of then.
+
+    Args:
+        meta: LeRobot's metadata of the dataset.
+    """
+
+    def __init__(self, model: Policy, config: "MMEVLAConfig", meta: Any) -> None:
+        self._model, self._config = model, config
+        self._entry = {
+            "root": str(meta.root),
+            "name": meta.repo_id.replace("/", "_"),
+            "exec_starts": config.exec_starts,
+        }
+        self._steps: TrainingDataset | None = None
+
+    def batch(self, rows: Tensor) -> Any:
+        """The batch of these rows [b] of the dataset's tables."""
+        steps = self._open()
+        places = [steps.sources[0].locate(int(row)) for row in rows.flatten().tolist()]
+        items = [steps[steps.item_at(0, episode, frame)] for episode, frame in places]
+        return steps.processor.collate(items)
+
+    def _open(self) -> TrainingDataset:
+        if self._steps is None:
+            processor = self._model.require_processor()
+            known = processor.stats
+            self._steps = _steps(self._model, self._config, self._entry)
+            if known is not None:
+                processor.stats = known  # those that the weights were trained with
+        return self._steps
+
+
+def _steps(model: Policy, config: "MMEVLAConfig", entry: dict[str, Any]) -> TrainingDataset:
+    data = {
+        "name": entry["name"], "sources": [entry], "val_fraction": 0.0, "val_episodes": [], "action_offset": 0,
+        "mask_padding": False, "jitter": False,
+        "cache": {"root": config.cache_root, "batch_size": 32, "max_build_frames": config.max_build_frames},
+    }  # fmt: skip
+    steps = prepare_data(model, data, config.seed).train
+    if type(steps) is not TrainingDataset:
+        raise UserError(
+            f"{config.model} is trained on groups of steps or on keyframes, which LeRobot's sampler does not draw: "
+            "train it with python -m mme_vla.train."
+        )
+    return steps
