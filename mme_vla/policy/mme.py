@@ -14,6 +14,7 @@ import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
 from mme_vla.backbone.shape import read_backbone
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
 from mme_vla.integration.base import Integration, doors_of
@@ -176,6 +177,11 @@ class MMEPolicy(Policy):
     def compile(self, **options: Any) -> None:
         """Compile the backbone's tower and layers in place, each by itself."""
         self.backbone.compile(**options)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """The backbone's groups, and the memory."""
+        memory = [] if self.memory is None else [ShardGroup(self.memory, full=True)]
+        return [*self.backbone.shard_groups(), *memory]
 
     def _inject(self, memory: MemoryTokens | None) -> Inject:
         return lambda observation: self.integration.inject(observation, memory)

@@ -6,6 +6,7 @@ from typing import Any, Self
 
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
+from mme_vla.training.parallel import ParallelSettings
 
 SCHEDULES = ("constant", "cosine", "steps")
 OPTIMIZERS = ("adamw", "lamb")
@@ -46,8 +47,9 @@ class TrainSettings:
     decay_min_dim: int = 0
     ema_warmup: bool = False
     accumulate: int = 1
-    gradient_checkpointing: bool = False
+    gradient_checkpointing: bool | str = False
     compile: bool = False
+    parallel: ParallelSettings = field(default_factory=ParallelSettings)
     device: str = "auto"
     workers: int = 1
     log_every: int = 100

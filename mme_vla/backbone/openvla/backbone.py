@@ -14,6 +14,7 @@ from mme_vla.backbone.openvla.head import ActionHead, StateToken
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.sizes import OpenVlaConfig
 from mme_vla.backbone.pi05.siglip import pool_grid
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
@@ -171,6 +172,10 @@ class OpenVlaBackbone(Backbone):
     def recompute(self, wanted: bool) -> None:
         """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(wanted)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Towers, word embedding, and every layer of the language model."""
+        return [*super().shard_groups(), ShardGroup(self.vlm.language.model.embed_tokens, full=True)]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers and every layer of the language model, each by itself."""

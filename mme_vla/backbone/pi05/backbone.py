@@ -14,6 +14,7 @@ from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
@@ -149,6 +150,10 @@ class Pi05Backbone(Backbone):
     def recompute(self, wanted: bool) -> None:
         """Recompute layers in the backward pass (activation checkpointing)."""
         self.transformer.gradient_checkpointing = wanted
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Tower, token embedding, and every layer of all experts."""
+        return [*super().shard_groups(), ShardGroup(self.embedding, full=True)]
 
     # Sampling
 

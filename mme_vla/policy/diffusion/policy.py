@@ -13,6 +13,7 @@ from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.diffusion import ddpm
 from mme_vla.backbone.diffusion.network import DiffusionNetwork
 from mme_vla.backbone.diffusion.sizes import DiffusionSizes
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.integration.feature_wise import PooledIntegration
@@ -167,6 +168,12 @@ class DiffusionPolicy(Policy):
     def recompute(self, wanted: bool) -> None:
         """Compute the pictures' features again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recomputed = wanted
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """The memory's tower, the memory, the picture encoder, and the U-Net."""
+        full = [] if self.memory is None else [self.backbone.vision, self.memory]
+        learnt = (self.backbone.image_encoder, self.backbone.unet)
+        return [*(ShardGroup(module, full=True) for module in full), *map(ShardGroup, learnt)]
 
     def _schedule(self) -> Any:
         return ddpm.noise_schedule(self.sizes.diffusion_steps)
