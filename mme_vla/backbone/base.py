@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers.blocks import Block, Visibility
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.types import Batch
 
@@ -120,7 +121,7 @@ class Backbone(nn.Module):
         """
         raise NotImplementedError
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Keep no activations inside layers in training, and compute them again in the backward pass; or keep them."""
         raise NotImplementedError
 

@@ -9,7 +9,8 @@ from torch import nn
 class ShardGroup(NamedTuple):
     """A module whose weights are gathered right before it runs, and let go of after.
 
-    module: it runs by being called, and nobody reads its weights but then.
+    module: it runs by being called, nobody reads its weights but then, and it answers with tensors, or with tuples,
+        lists and dictionaries of tensors.
     full: gathered in float32 where all else is gathered in bfloat16: what computes in float32, and towers that hold
         such layers without calling them.
     """

@@ -90,7 +90,7 @@ def _train(
     from accelerate.utils import broadcast_object_list
 
     from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.finetune import apply_finetuning
+    from mme_vla.policy.finetune import apply_finetuning, cast_frozen
     from mme_vla.policy.tensor_files import take_memory
     from mme_vla.training.checkpoint import check_disk, load_policy
     from mme_vla.training.console import ProgressLine
@@ -119,6 +119,7 @@ def _train(
     if run.checkpoint is not None:
         if holds:
             load_policy(run.checkpoint, policy)
+            cast_frozen(policy, config["finetune"].get("frozen_dtype"))
         line.say(f"going on from {run.checkpoint}")
     recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}

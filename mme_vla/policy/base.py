@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws, stack_draws
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
@@ -70,8 +71,8 @@ class Policy(Saved):
         """
         raise NotImplementedError
 
-    def recompute(self, wanted: bool) -> None:
-        """Compute activations again in the backward pass instead of keeping them, or keep them."""
+    def recompute(self, wanted: Recompute) -> None:
+        """Compute activations again in the backward pass instead of keeping them (all, or `selective`), or not."""
         raise NotImplementedError
 
     def shard_groups(self) -> Sequence[ShardGroup]:

@@ -13,6 +13,7 @@ from torch import Tensor
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shape import read_backbone
 from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.embodiment.robomme import embodiment_of
@@ -170,7 +171,7 @@ class MMEPolicy(Policy):
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             return self.backbone.velocity(batch, self._views(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Compute activations again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recompute(wanted)
 
@@ -179,9 +180,8 @@ class MMEPolicy(Policy):
         self.backbone.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The backbone's groups, and the memory."""
-        memory = [] if self.memory is None else [ShardGroup(self.memory, full=True)]
-        return [*self.backbone.shard_groups(), *memory]
+        """The backbone's groups. Memory and integration stand in none: they are small, and compute in float32."""
+        return self.backbone.shard_groups()
 
     def _inject(self, memory: MemoryTokens | None) -> Inject:
         return lambda observation: self.integration.inject(observation, memory)

@@ -96,6 +96,8 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
         if exact:
             wrap(exact, None)
         wrap(group.module, None if group.full else low)
+        if isinstance(group.module, nn.Embedding):  # its gradient needs the words alone
+            cast(FSDPModule, group.module).set_unshard_in_backward(False)
     wrap(policy, None)
     _materialise(policy, mesh)
     set_model_state_dict(policy, whole, options=FROM_FIRST)

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
+from mme_vla.backbone.layers.recomputing import SELECTIVE
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.training.parallel import ParallelSettings
@@ -89,6 +90,8 @@ class TrainSettings:
         _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
         betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
         _check("betas", self.betas, betas, "two numbers in [0, 1)")
+        known = self.gradient_checkpointing in (True, False, SELECTIVE)
+        _check("gradient_checkpointing", self.gradient_checkpointing, known, f"true, false or {SELECTIVE}")
         _check("device", self.device, self.device in ("auto", "cpu", "cuda"),
                "auto (a GPU where there is one), cuda or cpu; which GPU is said by CUDA_VISIBLE_DEVICES")  # fmt: skip
         _check(

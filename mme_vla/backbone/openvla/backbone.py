@@ -10,6 +10,7 @@ from torch import Tensor
 from mme_vla.backbone.base import Backbone, Inject
 from mme_vla.backbone.layers.attention import additive_mask
 from mme_vla.backbone.layers.blocks import Block
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.head import ActionHead, StateToken
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.sizes import OpenVlaConfig
@@ -169,7 +170,7 @@ class OpenVlaBackbone(Backbone):
         """The chunk [b, h, a]; there is nothing to draw."""
         return self.answer(batch, images, inject)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(wanted)
 

@@ -10,6 +10,7 @@ from mme_vla.backbone.base import Backbone, Draws, Inject, Injection
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.layers.precision import float32_linear
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
@@ -147,7 +148,7 @@ class Pi05Backbone(Backbone):
         answer, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(answer)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute layers in the backward pass (activation checkpointing)."""
         self.transformer.gradient_checkpointing = wanted
 

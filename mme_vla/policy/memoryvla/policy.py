@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.layers.attention import additive_mask
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.vision import IMAGENET
 from mme_vla.backbone.shard_groups import ShardGroup
@@ -175,7 +176,7 @@ class MemoryVlaPolicy(Policy):
         loss = losses.mean()
         return loss, {"loss": loss.detach()}
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(wanted)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws, map_draws
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.sam2act.geometry import Cube
 from mme_vla.backbone.sam2act.heatmaps import PointFinder
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
@@ -145,7 +146,7 @@ class SAM2ActPolicy(Policy):
         loss = torch.stack(list(parts.values())).sum()
         return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Compute the layers' activations again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recompute(wanted)
 
