@@ -27,6 +27,7 @@ from mme_vla.training.logging import Loggers
 from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.parallel import reshard, shard, whole_number
+from mme_vla.training.reading import readers, size_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
@@ -78,12 +79,17 @@ class Trainer:
             len(samples), settings.batch_size, settings.seed, range(run.step, settings.steps), settings.accumulate,
             accelerator.process_index, accelerator.num_processes,
         )  # fmt: skip
+        workers, ahead = settings.workers, None
+        if workers:
+            rows = self.order.rows(0)
+            batch_bytes = size_of(samples[0]) * (rows.stop - rows.start)
+            workers, ahead = readers(workers, batch_bytes, settings.prefetch_gb * 1e9)
         self.loader = DataLoader(
             _InEpoch(samples),
             batch_sampler=self.order,
             collate_fn=collate,
-            num_workers=settings.workers,
-            prefetch_factor=4 if settings.workers else None,
+            num_workers=workers,
+            prefetch_factor=ahead,
             pin_memory=accelerator.device.type == "cuda",
             worker_init_fn=leave_signals_alone,
             generator=generator_for(settings.seed, "workers"),

@@ -53,6 +53,7 @@ class TrainSettings:
     parallel: ParallelSettings = field(default_factory=ParallelSettings)
     device: str = "auto"
     workers: int = 1
+    prefetch_gb: float = 8.0
     log_every: int = 100
     val_every: int = 1000
     val_samples: int = 64
@@ -85,7 +86,7 @@ class TrainSettings:
         _check("gamma", self.gamma, 0 < self.gamma <= 1, "above 0 and at most 1")
         for name in ("warmup", "decay_min_dim", "workers", "val_samples", "open_loop_chunks", "weight_decay"):
             _check(name, getattr(self, name), getattr(self, name) >= 0, "not negative")
-        for name in ("lr", "eps", "clip_norm"):
+        for name in ("lr", "eps", "clip_norm", "prefetch_gb"):
             _check(name, getattr(self, name), getattr(self, name) > 0, "positive")
         _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
         betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
