@@ -12,6 +12,7 @@ from fakes import WIDTH, LastFrames, encode
 from h5_files import write_file
 
 from mme_vla.data.cache import building as cache_build
+from mme_vla.data.cache import store
 from mme_vla.data.cache.building import build_cache, clear_cache, estimate
 from mme_vla.data.cache.ensure import ensure_cache
 from mme_vla.data.cache.store import (
@@ -201,7 +202,7 @@ def test_an_estimate_counts_frames_and_bytes_and_writes_nothing(source, tmp_path
 
 
 def test_few_histories_stay_at_hand(source, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(VisionCache, "max_open", 2)
+    monkeypatch.setattr(store, "files_to_hold", lambda wanted: 2)
     cache = ensure(source, LastFrames(), tmp_path)
     for episode in (0, 1, 2, 0):
         cache.history(episode)

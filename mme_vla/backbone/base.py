@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers.blocks import Block, Visibility
+from mme_vla.backbone.layers.recomputing import Recompute
+from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.types import Batch
 
 Hook = Callable[[int, Tensor], Tensor]
@@ -122,9 +124,18 @@ class Backbone(nn.Module):
         """
         raise NotImplementedError
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Keep no activations inside layers in training, and compute them again in the backward pass; or keep them."""
         raise NotImplementedError
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """What processes that share the weights gather together: by default the tower, and layer by layer the rest.
+
+        All that stands in no group is gathered for a whole pass, in float32.
+        """
+        tower = set(self.vision.modules())
+        layers = [ShardGroup(layer) for layer in stacked_layers(self) if layer not in tower]
+        return [ShardGroup(self.vision, full=True), *layers]
 
     # Sampling
 

@@ -4,6 +4,7 @@ import logging
 import multiprocessing
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,9 @@ def main(cfg: DictConfig) -> None:
     assert isinstance(config, dict)
     plain = {str(key): value for key, value in config.items()}
     settings = RolloutSettings.from_config(plain)
+    if plain["deterministic"]:
+        settings = replace(settings, max_batch=1)
+        repeat_exactly()
     jobs = choose_episodes(named_tasks(plain), plain["episodes"], settings.split)
     shard = choose_shard(plain["shard"])
     if settings.env == "mme_vla":
@@ -69,20 +73,31 @@ def main(cfg: DictConfig) -> None:
     if not settings.render:
         logger.warning("render=false: the policy sees black pictures; only the time of the simulation means anything")
     output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
-    logger.info("%d episodes into %s%s", len(jobs), output, f", of which shard {shard.index}/{shard.count}"
+    logger.info("%d episodes into %s%s", len(jobs), output, f", shared as {shard.index}/{shard.count}"
                 if shard.count > 1 else "")  # fmt: skip
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
+    notes["deterministic"] = plain["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
     _spawn_as_usual()
     try:
         done = evaluate(
-            policy, jobs, output, facts, settings, subgoals=subgoals, shard=shard, source=source, notes=notes
-        )
+            policy, jobs, output, facts, settings, subgoals=subgoals, shard=shard, source=source, notes=notes,
+            times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
+        )  # fmt: skip
     finally:
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()
     report(done, output)
+
+
+def repeat_exactly() -> None:
+    """Have PyTorch choose kernels whose results repeat; where an operation has none, it warns."""
+    import torch
+
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read when the GPU is first used
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    torch.backends.cudnn.benchmark = False
 
 
 def choose_device(name: str) -> "torch.device":

@@ -4,7 +4,7 @@ import os
 import shlex
 import sys
 import time
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -86,10 +86,13 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
 def _train(
     cfg: DictConfig, config: dict[str, Any], run: "Run", settings: "TrainSettings", accelerator: Any, begun: float
 ) -> "Trainer":
+    import torch
+    from accelerate.utils import broadcast_object_list
+
     from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.finetune import apply_finetuning
-    from mme_vla.policy.tensor_files import assign_tensors, load_tensors, take_memory
-    from mme_vla.training.checkpoint import check_disk
+    from mme_vla.policy.finetune import apply_finetuning, cast_frozen
+    from mme_vla.policy.tensor_files import take_memory
+    from mme_vla.training.checkpoint import check_disk, load_policy
     from mme_vla.training.console import ProgressLine
     from mme_vla.training.data import check_frozen, prepare_data
     from mme_vla.training.finish import finish
@@ -100,22 +103,33 @@ def _train(
     from mme_vla.training.validation import Validation
 
     first = accelerator.is_main_process
+    # Of processes that share the weights, one a machine holds them until they are shared: it may have to build a cache.
+    sharded = settings.parallel.shards(accelerator.device)
+    holds = accelerator.is_local_main_process or not sharded
     line = ProgressLine(settings.steps, run.step, shown=first)
     # A backbone whose weights are about to be replaced is not drawn first.
     init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
-    policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
+    with nullcontext() if holds else torch.device("meta"):
+        policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
     check_frozen(policy, config["finetune"]["freeze_vision"])
-    if init_from is not None:
+    if init_from is not None and holds:
         line.say(start_from(policy, init_from))
-    apply_finetuning(policy, **config["finetune"])
+    with nullcontext() if holds else torch.device("meta"):
+        apply_finetuning(policy, **config["finetune"])
     if run.checkpoint is not None:
-        assign_tensors(policy, load_tensors(run.checkpoint), str(run.checkpoint))
+        if holds:
+            load_policy(run.checkpoint, policy)
+            cast_frozen(policy, config["finetune"].get("frozen_dtype"))
         line.say(f"going on from {run.checkpoint}")
     recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
-    take_memory(policy.to(accelerator.device))
-    with accelerator.main_process_first():
-        data = prepare_data(policy, config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
+    if holds:
+        take_memory(policy.to(accelerator.device))
+    encoder = broadcast_object_list([policy.vision_fingerprint() if first and policy.memory is not None else None])
+    local = config["data"]["cache"].get("local", False)
+    with accelerator.local_main_process_first() if local else accelerator.main_process_first():
+        of_run = (config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
+        data = prepare_data(policy, *of_run, encoder[0])
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
     config["data"]["content"] = data.content
@@ -134,7 +148,8 @@ def _train(
     try:
         with line:
             finished = trainer.run(line, loggers)
-        if finished and first:
+            trainer.close()
+        if finished:
             finish(trainer, data, time.perf_counter() - begun, line, loggers)
     finally:
         loggers.close()

@@ -1,7 +1,8 @@
 """Pictures out of video files, by time stamp, with PyAV.
 
 PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's libraries from the
-system and is not used. Files stay open between calls, at most `max_open` of them.
+system and is not used. Files stay open between calls, as many as the process may hold: samples are drawn from all
+episodes at random, and opening a file takes longer than decoding a picture.
 """
 
 import os
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.files import decoding
+from mme_vla.files import decoding, files_to_hold
 
 _SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nearer one is decoded up to
 
@@ -21,10 +22,16 @@ _SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nea
 class VideoReader:
     """Decodes single pictures from a bounded number of open files. Safe across `fork`: a child opens its own."""
 
-    def __init__(self, max_open: int = 8) -> None:
+    def __init__(self, max_open: int = 512) -> None:
+        """Open nothing yet.
+
+        Args:
+            max_open: most files held; each takes one to two megabytes for its decoder.
+        """
         self.max_open = max_open
         self._open: OrderedDict[Path, Any] = OrderedDict()
         self._process = os.getpid()
+        self._may_hold: int | None = None
 
     def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
         """Return the pictures nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for.
@@ -82,11 +89,14 @@ class VideoReader:
 
         if self._process != os.getpid():  # open files of a parent process share their position with it
             self._open, self._process = OrderedDict(), os.getpid()
+            self._may_hold = None
         if path not in self._open:
             container = av.open(str(path))
             container.streams.video[0].codec_context.thread_count = 1  # parallelism is across workers
             self._open[path] = container
-            while len(self._open) > self.max_open:
+            if self._may_hold is None:
+                self._may_hold = files_to_hold(self.max_open)
+            while len(self._open) > self._may_hold:
                 self._open.popitem(last=False)[1].close()
         self._open.move_to_end(path)
         return self._open[path]

@@ -2,6 +2,7 @@
 
 from mme_vla.files.checksums import SUMS, Sums, check_sums, file_sum, sum_line, write_sums
 from mme_vla.files.foreign import decoding, require_file
+from mme_vla.files.limits import files_to_hold
 from mme_vla.files.locks import FolderLock
 from mme_vla.files.places import inside, safe_name
 from mme_vla.files.plans import PLAN, claim_plan, drop_plan
@@ -12,7 +13,7 @@ from mme_vla.files.writing import draft_of, is_draft, remove_drafts, write_atomi
 
 __all__ = [
     "PLAN", "SUMS", "FolderLock", "Sums", "check_sums", "claim_plan", "decoding", "disk_trouble", "draft_of",
-    "drop_plan", "file_sum", "inside", "is_draft", "is_text", "name_place", "parse_json", "plain", "read_bytes",
-    "read_json", "read_json_lines", "read_text", "remove_drafts", "require_file", "safe_name", "sealed", "sum_line",
-    "unsealed", "write_atomically", "write_json", "write_sums",
+    "drop_plan", "file_sum", "files_to_hold", "inside", "is_draft", "is_text", "name_place", "parse_json", "plain",
+    "read_bytes", "read_json", "read_json_lines", "read_text", "remove_drafts", "require_file", "safe_name", "sealed",
+    "sum_line", "unsealed", "write_atomically", "write_json", "write_sums",
 ]  # fmt: skip

@@ -179,17 +179,15 @@ class OnlineHistory(History):
         self._length = 0
         self._kept: list[int] = []
         self._tokens: Tensor | None = None
-        self._score_frames: list[int] = []
-        self._score_values: list[np.ndarray] = []
+        self._scores = FrameScores.empty(spec.grid**2)
+        self._scored = 0  # rows in use
 
     def __len__(self) -> int:
         return self._length
 
     @property
     def scores(self) -> FrameScores:
-        if not self._score_frames:
-            return FrameScores.empty(self.spec.grid**2)
-        return FrameScores(np.asarray(self._score_frames, np.int64), np.stack(self._score_values))
+        return FrameScores(self._scores.frames[: self._scored], self._scores.values[: self._scored])
 
     def wanted(self, count: int, drawn: np.ndarray | None = None) -> np.ndarray:
         """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`.
@@ -220,15 +218,26 @@ class OnlineHistory(History):
             raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
         if self._scorer is not None:
             shown = zip((numbers + self._length).tolist(), frames, strict=True)
-            rows = [(number, self._scorer(number, frame)) for number, frame in shown]
-            self._score_frames += [frame for frame, values in rows if values is not None]
-            self._score_values += [np.asarray(values, np.float32) for _, values in rows if values is not None]
+            for number, frame in shown:
+                values = self._scorer(number, frame)
+                if values is not None:
+                    self._note_score(number, values)
         if len(tokens):
             self._grow(len(self._kept) + len(tokens), tokens)
             assert self._tokens is not None
             self._tokens[len(self._kept) : len(self._kept) + len(tokens)] = tokens
             self._kept.extend((wanted + self._length).tolist())
         self._length += count
+
+    def _note_score(self, frame: int, values: np.ndarray) -> None:
+        if self._scored == len(self._scores.frames):
+            more = max(self._scored, 16)
+            self._scores = FrameScores(
+                np.concatenate([self._scores.frames, np.zeros(more, np.int64)]),
+                np.concatenate([self._scores.values, np.zeros((more, len(values)), np.float32)]),
+            )
+        self._scores.frames[self._scored], self._scores.values[self._scored] = frame, values
+        self._scored += 1
 
     def _grow(self, needed: int, like: Tensor) -> None:
         capacity = 0 if self._tokens is None else len(self._tokens)

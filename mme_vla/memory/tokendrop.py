@@ -89,8 +89,10 @@ class TokenDrop(PerceptualMemory):
         return self.storage.kept_frames(length)
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        scores = history.scores.until(step) if self.causal else history.scores
-        return most_changed(ranked_patches(scores, self.storage.grid**2, self.candidates), step, self.budget)
+        patches = self.storage.grid**2
+        if self.causal:  # none lies later, so that the best `budget` of all are the best of the best `candidates`
+            return most_changed(ranked_patches(history.scores.until(step), patches, self.budget), step, self.budget)
+        return most_changed(ranked_patches(history.scores, patches, self.candidates), step, self.budget)
 
 
 def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
@@ -99,6 +101,10 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
     This is what a heap of that size holds after all frames have passed; the first frame's patches rank highest.
     """
     changed = scores.values >= THRESHOLD
+    beside = max(limit - patches, 0)  # places that the first frame leaves
+    if np.count_nonzero(changed) > beside > 0:  # sort no more than can stay: an episode's length costs next to nothing
+        flat = scores.values.reshape(-1)
+        changed &= scores.values >= np.partition(flat, len(flat) - beside)[len(flat) - beside]
     row, patch = np.nonzero(changed)
     frame = np.concatenate([np.zeros(patches, np.int64), scores.frames[row]])
     patch = np.concatenate([np.arange(patches), patch])

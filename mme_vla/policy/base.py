@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws, stack_draws
+from mme_vla.backbone.layers.recomputing import Recompute
+from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
@@ -33,6 +35,8 @@ class Policy(Saved):
     memory: Memory | None
     processor: "PolicyProcessor | None"
     config: dict[str, Any]
+    compute_dtype: torch.dtype = torch.float32
+    """Matrix products run in it, under autocast."""
     history_dtype: torch.dtype = torch.bfloat16
     """Of stored vision tokens."""
     horizon: int
@@ -69,9 +73,13 @@ class Policy(Saved):
         """
         raise NotImplementedError
 
-    def recompute(self, wanted: bool) -> None:
-        """Compute activations again in the backward pass instead of keeping them, or keep them."""
+    def recompute(self, wanted: Recompute) -> None:
+        """Compute activations again in the backward pass instead of keeping them (all, or `selective`), or not."""
         raise NotImplementedError
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """What processes that share the weights gather together; all else is gathered for a whole pass, in float32."""
+        return [ShardGroup(layer) for layer in stacked_layers(self)]
 
     # Sampling
 

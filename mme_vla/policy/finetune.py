@@ -9,9 +9,11 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
+import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
+from mme_vla.policy.tensor_files import dtype_of
 
 MODES = ("full", "expert_only", "lora")
 INITS: Mapping[str, Any] = {"uniform": True, "gaussian": "gaussian"}  # ours → peft's
@@ -26,6 +28,7 @@ class Tunable(Protocol):
     heads: Sequence[str]
     unadaptable: str | None
     frozen: str | None
+    compute_dtype: torch.dtype
 
     def parts(self) -> Mapping[str, str]: ...
 
@@ -51,6 +54,7 @@ def apply_finetuning(
     init: str = "uniform",
     targets: Sequence[str] | None = None,
     train: Sequence[str] | None = None,
+    frozen_dtype: str | None = None,
 ) -> dict[str, int]:
     """Set which parameters of a policy receive gradients; in mode `lora`, add the adapters that do.
 
@@ -66,15 +70,18 @@ def apply_finetuning(
             layer. By default those the policy names (`Policy.adapted`).
         train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`. By
             default the memory and the policy's heads.
+        frozen_dtype: `bfloat16` holds what does not learn at half the size, as the released training does; it rounds
+            those weights, and asks for compute in bfloat16.
 
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
 
     Raises:
-        UserError: an unknown mode, or a name that matches nothing.
+        UserError: an unknown mode or dtype, or a name that matches nothing.
     """
     if mode not in MODES:
         raise UserError(f"finetune.mode={mode!r}. {did_you_mean(str(mode), MODES)}")
+    check_frozen_dtype(policy, frozen_dtype)
     train = ("memory", *policy.heads) if train is None else train
     if mode == "lora":
         in_full = _named(policy, train)  # before anything is changed
@@ -89,10 +96,34 @@ def apply_finetuning(
             learns = ".lora_" in name or any(name.startswith(f"{module}.") for module in in_full) or part in train
         fixed = policy.frozen is not None and re.match(policy.frozen, name) is not None
         parameter.requires_grad_(learns and not fixed and not (part == "vision" and freeze_vision))
+    cast_frozen(policy, frozen_dtype)
     counts = dict.fromkeys(policy.parts(), 0)
     for name, parameter in policy.named_parameters():
         counts[policy.part_of(name)] += parameter.numel() if parameter.requires_grad else 0
     return counts
+
+
+def check_frozen_dtype(policy: Tunable, name: str | None) -> None:
+    """Make sure that a policy can compute with frozen weights of this dtype (None: as they are).
+
+    Raises:
+        UserError: it is none, or the policy computes in float32.
+    """
+    if name is None:
+        return
+    if dtype_of(name, "finetune.frozen_dtype") != torch.float32 and policy.compute_dtype == torch.float32:
+        raise UserError(
+            f"finetune.frozen_dtype={name} rounds weights that policy.compute_dtype=float32 would not: set "
+            "policy.compute_dtype=bfloat16 too, or leave frozen_dtype at null."
+        )
+
+
+def cast_frozen(policy: Tunable, name: str | None) -> None:
+    """Hold what does not learn in this dtype (None: as it is)."""
+    if name is not None:
+        for parameter in policy.parameters():
+            if not parameter.requires_grad and parameter.is_floating_point():
+                parameter.data = parameter.data.to(dtype_of(name))
 
 
 def add_adapters(

@@ -13,7 +13,9 @@ from torch import Tensor
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shape import read_backbone
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
 from mme_vla.integration.base import Integration, doors_of
@@ -173,13 +175,17 @@ class MMEPolicy(Policy):
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             return self.backbone.velocity(batch, self._views(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Compute activations again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recompute(wanted)
 
     def compile(self, **options: Any) -> None:
         """Compile the backbone's tower and layers in place, each by itself."""
         self.backbone.compile(**options)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """The backbone's groups. Memory and integration stand in none: they are small, and compute in float32."""
+        return self.backbone.shard_groups()
 
     def _inject(self, memory: MemoryTokens | None) -> Inject:
         return lambda observation: self.integration.inject(observation, memory)

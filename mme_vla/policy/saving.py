@@ -16,7 +16,7 @@ from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.hub import local_folder, push_folder
 from mme_vla.policy.kinds import policy_class_for
-from mme_vla.policy.tensor_files import INDEX, assign_tensors, dtype_of, load_tensors, save_tensors, weight_files
+from mme_vla.policy.tensor_files import assign_tensors, dtype_of, load_tensors, save_tensors, written_weights
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -67,12 +67,14 @@ class Saved(nn.Module):
         if card is not None:
             self.config["card"] = {**self.config.get("card", {}), **card}
         save_tensors(self.state_dict(), folder, dtype=kind)
+        about = self.save_about(folder)
+        write_sums(folder, [*about, *written_weights(folder)])  # not of the card, which people edit
+
+    def save_about(self, folder: Path) -> list[str]:
+        """Write all that `save_pretrained` writes beside the weights; return the names of what has checksums."""
         (folder / CONFIG).write_text(json.dumps(self.config, indent=2, ensure_ascii=False) + "\n")
         (folder / CARD_FILE).write_text(model_card(self, self.config))
-        written = [CONFIG, *(INDEX for _ in folder.glob(INDEX)), *(file.name for file in weight_files(folder))]
-        if self.processor is not None:
-            written += self.processor.save(folder)
-        write_sums(folder, written)  # not of the card, which people edit
+        return [CONFIG, *(self.processor.save(folder) if self.processor is not None else [])]
 
     @classmethod
     def from_pretrained(

@@ -76,6 +76,11 @@ def weight_files(folder: Path) -> list[Path]:
     raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
 
 
+def written_weights(folder: Path) -> list[str]:
+    """The names of a folder's weights and of their index."""
+    return [*(INDEX for _ in folder.glob(INDEX)), *(file.name for file in weight_files(folder))]
+
+
 def read_safetensors(file: Path) -> dict[str, Tensor]:
     """Read one safetensors file.
 

@@ -20,19 +20,38 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from mme_vla.errors import UserError, listed
 from mme_vla.files import check_sums, inside, read_json, write_sums
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
-from mme_vla.policy.tensor_files import check_values, load_tensors, read_files, replace_folder
+from mme_vla.policy.tensor_files import (
+    assign_tensors,
+    cast,
+    check_values,
+    load_tensors,
+    read_files,
+    replace_folder,
+    save_tensors,
+    written_weights,
+)
 from mme_vla.training.ema import EMA
+from mme_vla.training.parallel import like, whole_state
 from mme_vla.training.settings import KeepRule
+from mme_vla.training.shards import (
+    MOMENTS,
+    ShardWriter,
+    fresh_folder,
+    read_shards,
+    read_weights,
+    shard_files,
+    training_tensors,
+)
 
 FORMAT = "mme_vla training checkpoint 1"
 RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"
-_MOMENTS = ("exp_avg", "exp_avg_sq", "step")
+_ADAM = (*MOMENTS, "step")
 
 
 def trainable(module: nn.Module) -> dict[str, nn.Parameter]:
@@ -52,8 +71,7 @@ def save_checkpoint(
     """Write `folder`/step_…; it appears whole or not at all. Then remove what `keep` does not hold on to."""
     from safetensors.torch import save_file
 
-    target = folder / checkpoint_name(step)
-    draft = folder / f".{target.name}.partial"
+    target, draft = _places(folder, step)
     shutil.rmtree(draft, ignore_errors=True)
     with ema.applied():
         policy.save_pretrained(draft)
@@ -62,17 +80,64 @@ def save_checkpoint(
     moments = {
         f"{name}/{key}": _on_cpu(optimizer.state[p][key])
         for name, p in parameters.items()
-        for key in _MOMENTS
+        for key in _ADAM
         if p in optimizer.state
     }
     save_file(moments, draft / OPTIMIZER)
-    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": _versions()}
-    (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+    _write_state(draft, step, config)
     write_sums(draft, (RAW, OPTIMIZER, STATE), keep=True)
-    _flush(draft)
-    replace_folder(draft, target)
+    _publish(draft, target)
     tidy(folder, keep)
     return target
+
+
+def save_shards(
+    writer: ShardWriter,
+    folder: Path,
+    step: int,
+    policy: Policy,
+    ema: EMA,
+    optimizer: torch.optim.Optimizer,
+    config: Mapping[str, Any],
+    keep: KeepRule,
+    hurry: bool = False,
+) -> Path:
+    """Begin to write `folder`/step_… of a sharded run; all processes call it, and go on when `writer` has its copies.
+
+    Args:
+        hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's weights into it
+            after; otherwise it appears whole or not at all.
+    """
+    target, draft = _places(folder, step)
+    first = distributed.get_rank() == 0
+    writer.wait()  # the checkpoint before
+    with ema.applied():
+        averaged = whole_state(policy)
+    about: list[str] = []
+    if first:
+        fresh_folder(draft)
+        about = [*policy.save_about(draft), STATE]
+        _write_state(draft, step, config, shards=distributed.get_world_size())
+
+    def finish() -> None:
+        place = draft
+        if hurry:
+            write_sums(draft, about)
+            place = _publish(draft, target)
+        save_tensors(averaged, place, dtype=torch.float32)
+        write_sums(place, [*about, *written_weights(place)])
+        if not hurry:
+            _publish(draft, target)
+        tidy(folder, keep)
+
+    writer.write(draft, training_tensors(policy, ema.tensors(), optimizer, trainable(policy)), finish)
+    return target
+
+
+def load_policy(checkpoint: Path, policy: Policy) -> None:
+    """Give a policy, on meta or not, the weights that a run goes on from; `restore` brings all else."""
+    whole = read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
+    assign_tensors(policy, whole, str(checkpoint))
 
 
 def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optimizer) -> None:
@@ -82,23 +147,37 @@ def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optim
         UserError: a damaged file, or tensors that do not fit this policy.
     """
     parameters = trainable(policy)
-    averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
-    _check_fit(folder / "model.safetensors", averaged, policy.state_dict())
-    _check_fit(folder / RAW, raw, parameters)
-    like = {f"{name}/{key}": p for name, p in parameters.items() for key in _MOMENTS if f"{name}/{key}" in moments}
-    _check_fit(folder / OPTIMIZER, moments, like, scalar="/step")
-    for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
-        check_values(tensors, str(path))
-    ema.load(averaged)
-    policy.load_state_dict({**averaged, **raw})
+    if shard_files(folder):
+        moments = read_shards(folder, policy, ema.tensors(), optimizer, parameters)
+    else:
+        moments = _read_whole(folder, policy, ema)
     state = optimizer.state_dict()
     place = {id(p): i for i, p in enumerate(p for group in optimizer.param_groups for p in group["params"])}
     state["state"] = {
-        place[id(p)]: {key: moments[f"{name}/{key}"].clone() for key in _MOMENTS}  # no longer in a mapped file
+        place[id(p)]: {key: like(p, moments[f"{name}/{key}"]).clone() for key in MOMENTS}  # not in a mapped file
+        | {"step": moments[f"{name}/step"].clone()}
         for name, p in parameters.items()
         if f"{name}/step" in moments
     }
     optimizer.load_state_dict(state)
+
+
+def _read_whole(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
+    """Give weights and averages back their values, and return Adam's moments and counts as `<name>/<key>`."""
+    parameters = trainable(policy)
+    averaged, raw, moments = load_tensors(folder), _read(folder / RAW), _read(folder / OPTIMIZER)
+    own = policy.state_dict()
+    low = {name for name, tensor in own.items() if tensor.dtype == torch.bfloat16}  # frozen, and stored in float32
+    averaged = {name: cast(tensor, torch.bfloat16) if name in low else tensor for name, tensor in averaged.items()}
+    _check_fit(folder / "model.safetensors", averaged, own)
+    _check_fit(folder / RAW, raw, parameters)
+    wanted = {f"{name}/{key}": p for name, p in parameters.items() for key in _ADAM if f"{name}/{key}" in moments}
+    _check_fit(folder / OPTIMIZER, moments, wanted, scalar="/step")
+    for path, tensors in ((folder, averaged), (folder / RAW, raw), (folder / OPTIMIZER, moments)):
+        check_values(tensors, str(path))
+    ema.load(averaged)
+    policy.load_state_dict({name: like(own[name], tensor) for name, tensor in {**averaged, **raw}.items()})
+    return moments
 
 
 def read_state(checkpoint: Path) -> dict[str, Any]:
@@ -121,7 +200,13 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     sections = isinstance(state.get("config"), dict) and isinstance(state.get("versions"), dict)
     if isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < 2**53 or not sections:
         raise UserError(f"{path} is damaged: it lacks a step, a configuration or versions. Resume from an older one.")
-    for name in (RAW, OPTIMIZER):
+    shards = state.get("shards", 0)
+    if len(shard_files(checkpoint)) != shards:
+        raise UserError(
+            f"{checkpoint} holds {len(shard_files(checkpoint))} of the {shards} files that its processes wrote: it is "
+            "incomplete. Copy the whole folder again, or resume from an older checkpoint."
+        )
+    for name in () if shards else (RAW, OPTIMIZER):
         if not (checkpoint / name).is_file():
             raise UserError(f"{checkpoint} lacks {name}: it is incomplete. Resume from an older checkpoint.")
     return state
@@ -152,6 +237,23 @@ def tidy(folder: Path, keep: KeepRule) -> None:
             path.rename(folder / f".{path.name}.partial")  # whole or gone, for whoever looks
     for path in folder.glob(".step_*.partial"):
         shutil.rmtree(path)
+
+
+def _places(folder: Path, step: int) -> tuple[Path, Path]:
+    """Where a checkpoint will be, and where it is written."""
+    target = folder / checkpoint_name(step)
+    return target, folder / f".{target.name}.partial"
+
+
+def _write_state(draft: Path, step: int, config: Mapping[str, Any], **more: Any) -> None:
+    about = {"format": FORMAT, "step": step, "config": dict(config), "versions": _versions(), **more}
+    (draft / STATE).write_text(json.dumps(about, indent=2, ensure_ascii=False) + "\n")
+
+
+def _publish(draft: Path, target: Path) -> Path:
+    _flush(draft)
+    replace_folder(draft, target)
+    return target
 
 
 def _on_cpu(tensor: Tensor) -> Tensor:
@@ -187,7 +289,7 @@ def _versions() -> dict[str, str]:
 
 def _flush(folder: Path) -> None:
     """Have the disk hold what was written before the folder gets its final name."""
-    for path in (*folder.iterdir(), folder):
+    for path in (*folder.rglob("*"), folder):
         handle = os.open(path, os.O_RDONLY)
         try:
             os.fsync(handle)

@@ -38,6 +38,7 @@ def prepare_data(
     stats_from: Path | None = None,
     cache_command: str = COMMAND,
     say: Callable[[str], None] = print,
+    encoder: str | None = None,
 ) -> SplitData:
     """Open and check the datasets, give the policy's processor its statistics, and build or open the vision caches.
 
@@ -46,6 +47,7 @@ def prepare_data(
         cache_command: what to tell the user to run where a cache is missing.
         stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
         say: takes a line for the user.
+        encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by default asked here.
 
     Raises:
         UserError: whatever is wrong with the data, before any training.
@@ -66,7 +68,7 @@ def prepare_data(
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
-        cache, encoder = data["cache"], policy.vision_fingerprint()
+        cache, encoder = data["cache"], encoder or policy.vision_fingerprint()
         caches = [
             ensure_cache(
                 source,

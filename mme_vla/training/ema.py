@@ -1,22 +1,32 @@
 """The moving average of the trainable weights: what is evaluated, saved and released."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 
 import torch
 from torch import Tensor, nn
+from torch.distributed.tensor import DTensor
+
+from mme_vla.training.parallel import like
 
 
 class EMA:
     """average ← decay·average + (1 − decay)·weights after every update, begun with the initial weights as released."""
 
-    def __init__(self, parameters: Mapping[str, nn.Parameter], decay: float, warmup: bool = False) -> None:
-        """Begin with copies of the parameters.
+    def __init__(
+        self,
+        parameters: Mapping[str, nn.Parameter],
+        decay: float,
+        warmup: bool = False,
+        reshard: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Begin with copies of the parameters; of sharded ones, every process of its own part.
 
         Args:
             decay: of the average; with `warmup` at most, and (1 + k)/(10 + k) after k updates before (0 at first).
+            reshard: lets go of weights that were gathered from the parameters before they change.
         """
-        self.decay, self.warmup = decay, warmup
+        self.decay, self.warmup, self._reshard = decay, warmup, reshard
         self._parameters = dict(parameters)
         self._average = [p.detach().clone() for p in self._parameters.values()]
 
@@ -35,7 +45,7 @@ class EMA:
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Take the averages from `tensors`, which must name every parameter."""
         for name, average in zip(self._parameters, self._average, strict=True):
-            average.copy_(tensors[name])
+            average.copy_(like(average, tensors[name]))
 
     def tensors(self) -> dict[str, Tensor]:
         """The averages by parameter name."""
@@ -43,13 +53,27 @@ class EMA:
 
     @contextmanager
     def applied(self) -> Iterator[None]:
-        """Within this context the module has the averaged weights. Storage is exchanged; nothing is copied."""
+        """Within this context the module has the averaged weights.
+
+        Storage is exchanged and nothing copied, but for shards: what gathers them holds on to their storage, so their
+        numbers are exchanged.
+        """
         self._exchange()
         try:
             yield
         finally:
             self._exchange()
 
+    @torch.no_grad()
     def _exchange(self) -> None:
+        self._reshard()
         for i, parameter in enumerate(self._parameters.values()):
-            parameter.data, self._average[i] = self._average[i], parameter.data
+            average = self._average[i]
+            if isinstance(parameter, DTensor) and isinstance(average, DTensor):
+                own, other = parameter.to_local(), average.to_local()
+                kept = own.clone()
+                own.copy_(other)
+                other.copy_(kept)
+            else:
+                parameter.data, self._average[i] = average, parameter.data
+        self._reshard()

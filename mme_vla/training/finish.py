@@ -11,25 +11,32 @@ from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, read_metrics
 from mme_vla.training.loop import Trainer
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
+from mme_vla.training.parallel import gathered
 from mme_vla.training.runs import PLOT, SUMMARY
 
 
 def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine, loggers: Loggers) -> dict[str, Any]:
     """Check the averaged weights open loop, and write `open_loop.png` and `summary.json` into the run folder.
 
+    All processes call it, so that shared weights come together; the first does all else.
+
     Args:
         seconds: what the run took so far, for the summary.
     """
     folder, settings, policy = trainer.run_info.folder, trainer.settings, trainer.policy
-    summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
     samples = data.train if data.val is None else data.val
+    first, result = trainer.accelerator.is_main_process, None
     if settings.open_loop_chunks and not isinstance(samples, TrainingDataset):
         line.say("no open-loop check: it compares chunks step by step, and these samples are keyframes")
-    elif settings.open_loop_chunks:
-        assert isinstance(samples, TrainingDataset)
-        with trainer.ema.applied():
-            policy.eval()
-            result = open_loop(policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None)
+    elif isinstance(samples, TrainingDataset) and settings.open_loop_chunks and (first or trainer.sharded):
+        with trainer.ema.applied(), gathered(policy):
+            if first:
+                policy.eval()
+                result = open_loop(policy, samples, settings.open_loop_chunks, settings.seed, data.val is not None)
+    if not first:
+        return {}
+    summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
+    if result is not None:
         plot_open_loop(result, folder / PLOT, trainer.config["name"])
         loggers.picture(settings.steps, "open_loop", folder / PLOT)
         summary["open_loop"] = result.summary()

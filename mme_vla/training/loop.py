@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,24 @@ from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.training.checkpoint import checkpoint_name, restore, save_checkpoint, tidy, trainable
+from mme_vla.training.checkpoint import (
+    checkpoint_name,
+    restore,
+    save_checkpoint,
+    save_shards,
+    tidy,
+    trainable,
+)
 from mme_vla.training.console import ProgressLine, memory_gib
 from mme_vla.training.ema import EMA
 from mme_vla.training.logging import Loggers
 from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
+from mme_vla.training.parallel import reshard, shard, whole_number
+from mme_vla.training.reading import readers, size_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
+from mme_vla.training.shards import ShardWriter
 from mme_vla.training.stopping import leave_signals_alone, stop_asked
 from mme_vla.training.validation import Collate, Samples, Validation
 from mme_vla.training.window import Window
@@ -68,27 +79,37 @@ class Trainer:
             len(samples), settings.batch_size, settings.seed, range(run.step, settings.steps), settings.accumulate,
             accelerator.process_index, accelerator.num_processes,
         )  # fmt: skip
+        workers, ahead = settings.workers, None
+        if workers:
+            rows = self.order.rows(0)
+            batch_bytes = size_of(samples[0]) * (rows.stop - rows.start)
+            workers, ahead = readers(workers, batch_bytes, settings.prefetch_gb * 1e9)
         self.loader = DataLoader(
             _InEpoch(samples),
             batch_sampler=self.order,
             collate_fn=collate,
-            num_workers=settings.workers,
-            prefetch_factor=4 if settings.workers else None,
+            num_workers=workers,
+            prefetch_factor=ahead,
             pin_memory=accelerator.device.type == "cuda",
             worker_init_fn=leave_signals_alone,
             generator=generator_for(settings.seed, "workers"),
         )
-        self.policy = policy.to(accelerator.device).train()
+        self.policy = policy.train()
         policy.recompute(settings.gradient_checkpointing)
         if settings.compile:
             policy.compile()
+        self.sharded = settings.parallel.shards(accelerator.device)
+        if self.sharded:
+            mesh = settings.parallel.mesh(accelerator.device.type)
+            shard(policy, mesh, policy.compute_dtype, settings.compile)
         parameters = trainable(policy)
         self.optimizer = make_optimizer(parameters.values(), settings)
-        self.ema = EMA(parameters, settings.ema, settings.ema_warmup)
+        self.ema = EMA(parameters, settings.ema, settings.ema_warmup, partial(reshard, policy))
         if run.checkpoint is not None:
             restore(run.checkpoint, policy, self.ema, self.optimizer)
-        self.model = accelerator.prepare_model(policy)
+        self.model = policy if self.sharded else accelerator.prepare_model(policy)
         self._parameters = list(parameters.values())
+        self._shard_writer = ShardWriter() if self.sharded else None
         self.last_checkpoint = run.checkpoint
         self.stopped_by: int | None = None
         """The signal that ended `run` early."""
@@ -129,7 +150,7 @@ class Trainer:
                     if done % settings.val_every == 0 or done == settings.steps:
                         self.validate(done, line, loggers)
                     if saving:
-                        self.save(done)
+                        self.save(done, stopping)
                 if stopping:
                     self.stopped_by = asked.signal
                     line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
@@ -151,38 +172,63 @@ class Trainer:
             # Whatever else draws (augmentation, a memory's dropout) takes it from the default generator.
             torch.manual_seed(seed_of(settings.seed, "model", step, piece, self.accelerator.process_index))
             last = piece == settings.accumulate - 1
-            with nullcontext() if last else self.accelerator.no_sync(self.model):
+            with self._gradients_shared(last):
                 loss, metrics = self.model(batch, {name: value[rows].to(device) for name, value in draws.items()})
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
                 sums[name] = sums[name] + part if name in sums else part
-        norm = clip_gradients([p.grad for p in self._parameters if p.grad is not None], settings.clip_norm)
+        gradients = [p.grad for p in self._parameters if p.grad is not None]
+        norm = whole_number(clip_gradients(gradients, settings.clip_norm))
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.ema.update(step)
         return {**sums, "grad_norm": norm, "lr": torch.tensor(rate, device=device)}
 
+    @contextmanager
+    def _gradients_shared(self, shared: bool) -> Iterator[None]:
+        """Whether the backward passes within send their gradients to the other processes, or add up their own."""
+        if self.sharded:
+            self.policy.set_requires_gradient_sync(shared)  # type: ignore[operator]
+            yield
+        else:
+            with nullcontext() if shared else self.accelerator.no_sync(self.model):
+                yield
+
     def validate(self, step: int, line: ProgressLine, loggers: Loggers) -> float | None:
-        """Log the loss of the averaged weights on held-out steps."""
-        if self.validation is None or not self.accelerator.is_main_process:
+        """Log the loss of the averaged weights on held-out steps, of which every process takes its share."""
+        if self.validation is None:
             return None
+        processes = self.accelerator.process_index, self.accelerator.num_processes
         with self.ema.applied():
-            loss = self.validation.loss(self.policy)
+            loss = self.validation.loss(self.policy, *processes, self.accelerator.reduce)
         loggers.write(step, {"val/loss": loss})
         self.policy.config.setdefault("card", {})["results"] = {"validation loss": round(loss, 4), "at step": step}
         line.say(f"step {step}/{self.settings.steps} · validation loss {loss:.4f}")
         return loss
 
-    def save(self, step: int) -> Path:
-        """Write a checkpoint (the first process does)."""
-        folder = self.run_info.checkpoints
-        if self.accelerator.is_main_process:
-            keep = self.settings.keep
-            save_checkpoint(folder, step, self.policy, self.ema, self.optimizer, self.config, keep)
-        self.accelerator.wait_for_everyone()
+    def save(self, step: int, stopping: bool = False) -> Path:
+        """Write a checkpoint: the first process does, or all their parts, which training does not wait for.
+
+        Args:
+            stopping: the process may be killed before long: what resuming needs comes first.
+        """
+        folder, keep = self.run_info.checkpoints, self.settings.keep
+        held = (self.policy, self.ema, self.optimizer, self.config, keep)
+        if self._shard_writer is not None:
+            save_shards(self._shard_writer, folder, step, *held, hurry=stopping)
+        else:
+            if self.accelerator.is_main_process:
+                save_checkpoint(folder, step, *held)
+            self.accelerator.wait_for_everyone()
         self.last_checkpoint = folder / checkpoint_name(step)
         return self.last_checkpoint
+
+    def close(self) -> None:
+        """Wait until the last checkpoint is on disk."""
+        if self._shard_writer is not None:
+            self._shard_writer.close()
+            self._shard_writer = None
 
     def _due(self, done: int) -> bool:
         """Whether a window ends after `done` updates, as far as the plan goes; being asked to stop ends one too."""

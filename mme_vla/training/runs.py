@@ -22,7 +22,8 @@ CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json",
 
 MAY_DIFFER = (
     "name", "full_size", "output", "resume", "init_from", "logger", "train.steps", "train.log_every", "train.val_every",
-    "train.save_every", "train.keep", "train.workers", "train.open_loop_chunks", "train.device",
+    "train.save_every", "train.keep", "train.parallel", "train.prefetch_gb", "train.workers",
+    "train.open_loop_chunks", "train.device",
     "data.cache", "data.content", "trust_plugins",
 )  # fmt: skip
 """Keys (and all below them) that a resumed run may change: how long, how often, where; nothing that changes a loss.

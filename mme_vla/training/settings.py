@@ -4,8 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
+from mme_vla.backbone.layers.recomputing import SELECTIVE
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
+from mme_vla.training.parallel import ParallelSettings
 
 SCHEDULES = ("constant", "cosine", "steps")
 OPTIMIZERS = ("adamw", "lamb")
@@ -46,10 +48,12 @@ class TrainSettings:
     decay_min_dim: int = 0
     ema_warmup: bool = False
     accumulate: int = 1
-    gradient_checkpointing: bool = False
+    gradient_checkpointing: bool | str = False
     compile: bool = False
+    parallel: ParallelSettings = field(default_factory=ParallelSettings)
     device: str = "auto"
     workers: int = 1
+    prefetch_gb: float = 8.0
     log_every: int = 100
     val_every: int = 1000
     val_samples: int = 64
@@ -82,11 +86,13 @@ class TrainSettings:
         _check("gamma", self.gamma, 0 < self.gamma <= 1, "above 0 and at most 1")
         for name in ("warmup", "decay_min_dim", "workers", "val_samples", "open_loop_chunks", "weight_decay"):
             _check(name, getattr(self, name), getattr(self, name) >= 0, "not negative")
-        for name in ("lr", "eps", "clip_norm"):
+        for name in ("lr", "eps", "clip_norm", "prefetch_gb"):
             _check(name, getattr(self, name), getattr(self, name) > 0, "positive")
         _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
         betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
         _check("betas", self.betas, betas, "two numbers in [0, 1)")
+        known = self.gradient_checkpointing in (True, False, SELECTIVE)
+        _check("gradient_checkpointing", self.gradient_checkpointing, known, f"true, false or {SELECTIVE}")
         _check("device", self.device, self.device in ("auto", "cpu", "cuda"),
                "auto (a GPU where there is one), cuda or cpu; which GPU is said by CUDA_VISIBLE_DEVICES")  # fmt: skip
         _check(

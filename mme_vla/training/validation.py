@@ -33,18 +33,31 @@ class Validation:
         self._batches: list[Any] = []
 
     @torch.no_grad()
-    def loss(self, policy: Policy) -> float:
-        """The mean loss, without augmentation; the policy's mode is put back."""
+    def loss(
+        self, policy: Policy, process: int = 0, processes: int = 1, reduce: Callable[..., Any] | None = None
+    ) -> float:
+        """The mean loss, without augmentation; the policy's mode is put back.
+
+        Args:
+            process, processes: which of how many this is; each takes its share of the batches. All of them run the
+                policy equally often, as sharing its weights asks: one without a batch of its own repeats its last.
+            reduce: sums a tensor over all processes (`Accelerator.reduce`), where there are several.
+        """
         was_training = policy.training
         policy.eval()
-        total = 0.0
+        total = torch.zeros((), dtype=torch.float64)
         places = [self.indices[i : i + self._batch_size] for i in range(0, len(self.indices), self._batch_size)]
-        for number, place in enumerate(places):
+        mine = places[process::processes]
+        for number in range(-(-len(places) // processes)):
+            place = mine[number] if number < len(mine) else places[process % len(places)]
             if number == len(self._batches):
                 self._batches.append(self._collate([self._samples[i] for i in place]))
             rows = [policy.loss_draws(1, generator_for(self._seed, "validation", i)) for i in place]
             draws = {name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]}
             loss, _ = policy(self._batches[number].to(policy.device), draws)
-            total += float(loss) * len(place)
+            if number < len(mine):
+                total += float(loss) * len(place)
         policy.train(was_training)
-        return total / len(self.indices)
+        if reduce is not None and processes > 1:
+            total = reduce(total.to(policy.device), reduction="sum")
+        return float(total) / len(self.indices)

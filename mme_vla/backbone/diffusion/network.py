@@ -2,11 +2,11 @@
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from mme_vla.backbone.diffusion.keypoints import keypoint_pool, picture_encoder
 from mme_vla.backbone.diffusion.sizes import DiffusionSizes
 from mme_vla.backbone.diffusion.unet import ConditionalUnet1d
+from mme_vla.backbone.layers.recomputing import Recompute, run_layer
 from mme_vla.backbone.pi05.backbone import initialise
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 
@@ -27,7 +27,7 @@ class DiffusionNetwork(nn.Module):
         """
         super().__init__()
         self.sizes = sizes
-        self.recomputed = False
+        self.recomputed: Recompute = False
         # The tower comes first: with one seed it is the same whatever else is built, and so is a cache made by it.
         if tower:
             self.vision = VisionTower(sizes.memory_tower, sizes.memory_width)
@@ -53,10 +53,7 @@ class DiffusionNetwork(nn.Module):
             pictures: [b, t, v, 3, h, w] in [−1, 1], cropped. state: [b, t, s] normalised. text: [b, d] of unit length.
         """
         flat = pictures.flatten(0, 2)
-        if self.recomputed and self.training:
-            features = checkpoint(self.image_encoder, flat, use_reentrant=False)
-        else:
-            features = self.image_encoder(flat)
+        features = run_layer(self.image_encoder, flat, how=self.training and self.recomputed)
         points = self.image_pool(features).unflatten(0, pictures.shape[:3]).flatten(2)  # b t (v k 2)
         words = self.text_proj(text)[:, None].expand(-1, pictures.shape[1], -1)
         steps = torch.cat([points, state, words], dim=-1).flatten(1)

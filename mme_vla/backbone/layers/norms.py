@@ -39,6 +39,9 @@ class Modulation(NamedTuple):
 class AdaRMSNorm(nn.Module):
     """rms(x)·(1 + scale(c)) + shift(c), and a gate(c) for the sublayer's output. Starts as identity with gate 0."""
 
+    keeps_float32 = True
+    """Its weights are never gathered in bfloat16 (`shard_groups`)."""
+
     def __init__(self, width: int, condition_width: int) -> None:
         super().__init__()
         self.dense = nn.Linear(condition_width, 3 * width)

@@ -15,6 +15,7 @@ from mme_vla.backbone.base import Backbone, Draws, Hook, Inject, Injection
 from mme_vla.backbone.layers.attention import additive_mask, attend
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.nano.sizes import NanoConfig
 from mme_vla.backbone.nano.tower import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import flow
@@ -222,7 +223,7 @@ class NanoBackbone(Backbone):
         clean = self._clean(batch, *self._prepare(batch, images, inject), noisy, time, versions)
         return flow.step_loss(clean, actions).unflatten(0, (-1, versions)).mean(1)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """There is nothing worth recomputing: a layer's activations are a chunk's few tokens."""
 
     def sample_draws(self, generator: torch.Generator) -> Draws:

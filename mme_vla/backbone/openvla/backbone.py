@@ -10,10 +10,12 @@ from torch import Tensor
 from mme_vla.backbone.base import Backbone, Inject
 from mme_vla.backbone.layers.attention import additive_mask
 from mme_vla.backbone.layers.blocks import Block
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.head import ActionHead, StateToken
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.sizes import OpenVlaConfig
 from mme_vla.backbone.pi05.siglip import pool_grid
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
@@ -168,9 +170,13 @@ class OpenVlaBackbone(Backbone):
         """The chunk [b, h, a]; there is nothing to draw."""
         return self.answer(batch, images, inject)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(wanted)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Towers, word embedding, and every layer of the language model."""
+        return [*super().shard_groups(), ShardGroup(self.vlm.language.model.embed_tokens, full=True)]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers and every layer of the language model, each by itself."""

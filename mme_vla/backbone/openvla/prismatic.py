@@ -5,6 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.layers.recomputing import Recompute, checkpoint_options
 from mme_vla.backbone.layers.rope import rotation
 from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig
 from mme_vla.backbone.openvla.vision import OPENVLA, FusedVision, Standard
@@ -71,10 +72,10 @@ class Prismatic(nn.Module):
         )
         return answer.hidden_states if every_layer else answer.last_hidden_state
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute the Llama's layers in the backward pass, through transformers' own switch."""
         if wanted:
-            self.language.gradient_checkpointing_enable({"use_reentrant": False})
+            self.language.gradient_checkpointing_enable(checkpoint_options(wanted))
         else:
             self.language.gradient_checkpointing_disable()
 

@@ -10,11 +10,13 @@ from mme_vla.backbone.base import Backbone, Draws, Inject, Injection
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.layers.precision import float32_linear
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.pi05 import flow
 from mme_vla.backbone.pi05.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.pi05.overlap import agreeing
 from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
 
@@ -148,9 +150,13 @@ class Pi05Backbone(Backbone):
         answer, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(answer)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute layers in the backward pass (activation checkpointing)."""
         self.transformer.gradient_checkpointing = wanted
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Tower, token embedding, and every layer of all experts."""
+        return [*super().shard_groups(), ShardGroup(self.embedding, full=True)]
 
     # Sampling
 

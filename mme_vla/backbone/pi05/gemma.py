@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from mme_vla.backbone.base import Hook
 from mme_vla.backbone.layers.attention import additive_mask, attend
 from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, placed, token_positions
 from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
 from mme_vla.backbone.layers.precision import compute_dtype
+from mme_vla.backbone.layers.recomputing import Recompute, run_layer
 from mme_vla.backbone.layers.rope import Rotation, rotate, rotation
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 
@@ -206,7 +206,7 @@ class JointTransformer(nn.Module):
     def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str = "action") -> None:
         super().__init__()
         self.head_dim, self.answering, self.experts = config.head_dim, answering, experts
-        self.gradient_checkpointing = False
+        self.gradient_checkpointing: Recompute = False
         self.layers = nn.ModuleList(
             JointBlock(config, experts, answering, last=i == config.depth - 1) for i in range(config.depth)
         )
@@ -258,10 +258,7 @@ class JointTransformer(nn.Module):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
             of_hook = None if hook is None else _bind(hook, i)
             args = (segments, layout.turn, layout.mask, of_layer, of_hook, past.layers[i] if past else None)
-            if self.gradient_checkpointing and torch.is_grad_enabled():
-                segments, kv = checkpoint(block, *args, use_reentrant=False)
-            else:
-                segments, kv = block(*args)
+            segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
             if keep:
                 old = past.layers[i] if past else None
                 cached.append(kv if old is None else (torch.cat([old[0], kv[0]], 1), torch.cat([old[1], kv[1]], 1)))

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
+from mme_vla.backbone.layers.recomputing import Recompute, run_layer
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.backbone.sam2act.views import VIEWS
 
@@ -108,7 +108,7 @@ class MultiViewTransformer(nn.Module):
         self.wide = nn.Linear(sizes.token, sizes.width)
         self.narrow = nn.Linear(sizes.width, sizes.token)
         self.layers = nn.ModuleList(Layer(sizes.width, sizes.heads) for _ in range(sizes.depth))
-        self.recomputed = False
+        self.recomputed: Recompute = False
         """Whether layers keep no activations in training."""
 
     def forward(self, look: Look) -> Tensor:
@@ -134,8 +134,5 @@ class MultiViewTransformer(nn.Module):
         return tokens.transpose(1, 2).unflatten(-1, (grid, grid))
 
     def _run(self, layer: nn.Module, x: Tensor) -> Tensor:
-        if self.recomputed and torch.is_grad_enabled():
-            kept: Tensor = checkpoint(layer, x, use_reentrant=False)
-            return kept
-        out: Tensor = layer(x)
+        out: Tensor = run_layer(layer, x, how=self.recomputed)
         return out

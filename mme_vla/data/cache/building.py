@@ -2,15 +2,19 @@
 
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
+from io import BytesIO
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.data.ahead import ahead
 from mme_vla.data.cache.store import (
     DTYPES,
     FINGERPRINT,
@@ -25,6 +29,9 @@ from mme_vla.data.progress import progress
 from mme_vla.errors import UserError
 from mme_vla.files import draft_of, remove_drafts, sum_line, write_atomically, write_json
 from mme_vla.memory.base import Memory
+
+PAGE = 4096  # bytes
+CHUNKS_AHEAD = 2
 
 Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
 
@@ -87,10 +94,25 @@ def build_cache(
     mine = range(rank, len(source), world)
     missing = [episode for episode in mine if not token_file(folder, episode).is_file()]
     total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
-    with progress(f"vision cache {source.name}", total, total - left, "frames") as advance:
-        for episode in missing:
-            _build_episode(source, episode, memory, encode, folder, expected["dtype"], batch_size, advance)
+    with (
+        progress(f"vision cache {source.name}", total, total - left, "frames") as advance,
+        # Pictures are decoded in a thread while the ones before them are encoded.
+        closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
+    ):
+        for episode, of_episode in groupby(chunks, lambda found: found[0]):
+            some = (chunk for _, chunk in of_episode)
+            _build_episode(source, episode, some, memory, encode, folder, expected["dtype"], advance)
     return len(missing)
+
+
+def _of_all(
+    source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
+) -> Iterator[tuple[int, "_Chunk"]]:
+    """The chunks of all episodes, one after the other; an episode of which nothing was drawn has an empty one."""
+    for episode in episodes:
+        yield episode, _Chunk(0, np.zeros((0, 1, 1, 3), np.uint8), [], [])
+        for chunk in _chunks(source, episode, memory, batch_size):
+            yield episode, chunk
 
 
 def estimate(
@@ -146,18 +168,18 @@ def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int
 def _build_episode(
     source: EpisodeSource,
     episode: int,
+    chunks: Iterable[_Chunk],
     memory: Memory,
     encode: Encode,
     folder: Path,
     dtype: str,
-    batch_size: int,
     advance: Callable[[int], None],
 ) -> None:
     patches = memory.storage.grid**2
     rows: list[np.ndarray] = []
     frames: list[int] = []
     values: list[np.ndarray] = []
-    for chunk in _chunks(source, episode, memory, batch_size):
+    for chunk in chunks:
         frames += chunk.score_frames
         values += chunk.score_values
         if len(chunk.kept_pictures):
@@ -174,12 +196,22 @@ def _build_episode(
         path = score_file(folder, episode)
         drafts[path] = _draft(path, np.savez, frames=np.asarray(frames, np.int64), values=stacked)
     path = token_file(folder, episode)
-    drafts[path] = _draft(path, np.save, np.concatenate(rows))
+    drafts[path] = _draft(path, save_aligned, np.concatenate(rows))
     sums = "".join(sum_line(draft, path.name) for path, draft in drafts.items())
     with write_atomically(sum_file(folder, episode)) as draft:
         draft.write_text(sums)
     for path, draft in drafts.items():  # tokens last: where they are, all else is
         draft.replace(path)
+
+
+def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
+    """Write an array as .npy whose numbers begin at a page: a row of one page is then read as one, not as two."""
+    buffer = BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
+    magic, described = buffer.getvalue()[:8], buffer.getvalue()[10:].rstrip()
+    described += b" " * (PAGE - 11 - len(described)) + b"\n"
+    file.write(magic + len(described).to_bytes(2, "little") + described)
+    file.write(np.ascontiguousarray(array).data)
 
 
 def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:

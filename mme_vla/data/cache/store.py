@@ -18,7 +18,7 @@ import numpy as np
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError, brief
-from mme_vla.files import Sums, decoding, read_json, require_file
+from mme_vla.files import Sums, decoding, files_to_hold, read_json, require_file
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 
 if TYPE_CHECKING:
@@ -102,7 +102,8 @@ class VisionCache:
     An episode's files are compared with their checksums when its history is first asked for, once a process.
     """
 
-    max_open = 64  # histories kept at hand
+    max_open: int
+    """Histories kept at hand: of all episodes, as far as the process may hold their files."""
 
     def __init__(self, folder: Path, source: EpisodeSource, expected: dict[str, Any], command: str = COMMAND) -> None:
         """Open and check a cache.
@@ -130,6 +131,7 @@ class VisionCache:
         if len(widths) > 1:
             raise UserError(f"{folder} mixes tokens of widths {sorted(widths)}. Rebuild it: {command} rebuild=true")
         self.width = widths.pop()
+        self.max_open = files_to_hold(len(source))
         self._histories: OrderedDict[int, CachedHistory] = OrderedDict()
         self._verified: set[int] = set()
 

@@ -72,7 +72,10 @@ class Run:
 
 @dataclass
 class Method:
-    """All runs of one model, with the figures of every scope in `figures[kind][name]`."""
+    """All runs of one model, with the figures of every scope in `figures[kind][name]`.
+
+    repeated, flipped: see `Comparison`.
+    """
 
     label: str
     model: str
@@ -82,6 +85,8 @@ class Method:
     paper: PaperMethod | None
     composition: str | None = None
     figures: dict[str, dict[str, Figure]] = field(default_factory=dict)
+    repeated: int = 0
+    flipped: int = 0
 
     @property
     def average(self) -> Figure:
@@ -128,6 +133,7 @@ def aggregate(
         UserError: nothing to average, an unknown task, several splits, or records that contradict each other.
     """
     protocol = protocol or Protocol()
+    records = list(records)
     merged = merge(records, conflicts)
     for task in {record.task for record in merged}:
         task_facts(task)
@@ -149,8 +155,26 @@ def aggregate(
         run = Run(key, {record.key: record for record in members}, protocol)
         groups.setdefault((key.model, key.subgoal, key.memory_budget, key.composition), []).append(run)
     methods = [_method(*group, runs, protocol) for group, runs in groups.items()]
+    repeats = repeated_episodes(records)
+    for method in methods:
+        found = [repeats[run.key] for run in method.runs if run.key in repeats]
+        method.repeated, method.flipped = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
     apart = _tell_apart(methods)
     return Results(methods, protocol, [*apart, *_notes(methods, protocol, len(chosen) - len(inside))])
+
+
+def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
+    """Of each run: how many episodes ended twice or more by themselves, and how many of those not always alike."""
+    outcomes: dict[tuple[RunKey, EpisodeKey], list[str]] = {}
+    for record in records:
+        if record.outcome != "error":
+            outcomes.setdefault((record.run, record.key), []).append(record.outcome)
+    counts: dict[RunKey, tuple[int, int]] = {}
+    for (run, _), found in outcomes.items():
+        if len(found) > 1:
+            repeated, flipped = counts.get(run, (0, 0))
+            counts[run] = repeated + 1, flipped + (len(set(found)) > 1)
+    return counts
 
 
 def _tell_apart(methods: Sequence[Method]) -> list[str]:
@@ -269,6 +293,11 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             errors = run.outcomes["error"]
             if errors:
                 notes.append(f"{run.key}: {errors} episodes ended in an error and count as failures.")
+        if method.repeated:
+            notes.append(
+                f"{method.label}: {method.repeated:,} episodes were run more than once with the same weights and seed; "
+                f"{method.flipped:,} of them did not always end alike (deterministic=true repeats runs)."
+            )
         limits = {record.max_steps for run in method.runs for record in run.records.values()}
         if method.paper and limits != {MAX_STEPS}:
             given = ", ".join(map(str, sorted(limits)))

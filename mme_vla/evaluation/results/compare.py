@@ -21,6 +21,8 @@ class Comparison:
     p: exact two-sided test on wins and losses (McNemar's where each has one run). corrected: by Holm, over all
         comparisons made together. significant: `corrected` is below 1 − confidence.
     suites: difference and interval of each suite.
+    repeated, flipped: episodes that were run twice with the same weights and seed, and those of them that then ended
+        otherwise; of both methods.
     """
 
     first: str
@@ -37,10 +39,19 @@ class Comparison:
     corrected: float
     significant: bool
     suites: dict[str, tuple[float, Interval]]
+    repeated: int = 0
+    flipped: int = 0
 
     @property
     def verdict(self) -> str:
         """One sentence."""
+        said = self._judgement
+        if self.repeated:
+            said += f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
+        return said
+
+    @property
+    def _judgement(self) -> str:
         p = f"p {show_p(self.corrected)}" if self.corrected < 0.001 else f"p = {show_p(self.corrected)}"
         if self.significant:
             better, worse = (self.first, self.second) if self.wins > self.losses else (self.second, self.first)
@@ -103,7 +114,7 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     return Comparison(
         first.label, second.label, len(common), len(protocol.tasks) * protocol.episodes, float(means[0]),
         float(means[1]), float(means[0] - means[1]), _interval(gaps, protocol), wins, losses, p, p,
-        p < 1 - protocol.confidence, suites,
+        p < 1 - protocol.confidence, suites, first.repeated + second.repeated, first.flipped + second.flipped,
     )  # fmt: skip
 
 

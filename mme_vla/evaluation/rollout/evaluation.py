@@ -11,14 +11,17 @@ from mme_vla.envs.make import ACTION_SPACES, make_env
 from mme_vla.envs.vector.jobs import Job
 from mme_vla.envs.vector.pool import VecEnv
 from mme_vla.errors import UserError
+from mme_vla.evaluation.claims import Claims
+from mme_vla.evaluation.forecast import Durations, earlier_records
 from mme_vla.evaluation.record_log import RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.plan import Shard, take_share
+from mme_vla.evaluation.rollout.plan import Shard
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
+from mme_vla.evaluation.rollout.waiting import Waiting
 from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
 from mme_vla.files import remove_drafts, safe_name
 from mme_vla.policy.base import Policy
@@ -31,7 +34,10 @@ VIDEOS = "videos"
 
 
 class Evaluation(NamedTuple):
-    """What came of a run: the records of this shard's episodes, old and new, and what the policy did this time."""
+    """What came of a run: the records of its episodes, old and new, and what the policy did this time.
+
+    Of several processes that share a run each has the records that it wrote.
+    """
 
     records: list[EpisodeRecord]
     workload: Workload
@@ -55,19 +61,23 @@ def evaluate(
     source: str | None = None,
     base: Callable[..., Any] = make_env,
     notes: dict[str, Any] | None = None,
+    times_from: Path | None = None,
     shown: bool = True,
 ) -> Evaluation:
     """Run every episode that `output` has no result of yet.
 
     Args:
         policy: in eval mode, on its device, with statistics.
-        jobs: the episodes of all shards.
+        jobs: the episodes of the run. shard: which of how many processes this is; each takes the next episode that is
+            free when it has room (`claims.py`).
         output: the run's folder; one that holds a part of the same run is gone on with.
         facts: what the records say of the policy.
         subgoals: who says the subgoal, where the policy reads one.
         source: where the weights are from; part of what makes a run the same.
         base: makes an environment with the benchmark's interface; importable by name.
         notes: kept in `run.json` and never compared.
+        times_from: earlier records, of any policy: the longest episodes begin first, and say how long all will take;
+            by default those in `output` and in the folders beside it.
 
     Raises:
         UserError: `output` holds another run, or the environments cannot be built.
@@ -78,32 +88,28 @@ def evaluate(
         check_benchmark(policy.embodiment, ACTION_SPACES)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
     shard = shard or Shard()
-    mine = take_share(jobs, shard)
     with RecordLog(output / shard.file) as log:
         remove_drafts(output / VIDEOS)  # films of workers that were killed
-        done = _done(output, mine, facts)
-        missing = [job for job in mine if (job.task, job.episode) not in finished(done)]
+        done = _done(output, jobs, facts)
+        missing = [job for job in jobs if (job.task, job.episode) not in finished(done)]
+        durations = Durations(earlier_records(output, times_from))
+        missing = durations.longest_first(missing)
         kept = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(len(mine), kept, shown) as progress:
+        with RolloutProgress(len(jobs), kept, shown) as progress:
             if kept:
-                progress.say(f"{output} holds {len(kept)} of {len(mine)} episodes: going on with the others")
-            workload = _run(policy, missing, output, facts, settings, subgoals, base, log, progress)
-    return Evaluation(_done(output, mine, facts), workload)
+                progress.say(f"{output} holds {len(kept)} of {len(jobs)} episodes: going on with the others")
+            workers = settings.worker_count(-(-len(missing) // shard.count))
+            if forecast := durations.forecast(missing, workers, shard.count):
+                progress.say(str(forecast))
+            waiting = Waiting(missing, Claims(output, shard.file) if shard.count > 1 else None)
+            envs = _environments(policy, output, settings, base, workers) if missing else None
+            workload = _run(policy, waiting, envs, output, facts, settings, subgoals, log, progress)
+    return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
-def _run(
-    policy: Policy,
-    jobs: list[Job],
-    output: Path,
-    facts: RunFacts,
-    settings: RolloutSettings,
-    subgoals: SubgoalPredictor | None,
-    base: Callable[..., Any],
-    log: RecordLog,
-    progress: RolloutProgress,
-) -> Workload:
-    if not jobs:
-        return Workload()
+def _environments(
+    policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
+) -> VecEnv:
     robot = policy.embodiment
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
     if base is make_env:
@@ -111,11 +117,26 @@ def _run(
         options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":
         options["videos"] = (str(output / VIDEOS), settings.video)
-    workers = settings.worker_count(len(jobs))
-    with VecEnv([], workers, make_rollout_env, options, settings.timeout_s) as envs:
+    return VecEnv([], workers, make_rollout_env, options, settings.timeout_s)
+
+
+def _run(
+    policy: Policy,
+    waiting: Waiting,
+    environments: VecEnv | None,
+    output: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    subgoals: SubgoalPredictor | None,
+    log: RecordLog,
+    progress: RolloutProgress,
+) -> Workload:
+    if environments is None:
+        return Workload()
+    with environments as envs:
         folder = output / SUBGOALS if settings.subgoal_log else None
         rollout = Rollout(policy, envs, facts, settings, log.append, subgoals, folder, progress)
-        rollout.run(jobs)
+        rollout.run(waiting)
     return rollout.workload
 
 
@@ -198,13 +219,14 @@ def default_output(facts: RunFacts) -> Path:
     return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
 
 
-def _done(output: Path, mine: Sequence[Job], facts: RunFacts) -> list[EpisodeRecord]:
-    """What the folder has of these episodes, whichever shard wrote it; folders below it hold other runs."""
+def _done(output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | None = None) -> list[EpisodeRecord]:
+    """What the folder has of these episodes, whichever process wrote it, or this one; folders below hold other runs."""
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
     run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
                  facts.composition)  # fmt: skip
-    wanted = {(job.task, job.episode) for job in mine}
-    found = [record for path in sorted(output.glob("episodes*.jsonl")) for record in read_records(path)]
+    wanted = {(job.task, job.episode) for job in jobs}
+    files = sorted(output.glob("episodes*.jsonl")) if shard is None or shard.count == 1 else [output / shard.file]
+    found = [record for path in files for record in read_records(path)]
     # run.json has seen to it that this is the same policy: records from before there were digests are of it too.
     found = [replace(r, composition=facts.composition) if r.composition is None else r for r in found]
     return [record for record in merge(found, "first") if record.run == run and record.key in wanted]

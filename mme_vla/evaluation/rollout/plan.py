@@ -1,6 +1,5 @@
 """Which episodes a run is made of, and which of them this process runs."""
 
-import hashlib
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -54,13 +53,3 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
     if shard.index >= shard.count:
         raise UserError(f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
     return shard
-
-
-def take_share(jobs: Sequence[Job], shard: Shard) -> list[Job]:
-    """This shard's part of the episodes, in their order.
-
-    Who runs what is decided by a hash of each episode, so that every shard gets its share of every task and difficulty.
-    """
-    mixed = sorted(jobs, key=lambda job: hashlib.sha256(str(job).encode()).digest())
-    mine = set(mixed[shard.index :: shard.count])
-    return [job for job in jobs if job in mine]

@@ -6,7 +6,7 @@ for a slow episode, and a long conditioning video is read in pieces between batc
 
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -24,6 +24,7 @@ from mme_vla.evaluation.rollout.running_episode import RunningEpisode
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoal_score import EXTRA
 from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
+from mme_vla.evaluation.rollout.waiting import Waiting
 from mme_vla.policy.base import Policy
 from mme_vla.policy.batching import Act, Turns
 from mme_vla.subgoal import SubgoalPredictor
@@ -94,7 +95,7 @@ class Rollout:
     subgoal_folder: Path | None = None
     progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, shown=False))
     workload: Workload = field(default_factory=Workload)
-    _waiting: list[Job] = field(default_factory=list)
+    _waiting: Waiting = field(default_factory=Waiting)
     _running: dict[int, RunningEpisode] = field(default_factory=dict)
     _tries: Counter[Job] = field(default_factory=Counter)
     _stillborn: int = 0
@@ -103,14 +104,14 @@ class Rollout:
         self._turns: Turns[RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
         self._pictures = Pictures(self.policy, self.subgoals, self.settings)
 
-    def run(self, jobs: list[Job]) -> None:
+    def run(self, jobs: Sequence[Job] | Waiting) -> None:
         """Run these episodes.
 
         Raises:
             UserError: the environments cannot be built, or a policy and its subgoals do not go together.
         """
         begun = time.perf_counter()
-        self._waiting = list(jobs)
+        self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
         for worker in range(self.envs.workers):
             self._start(worker)
         while self.envs.busy or self._turns:
@@ -120,9 +121,9 @@ class Rollout:
         self.workload.wall_s += time.perf_counter() - begun
 
     def _start(self, worker: int) -> None:
-        if not self._waiting:
+        job = self._waiting.take()
+        if job is None:
             return
-        job = self._waiting.pop(0)
         self._tries[job] += 1
         settings, memory = self.settings, self.policy.memory
         # Of some memories most frames are never encoded.
@@ -232,6 +233,6 @@ class Rollout:
         self.record(record)
         self.progress.episode(record, again)
         if again:
-            self._waiting.append(job)
+            self._waiting.put_back(job)
         del self._running[running.worker]
         self._start(running.worker)

@@ -13,6 +13,8 @@ from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.diffusion import ddpm
 from mme_vla.backbone.diffusion.network import DiffusionNetwork
 from mme_vla.backbone.diffusion.sizes import DiffusionSizes
+from mme_vla.backbone.layers.recomputing import Recompute
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.integration.feature_wise import PooledIntegration
@@ -164,9 +166,14 @@ class DiffusionPolicy(Policy):
         with self.autocast():
             return self.memory(history)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Compute the pictures' features again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recomputed = wanted
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """The memory's tower, the picture encoder, and the U-Net."""
+        tower = [] if self.memory is None else [ShardGroup(self.backbone.vision, full=True)]
+        return [*tower, ShardGroup(self.backbone.image_encoder), ShardGroup(self.backbone.unet)]
 
     def _schedule(self) -> Any:
         return ddpm.noise_schedule(self.sizes.diffusion_steps)

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.layers.attention import additive_mask
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.vision import IMAGENET
+from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
@@ -174,9 +176,15 @@ class MemoryVlaPolicy(Policy):
         loss = losses.mean()
         return loss, {"loss": loss.detach()}
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(wanted)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Towers, word embedding, every layer of the language model, and every block of the head."""
+        whole = (self.vlm.vision, self.vlm.language.model.embed_tokens)
+        layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
+        return [*(ShardGroup(module, full=True) for module in whole), *map(ShardGroup, layers)]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers, the language model's layers and the head's blocks, each by itself."""

@@ -5,6 +5,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.sam2act.branch import Branch
 from mme_vla.backbone.sam2act.picture_encoder import PictureEncoder
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
@@ -35,7 +36,7 @@ class SAM2ActNetwork(nn.Module):
         self.coarse = Branch(sizes)
         self.fine = Branch(sizes, with_heads=True)
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Compute the transformer layers' activations again in the backward pass, or keep them."""
         self.coarse.transformer.recomputed = self.fine.transformer.recomputed = wanted
 

@@ -8,9 +8,11 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws, map_draws
+from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.sam2act.geometry import Cube
 from mme_vla.backbone.sam2act.heatmaps import PointFinder
 from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
+from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.memory.sam2act.keyframe_bank import BankState
@@ -144,9 +146,15 @@ class SAM2ActPolicy(Policy):
         loss = torch.stack(list(parts.values())).sum()
         return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
 
-    def recompute(self, wanted: bool) -> None:
+    def recompute(self, wanted: Recompute) -> None:
         """Compute the layers' activations again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recompute(wanted)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """SAM2's encoder, and every layer of both transformers."""
+        looks = (self.backbone.coarse, self.backbone.fine)
+        layers = [ShardGroup(layer) for look in looks for layer in stacked_layers(look.transformer)]
+        return [ShardGroup(self.backbone.encoder, full=True), *layers]
 
     # Sampling
 

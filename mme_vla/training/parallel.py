@@ -1,0 +1,178 @@
+"""How processes share one training run: every one with all weights (DDP), or each with a part of them (FSDP2).
+
+Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of weights
+(`Policy.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
+`accelerate launch`.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, cast
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.distributed.checkpoint.state_dict import StateDictOptions, get_model_state_dict, set_model_state_dict
+from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
+from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
+from torch.distributed.tensor import DTensor
+
+from mme_vla.backbone.shard_groups import float32_modules
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.policy.base import Policy
+
+STRATEGIES = ("auto", "ddp", "fsdp")
+WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)
+FROM_FIRST = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
+
+
+@dataclass(frozen=True)
+class ParallelSettings:
+    """The keys of `train.parallel`, where each is explained."""
+
+    strategy: str = "auto"
+    replicate: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.strategy not in STRATEGIES:
+            raise UserError(f"train.parallel.strategy={self.strategy!r}. {did_you_mean(self.strategy, STRATEGIES)}")
+        if self.replicate is not None and self.replicate < 1:
+            raise UserError(f"train.parallel.replicate={self.replicate} must be at least 1, or null.")
+
+    def shards(self, device: torch.device) -> bool:
+        """Whether this run shards its weights: where that is asked for, and of itself on several GPUs.
+
+        Raises:
+            UserError: sharding is asked of a process that was not started by a launcher.
+        """
+        started = distributed.is_available() and distributed.is_initialized()
+        if self.strategy == "fsdp" and not started:
+            raise UserError(
+                "train.parallel.strategy=fsdp shares the weights among processes, and this one was started alone: "
+                "start it with torchrun --nproc-per-node <GPUs> -m mme_vla.train …, or leave the strategy at auto."
+            )
+        if self.strategy == "auto":
+            return started and distributed.get_world_size() > 1 and device.type == "cuda"
+        return self.strategy == "fsdp"
+
+    def mesh(self, device_type: str) -> DeviceMesh:
+        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis counts those.
+
+        Raises:
+            UserError: the processes do not divide into so many copies.
+        """
+        world = distributed.get_world_size()
+        nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
+        copies = nodes if self.replicate is None else self.replicate
+        if world % copies:
+            raise UserError(f"train.parallel.replicate={copies} must divide the number of processes, {world}.")
+        if copies == 1:
+            return init_device_mesh(device_type, (world,), mesh_dim_names=("shard",))
+        return init_device_mesh(device_type, (copies, world // copies), mesh_dim_names=("replicate", "shard"))
+
+
+def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool = False) -> None:
+    """Share a policy's weights in place; the first process's are what all get, and the others' may be on meta.
+
+    Args:
+        policy: with adapters, frozen parameters, recomputation and compilation as they shall be.
+        dtype: matrix products run in it (`policy.compute_dtype`). Groups are gathered in it, but for what computes in
+            float32: groups that say so, norms, and all that stands in no group.
+        compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are in `dtype` too.
+    """
+    whole = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
+    whole = {name: tensor.detach().cpu() for name, tensor in whole.items()}
+    if distributed.get_rank() != 0:
+        policy.compute_unsaved()
+    low = None if dtype == torch.float32 else dtype
+
+    def wrap(module: nn.Module | list[nn.Module], kind: torch.dtype | None) -> None:
+        rules = MixedPrecisionPolicy(param_dtype=kind, reduce_dtype=torch.float32, cast_forward_inputs=False)
+        fully_shard(module, mesh=mesh, mp_policy=rules)
+
+    for group in policy.shard_groups():
+        exact = [] if group.full or low is None or compiled else float32_modules(group.module)
+        if exact:
+            wrap(exact, None)
+        wrap(group.module, None if group.full else low)
+        if isinstance(group.module, nn.Embedding):  # its gradient needs the words alone
+            cast(FSDPModule, group.module).set_unshard_in_backward(False)
+    wrap(policy, None)
+    _materialise(policy, mesh)
+    set_model_state_dict(policy, whole, options=FROM_FIRST)
+
+
+def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
+    """Give what is on meta memory, and what no checkpoint holds the first process's values."""
+    kind = mesh.device_type
+    device = torch.device(kind, torch.cuda.current_device()) if kind == "cuda" else torch.device(kind)
+    for module in policy.modules():
+        tensors = [*module.parameters(recurse=False), *module.buffers(recurse=False)]
+        if any(tensor.is_meta for tensor in tensors):
+            module.to_empty(device=device, recurse=False)
+    saved = policy.state_dict().keys()
+    for name, buffer in policy.named_buffers():
+        if name not in saved:
+            distributed.broadcast(buffer, 0)
+
+
+def is_sharded(module: nn.Module) -> bool:
+    """Whether a module's weights are shared (`shard`)."""
+    return isinstance(module, FSDPModule)
+
+
+def whole_state(policy: Policy) -> dict[str, Tensor]:
+    """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All processes call it."""
+    whole = cast(dict[str, Tensor], get_model_state_dict(policy, options=WHOLE))
+    # Trained on the CPU they may lie in what training goes on with, or in the middle of what was gathered.
+    return {name: tensor.clone() for name, tensor in whole.items()} if policy.device.type == "cpu" else whole
+
+
+def reshard(module: nn.Module) -> None:
+    """Let go of gathered weights, so that the next pass gathers what the shards now hold."""
+    for part in _sharded_parts(module):
+        part.reshard()
+        # A pass that used only some of a group's norms left the group waiting for the others.
+        fully_shard.state(part)._modules_to_run_forward.clear()  # type: ignore[attr-defined]
+
+
+@contextmanager
+def gathered(policy: Policy) -> Iterator[None]:
+    """Within this context every process holds all weights of a sharded policy, and any of its methods may be called.
+
+    For sampling and looking, without gradients. All processes enter it; inside nothing is collective.
+    """
+    parts = _sharded_parts(policy)
+    if not parts:
+        yield
+        return
+    fully_shard.state(policy)._lazy_init()  # type: ignore[attr-defined]  # which the first training step does else
+    policy.set_reshard_after_forward(False)  # type: ignore[operator]
+    for part in parts:
+        part.unshard()
+    try:
+        yield
+    finally:
+        for part in parts:
+            part.set_reshard_after_forward(part is not policy, recurse=False)
+        reshard(policy)
+
+
+def like(tensor: Tensor, whole: Tensor) -> Tensor:
+    """Of a whole tensor the part that this process keeps, laid out as `tensor` is; nothing is sent."""
+    if not isinstance(tensor, DTensor) or isinstance(whole, DTensor):
+        return whole
+    from torch.distributed.tensor import distribute_tensor
+
+    own = whole.to(tensor.to_local().device)
+    return distribute_tensor(own, tensor.device_mesh, tensor.placements, src_data_rank=None)
+
+
+def whole_number(value: Tensor) -> Tensor:
+    """A number that processes hold parts of (a norm over shards) as the number itself."""
+    return value.full_tensor() if isinstance(value, DTensor) else value
+
+
+def _sharded_parts(module: nn.Module) -> list[Any]:
+    return [part for part in module.modules() if isinstance(part, FSDPModule)]

@@ -1,0 +1,173 @@
+"""Checkpoints of sharded runs: every process writes its part, beside training, and any number of them reads it again.
+
+    checkpoints/step_000500/
+        shards/shard-00001-….safetensors   one a process: its part of weights, averages and Adam's moments
+        shards/shard-00001-….sha256        its checksum
+        training_state.json, config.json, …, model.safetensors     as in every checkpoint (`training/checkpoint.py`)
+
+`torch.distributed.checkpoint` writes and reads them. They are safetensors too: nothing is pickled.
+"""
+
+import shutil
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, distributed, nn
+from torch.distributed import checkpoint as dcp
+from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
+from torch.distributed.tensor import DTensor
+
+from mme_vla.errors import UserError, listed
+from mme_vla.files import Sums, sum_line
+from mme_vla.policy.tensor_files import check_values
+from mme_vla.training.parallel import reshard
+
+SHARDS = "shards"
+RAW, AVERAGE, STEPS = "raw", "average", "steps"
+MOMENTS = ("exp_avg", "exp_avg_sq")
+
+
+def shard_files(checkpoint: Path) -> list[Path]:
+    """The files that the processes of a sharded run wrote, in their order; none of any other run."""
+    return sorted((checkpoint / SHARDS).glob("*.safetensors"))
+
+
+class ShardWriter:
+    """Writes parts in a thread while training goes on; one checkpoint at a time. All processes call each method."""
+
+    def __init__(self) -> None:
+        self._group = distributed.new_group(backend="gloo")
+        self._thread = ThreadPoolExecutor(1, "checkpoint")
+        self._pending: Future[None] | None = None
+
+    def write(self, draft: Path, tensors: Mapping[str, Tensor], finish: Callable[[], None]) -> None:
+        """Copy tensors to the CPU, then write them below `draft` in the background.
+
+        Args:
+            draft: a folder that is there. finish: called by the first process when all have written.
+        """
+        self.wait()
+        distributed.barrier(self._group)  # the folder is made
+        writer = dcp.HuggingFaceStorageWriter(str(draft / SHARDS), save_distributed=True)
+        pinned = torch.cuda.is_available()
+        stager = DefaultStager(StagingOptions(pinned, False, False, pinned))
+        with _quiet():
+            parts = dcp.async_save(dict(tensors), storage_writer=writer, process_group=self._group, async_stager=stager)
+        self._pending = self._thread.submit(self._complete, parts, draft, finish)
+
+    def _complete(self, parts: Any, draft: Path, finish: Callable[[], None]) -> None:
+        parts.result()
+        rank = distributed.get_rank(self._group)
+        for file in (draft / SHARDS).glob(f"shard-{rank + 1:05d}-*.safetensors"):
+            file.with_suffix(".sha256").write_text(sum_line(file, file.name))
+        distributed.barrier(self._group)
+        if rank == 0:
+            finish()
+
+    def wait(self) -> None:
+        """Return when nothing is being written any more; what went wrong meanwhile is raised here."""
+        pending, self._pending = self._pending, None
+        if pending is not None:
+            pending.result()
+
+    def close(self) -> None:
+        """Wait for the last checkpoint, on every process, and stop the thread."""
+        self.wait()
+        distributed.barrier(self._group)
+        self._thread.shutdown()
+
+
+def training_tensors(
+    policy: nn.Module, averages: Mapping[str, Tensor], optimizer: torch.optim.Optimizer, trained: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """What exact resume needs, by name: as processes hold it, in parts or whole.
+
+    Args:
+        trained: the parameters that learn. `steps` counts their updates, in that order; −1 where there were none.
+    """
+    tensors = {f"{RAW}/{name}": tensor for name, tensor in policy.state_dict().items()}
+    tensors |= {f"{AVERAGE}/{name}": tensor for name, tensor in averages.items()}
+    counts = torch.full((len(trained),), -1.0)
+    for i, (name, parameter) in enumerate(trained.items()):
+        state = optimizer.state.get(parameter, {})
+        tensors |= {f"{key}/{name}": state.get(key, torch.zeros_like(parameter)).detach() for key in MOMENTS}
+        if "step" in state:
+            counts[i] = float(state["step"])
+    return tensors | {STEPS: counts}
+
+
+def read_shards(
+    checkpoint: Path,
+    policy: nn.Module,
+    averages: Mapping[str, Tensor],
+    optimizer: torch.optim.Optimizer,
+    trained: Mapping[str, Tensor],
+) -> dict[str, Tensor]:
+    """Give weights and averages back their values, in place, whatever number of processes wrote them.
+
+    Returns:
+        Adam's moments and counts as `<name>/<key>`, of those parameters that had any.
+
+    Raises:
+        UserError: a damaged file, or tensors that do not fit this policy.
+    """
+    tensors = training_tensors(policy, averages, optimizer, trained)
+    _load(checkpoint, tensors, alone=not any(isinstance(tensor, DTensor) for tensor in tensors.values()))
+    reshard(policy)
+    moments: dict[str, Tensor] = {}
+    for name, count in zip(trained, tensors[STEPS], strict=True):
+        if count >= 0:
+            moments |= {f"{name}/{key}": tensors[f"{key}/{name}"] for key in MOMENTS} | {f"{name}/step": count}
+    return moments
+
+
+def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
+    """The trained weights themselves of a whole policy (built on meta or not), by name, on the CPU.
+
+    Raises:
+        UserError: a damaged file, or tensors that do not fit this policy.
+    """
+    found = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
+    _load(checkpoint, found, alone=True, others=True)
+    return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in found.items()}
+
+
+def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: bool = False) -> None:
+    folder = checkpoint / SHARDS
+    files = shard_files(checkpoint)
+    rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
+    for file in files[rank::world]:  # all together look at each file once
+        Sums(folder, file.with_suffix(".sha256").name).check(file.name)
+    reader = dcp.HuggingFaceStorageReader(str(folder))
+    stored = {name: about.size for name, about in reader.read_metadata().state_dict_metadata.items()}  # type: ignore[union-attr]
+    wanted = {name: tensor.shape for name, tensor in tensors.items()}
+    names = set(wanted) - set(stored) if others else set(wanted) ^ set(stored)
+    wrong = sorted(names | {name for name in wanted.keys() & stored.keys() if wanted[name] != stored[name]})
+    if wrong:
+        raise UserError(
+            f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
+            "It belongs to another model or other settings, or a file of it is missing."
+        )
+    with _quiet():
+        dcp.load(tensors, storage_reader=reader, no_dist=alone)
+    own = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
+    check_values(own, str(folder))
+
+
+def fresh_folder(draft: Path) -> None:
+    """An empty folder, made by the first process."""
+    shutil.rmtree(draft, ignore_errors=True)
+    (draft / SHARDS).mkdir(parents=True)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without PyTorch's warnings on what it calls experimental, or assumes of a process that is alone."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

@@ -1,0 +1,174 @@
+"""What the processes of test_sharded_training.py do: `python sharded_runs.py <what> <folder>` in each of them."""
+
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import torch
+from accelerate import Accelerator
+from test_training import RECIPE, Samples, collate, policy
+from torch import Tensor, distributed
+
+from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_policy
+from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.policy.run_folders import resolve_checkpoint
+from mme_vla.testing.small import open_gates
+from mme_vla.training.checkpoint import trainable
+from mme_vla.training.console import ProgressLine
+from mme_vla.training.logging import Loggers, open_loggers
+from mme_vla.training.loop import Trainer
+from mme_vla.training.optim import clip_gradients, make_optimizer
+from mme_vla.training.parallel import ParallelSettings, gathered, is_sharded, shard, whole_number
+from mme_vla.training.runs import Run
+from mme_vla.training.settings import TrainSettings
+from mme_vla.training.validation import Validation
+
+MODELS = (
+    "tokendrop_expert", "ttt_context", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus",
+)  # fmt: skip
+SHARDED = {"parallel": {"strategy": "fsdp"}}
+BATCH = 6  # of two and of three processes
+
+
+def trainer(folder: Path, steps: int, resumed: bool = False, **changes: Any) -> Trainer:
+    built = policy("tokendrop_expert", policy={"augment": False})
+    run = Run(folder)
+    if resumed:
+        checkpoint = resolve_checkpoint(folder)
+        run = Run(folder, checkpoint, int(checkpoint.name.removeprefix("step_")))
+    recipe = {**RECIPE, "batch_size": BATCH, "steps": steps, "save_every": 2, **changes}
+    validation = Validation(Samples(built, 5), collate, 5, 2, seed=1)
+    settings = TrainSettings.from_dict(recipe, seed=1)
+    config = {"train": recipe, "seed": 1}
+    return Trainer(built, Samples(built), collate, validation, settings, run, config, Accelerator(cpu=True))
+
+
+def finish_run(job: Trainer, line: ProgressLine | None = None) -> bool:
+    first, run = job.accelerator.is_main_process, job.run_info
+    loggers = open_loggers(run.folder, {}, run.step) if first else Loggers([])
+    with line or ProgressLine(job.settings.steps, 0, shown=False) as shown:
+        finished = job.run(shown, loggers)
+        job.close()
+    return finished
+
+
+def validation_losses(job: Trainer) -> dict[str, float]:
+    """With the weights themselves, and with their averages."""
+    share = (job.accelerator.process_index, job.accelerator.num_processes, job.accelerator.reduce)
+    assert job.validation is not None
+    raw = job.validation.loss(job.policy, *share)
+    with job.ema.applied():
+        return {"raw": raw, "average": job.validation.loss(job.policy, *share)}
+
+
+def train(folder: Path) -> dict[str, Any]:
+    """Train sharded to step 4, with a checkpoint at 2 and 4 that is written while it goes on."""
+    job = trainer(folder / "run", 4, **SHARDED)
+    assert finish_run(job) and is_sharded(job.policy)
+    held = sum(p.to_local().numel() for p in trainable(job.policy).values())
+    whole = sum(p.numel() for p in trainable(job.policy).values())
+    return {"held": held / whole, **validation_losses(job)}
+
+
+class Interrupted(ProgressLine):
+    """One of the processes is asked to stop after its first update."""
+
+    def advance(self) -> None:
+        if distributed.get_rank() == 1:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+
+def stop(folder: Path) -> dict[str, Any]:
+    job = trainer(folder / "stopped", 4, **SHARDED)
+    finished = finish_run(job, Interrupted(4, 0, shown=False))
+    return {"finished": finished, "signal": job.stopped_by}
+
+
+class Killed(ProgressLine):
+    def advance(self) -> None:
+        if distributed.get_rank() == 1:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die(folder: Path) -> None:
+    finish_run(trainer(folder / "killed", 4, **SHARDED), Killed(4, 0, shown=False))
+
+
+def update_of(model: Policy, batch: Any, draws: dict[str, Tensor]) -> tuple[float, float, float]:
+    """The loss of an update, its gradients' norm, and the loss after it."""
+    settings = TrainSettings.from_dict({**RECIPE, "lr": 1e-3})
+    optimizer = make_optimizer(trainable(model).values(), settings)
+    torch.manual_seed(3)
+    loss, numbers = model(batch, draws)
+    loss.backward()
+    gradients = [p.grad for p in trainable(model).values() if p.grad is not None]
+    norm = whole_number(clip_gradients(gradients, 1.0))
+    optimizer.step()
+    optimizer.zero_grad()
+    torch.manual_seed(3)
+    with torch.no_grad():
+        after, _ = model(batch, draws)
+    return float(numbers["loss"]), float(norm), float(after)
+
+
+def compare(name: str, dtype: str) -> dict[str, Any]:
+    """One update of a model alone and shared, and a chunk that it then answers with."""
+
+    def built() -> Policy:
+        made = build_policy(name, policy={"compute_dtype": dtype, "augment": False})
+        if hasattr(made, "backbone") and hasattr(made, "integration"):
+            open_gates(made)  # type: ignore[arg-type]
+        apply_finetuning(made)  # type: ignore[arg-type]
+        made.recompute(True)
+        return made.train()
+
+    alone, shared = built(), built()
+    shard(shared, ParallelSettings("fsdp").mesh("cpu"), shared.compute_dtype)
+    batch = alone.full_batch()
+    draws = alone.loss_draws(1, torch.Generator().manual_seed(1))
+    results = {"alone": update_of(alone, batch, draws), "shared": update_of(shared, batch, draws)}
+    start = alone.sample_draws(torch.Generator().manual_seed(2))
+    asked = {key: value[None] for key, value in start.items()}
+    for one, again in ((alone.eval(), None), (shared.eval(), shared.train)):
+        with gathered(one):
+            chunk = one.sample_actions(batch, asked, steps=2)
+        results["alone chunk" if again is None else "shared chunk"] = chunk.float().abs().mean().item()
+    with torch.no_grad():  # sampling left it as it was
+        torch.manual_seed(3)
+        loss, _ = shared.train()(batch, draws)
+    return {**results, "again": float(loss)}
+
+
+def policies(folder: Path) -> dict[str, Any]:
+    low = compare("framesamp_modul", "bfloat16")
+    return {**{name: compare(name, "float32") for name in MODELS}, "framesamp_modul bfloat16": low}
+
+
+def resume(folder: Path) -> dict[str, Any]:
+    job = trainer(folder / "run", 8, resumed=True, **SHARDED)
+    assert finish_run(job)
+    return validation_losses(job)
+
+
+DONE: dict[str, Callable[[Path], Any]] = {
+    "train": train, "stop": stop, "die": die, "policies": policies, "resume": resume,
+}  # fmt: skip
+
+
+def main(what: list[str], folder: Path) -> None:
+    torch.set_num_threads(1)
+    Accelerator(cpu=True)  # joins the others
+    for name in what:
+        answer = DONE[name](folder)
+        if distributed.get_rank() == 0:
+            (folder / f"{name}.json").write_text(json.dumps(answer))
+    distributed.destroy_process_group()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1].split(","), Path(sys.argv[2]))

@@ -1,0 +1,142 @@
+"""Episodes that processes share: taken one by one, longest first, and again when whoever had them is gone."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from mme_vla.envs.vector.jobs import Job
+from mme_vla.errors import UserError
+from mme_vla.evaluation.claims import CLAIMS, Claims
+from mme_vla.evaluation.forecast import Durations, earlier_records
+from mme_vla.evaluation.record_log import RecordLog
+from mme_vla.evaluation.records import EpisodeRecord, Seconds
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.compare import compare
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.waiting import Waiting
+
+JOBS = [Job("BinFill", "test", i) for i in range(4)]
+
+TAKE_TWO = """
+import os, signal, sys
+from pathlib import Path
+from mme_vla.envs.vector.jobs import Job
+from mme_vla.evaluation.claims import Claims
+from mme_vla.evaluation.record_log import RecordLog
+from mme_vla.evaluation.records import EpisodeRecord
+folder = Path(sys.argv[1])
+log = RecordLog(folder / "episodes-0of2.jsonl")
+claims, jobs = Claims(folder, "episodes-0of2.jsonl"), [Job("BinFill", "test", i) for i in range(4)]
+first = claims.take(jobs)
+log.append(EpisodeRecord("tiny", 1, 7, first.task, first.episode, 1, "easy", "success", 5))
+claims.take(jobs[1:])
+print("taken", flush=True)
+sys.stdin.read()
+"""
+
+
+def record(episode: int, seconds: float = 1.0, outcome: str = "success", task: str = "BinFill") -> EpisodeRecord:
+    times = Seconds(sim=0.75 * seconds, policy=0.25 * seconds, total=2 * seconds)
+    return EpisodeRecord("tiny", 1, 7, task, episode, 1, "easy", outcome, 5, times)
+
+
+def taken(job: Job | None) -> int | None:
+    return None if job is None else job.episode
+
+
+def test_each_episode_is_taken_once(tmp_path: Path) -> None:
+    names = [f"episodes-{i}of2.jsonl" for i in range(2)]
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        first, second = (Claims(tmp_path, name) for name in names)
+        assert [taken(claims.take(JOBS)) for claims in (first, second, second, first)] == [0, 1, 2, 3]
+        assert first.take(JOBS) is None and second.take(JOBS) is None
+
+
+def test_what_a_killed_process_had_not_finished_is_taken_again(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-c", TAKE_TWO, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "taken\n"
+    other = "episodes-1of2.jsonl"
+    with RecordLog(tmp_path / other):
+        claims = Claims(tmp_path, other)
+        assert taken(claims.take(JOBS)) == 2  # the process is alive: 0 and 1 are its own
+        process.kill()
+        process.communicate()
+        with (tmp_path / CLAIMS).open("a") as file:
+            file.write('{"by": "half')  # as if it had been writing
+        assert [taken(claims.take(JOBS)) for _ in range(3)] == [1, 3, None]  # 0 it had finished
+        with RecordLog(tmp_path / "episodes-0of2.jsonl"):  # begun again, under its old name
+            again = Claims(tmp_path, "episodes-0of2.jsonl")
+            assert again.take(JOBS) is None
+
+
+def test_a_damaged_file_of_claims_is_named(tmp_path: Path) -> None:
+    Claims(tmp_path, "episodes-0of2.jsonl")
+    with (tmp_path / CLAIMS).open("a") as file:
+        file.write(json.dumps({"by": "nobody", "task": "BinFill", "episode": 0}) + "\n")
+    with pytest.raises(UserError, match=r"claims\.jsonl is damaged"):
+        Claims(tmp_path, "episodes-1of2.jsonl")
+
+
+def test_episodes_that_took_longest_begin_first() -> None:
+    durations = Durations([record(0, 1), record(1, 4), record(0, 8, task="PickXtimes")])
+    jobs = [*JOBS[:3], Job("PickXtimes", "test", 5), Job("StopCube", "test", 0)]
+    order = durations.longest_first(jobs)
+    assert [(job.task, job.episode) for job in order] == [
+        ("PickXtimes", 5), ("StopCube", 0), ("BinFill", 1), ("BinFill", 2), ("BinFill", 0),
+    ]  # fmt: skip
+    assert Durations([]).longest_first(jobs) == jobs
+
+
+def test_the_forecast_follows_whoever_is_slower() -> None:
+    durations = Durations([record(0, 3600)])
+    alone = durations.forecast(JOBS, workers=1)
+    assert alone is not None and alone.seconds == pytest.approx(4 * 0.75 * 3600)
+    many = durations.forecast(JOBS, workers=4)
+    assert many is not None and many.seconds == pytest.approx(3600)  # the policy's quarter of each, one by one
+    shared = durations.forecast(JOBS * 10, workers=4, processes=2)
+    assert shared is not None and shared.seconds == pytest.approx(5 * 3600)
+    assert str(shared) == (
+        "forecast: about 5.0 h for 40 episodes, 8 at a time, if they take as long as the 1 before them did"
+    )
+    assert Durations([]).forecast(JOBS, workers=1) is None
+
+
+def test_earlier_records_are_those_beside_the_run_or_those_named(tmp_path: Path) -> None:
+    with RecordLog(tmp_path / "runs" / "seed7" / "episodes.jsonl") as log:
+        log.append(record(0))
+        log.append(record(1, outcome="error"))
+    assert len(earlier_records(tmp_path / "runs" / "seed42", None)) == 1
+    assert earlier_records(tmp_path / "seed42", None) == []
+    assert len(earlier_records(tmp_path, tmp_path / "runs")) == 1
+    with pytest.raises(UserError):
+        earlier_records(tmp_path, tmp_path / "nothing")
+
+
+def test_an_episode_that_is_tried_again_comes_last() -> None:
+    waiting = Waiting(JOBS[:2])
+    first = waiting.take()
+    assert first is not None
+    waiting.put_back(first)
+    assert [taken(waiting.take()) for _ in range(3)] == [1, 0, None]
+
+
+def test_episodes_that_end_otherwise_between_equal_runs_are_counted() -> None:
+    protocol = Protocol(("BinFill",), 4)
+    once = [record(i) for i in range(4)]
+    twice = [*once, record(0), record(1, outcome="fail"), record(2, outcome="error")]
+    other = [EpisodeRecord("else", 1, 7, "BinFill", i, 1, "easy", "fail", 5) for i in range(4)]
+    results = aggregate([*twice, *other], protocol, conflicts="first")
+    method = results.method("tiny")
+    assert (method.repeated, method.flipped) == (2, 1)
+    assert any("2 episodes were run more than once" in note for note in results.notes)
+    comparison = compare(method, results.method("else"), protocol)
+    assert (comparison.repeated, comparison.flipped) == (2, 1)
+    assert comparison.verdict.endswith("of 2 episodes run twice alike, 1 ended otherwise")
+    alone = aggregate([*once, *other], protocol)
+    assert "run twice" not in compare(alone.method("tiny"), alone.method("else"), protocol).verdict
