@@ -9,7 +9,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
+import torch
 from torch import Tensor
+
+
+def send(x: Tensor, device: torch.device) -> Tensor:
+    """A tensor on a device; from the CPU to a GPU through page-locked memory, so that nobody waits for the copy."""
+    return x.pin_memory().to(device, non_blocking=True) if device.type == "cuda" and not x.is_cuda else x.to(device)
 
 
 class TensorStruct:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -12,6 +13,24 @@ from mme_vla.types import Batch
 
 Hook = Callable[[int, Tensor], Tensor]
 """`hook(layer, x)`: what the answering expert's MLP of a layer reads instead of its residual stream x [b, h, d]."""
+
+
+class LayerHooks:
+    """A hook made of one callable a layer. Compiled layers share one code; any other hook makes each compile its own.
+
+    layers: `layers[i](x)` is what layer i's MLP reads.
+    """
+
+    def __init__(self, layers: Sequence[Callable[[Tensor], Tensor]]) -> None:
+        self.layers = list(layers)
+
+    def __call__(self, layer: int, x: Tensor) -> Tensor:
+        return self.layers[layer](x)
+
+
+def bind_hook(hook: Hook | None, layer: int) -> Callable[[Tensor], Tensor] | None:
+    """A hook with its layer already said."""
+    return hook.layers[layer] if isinstance(hook, LayerHooks) else None if hook is None else partial(hook, layer)
 
 Draws = dict[str, Tensor]
 """Random numbers by name, one row a sample: drawn by the caller, so that batching and sharding cannot change them."""

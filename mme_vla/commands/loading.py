@@ -77,7 +77,7 @@ def load_policy(
         )
     from mme_vla.testing.small import unit_stats
 
-    if cfg.dtype != "float32":
+    if cfg.dtype not in ("auto", "float32"):
         raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
     policy.require_processor().stats = unit_stats(policy.embodiment)

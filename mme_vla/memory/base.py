@@ -89,6 +89,9 @@ class Memory(nn.Module):
         """
         raise NotImplementedError
 
+    def compile(self, **options: Any) -> None:
+        """Compile in place what many small steps make slow; by default nothing is. `options` are `torch.compile`'s."""
+
     def make_scorer(self) -> FrameScorer | None:
         """Return a fresh scorer for one episode, or None when frames need no scores."""
         return None

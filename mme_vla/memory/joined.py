@@ -51,6 +51,10 @@ class JoinedMemory(Memory):
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
+    def compile(self, **options: Any) -> None:
+        for member in self.memories:
+            member.compile(**options)
+
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """What any member remembers, as the stored tokens it is made of."""
         chosen = [

@@ -29,7 +29,12 @@ Statistics = dict[str, Tensor]
 
 
 class RecurrentLayer(nn.Module):
-    """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose."""
+    """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose.
+
+    window: most frames at the end of a list whose outputs `read` hands over; None where `following` may count further.
+    """
+
+    window: int | None = None
 
     def initial(self, batch: int) -> State:
         """The learned state before the first frame, for a batch of `batch`."""
@@ -47,6 +52,12 @@ class RecurrentLayer(nn.Module):
             statistics: also compute the numbers about each step, which cost time.
         """
         raise NotImplementedError
+
+    def forward(
+        self, state: State, x: Tensor, valid: Tensor, following: int, statistics: bool
+    ) -> tuple[State, Statistics]:
+        """A whole chunk of a window: what is compiled."""
+        return self.advance(state, x, valid, following, statistics)
 
     def read(self, state: State) -> tuple[Tensor, Tensor]:
         """Tokens [b, budget, d] and their mask [b, budget]."""
@@ -157,21 +168,29 @@ class RecurrentMemory(Memory):
 
         Gradients flow through every step. Between chunks only the state is kept for the backward pass.
         """
-        advance = self.layer.advance
-        start = state = self.init_state(len(x))
+        # Statistics are wanted of one update in many: not worth code of their own.
+        step, window = self.layer.advance if self.reporting else self.layer, self.layer.window
+        start = self.init_state(len(x))
+        # Laid out as every later state is, so that all chunks share one code.
+        state = tuple(tensor.contiguous() for tensor in start)
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
+            counted = following if window is None else min(following, window)
+            inputs = (state, part, real, counted, self.reporting)
             if torch.is_grad_enabled():
-                inputs = (state, part, real, following, self.reporting)
-                state, numbers = checkpoint(advance, *inputs, use_reentrant=False, preserve_rng_state=False)
+                state, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
-                state, numbers = advance(state, part, real, following, self.reporting)
+                state, numbers = step(*inputs)
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
             tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
         return tokens
+
+    def compile(self, **options: Any) -> None:
+        """Compile the steps of a chunk, whose number does not depend on how long a window is."""
+        self.layer.compile(**{**options, "fullgraph": True, "dynamic": False})
 
     # Frame by frame
 

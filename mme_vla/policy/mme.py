@@ -49,6 +49,8 @@ class MMEPolicy(Policy):
     The two independent choices meet here and nowhere else; no method asks which variant it is.
     """
 
+    acts_in_bfloat16 = True
+
     def __init__(
         self,
         backbone: Backbone,
@@ -124,8 +126,14 @@ class MMEPolicy(Policy):
     # Training
 
     def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
-        return self.backbone.loss_draws(count, generator)
+        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n].
+
+        While training with augmentation also `changes` [n, …]: what happens to a sample's pictures.
+        """
+        draws = self.backbone.loss_draws(count, generator)
+        if self.training and self.augment:
+            draws = {**draws, "changes": self._draw_changes(count, generator)}
+        return draws
 
     def forward(
         self,
@@ -151,9 +159,10 @@ class MMEPolicy(Policy):
         if set(self.loss_draws(0, torch.default_generator)) - set(given):
             given = self.loss_draws(len(batch.actions), torch.default_generator) | given
         drawn = map_draws(given, lambda value: value.to(self.device))
+        views = self._views(batch, drawn.pop("changes", None))
         with self.autocast():
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            losses = self.backbone.loss(batch, self._views(batch), self._inject(memory), drawn)  # b h
+            losses = self.backbone.loss(batch, views, self._inject(memory), drawn)  # b h
         if batch.action_mask is None:
             loss = losses.mean()
         else:
@@ -174,8 +183,10 @@ class MMEPolicy(Policy):
         self.backbone.recompute(wanted)
 
     def compile(self, **options: Any) -> None:
-        """Compile the backbone's tower and layers in place, each by itself."""
+        """Compile the backbone's tower and layers in place, each by itself, and what of the memory is worth it."""
         self.backbone.compile(**options)
+        if self.memory is not None:
+            self.memory.compile(**options)
 
     def _inject(self, memory: MemoryTokens | None) -> Inject:
         return lambda observation: self.integration.inject(observation, memory)
@@ -193,12 +204,19 @@ class MMEPolicy(Policy):
         features = self.backbone.mark(batch.history.features, batch.prompt, batch.prompt_mask)
         return replace(batch.history, features=features)
 
-    def _views(self, batch: Batch) -> Tensor:
+    def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
+        """The random numbers that change the pictures of `count` training samples, [count, …] on the CPU."""
+        from mme_vla.processing.augment import augmentation_draws
+
+        return augmentation_draws(count, generator)
+
+    def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
+        """The current views in [−1, 1], changed where random numbers say how (`_draw_changes`)."""
         from mme_vla.processing.augment import augment_views
         from mme_vla.processing.pictures import to_unit_range
 
         images = to_unit_range(batch.images)
-        return augment_views(images, self.embodiment.augmentations) if self.training and self.augment else images
+        return images if changes is None else augment_views(images, self.embodiment.augmentations, changes)
 
     # Sampling
 

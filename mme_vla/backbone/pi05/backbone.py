@@ -75,11 +75,15 @@ class Pi05Backbone(Backbone):
                 initialise(block.experts[name])  # type: ignore[index, arg-type]
 
     def compile(self, **options: Any) -> None:
-        """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still."""
+        """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still.
+
+        Lengths are symbols, so that prompts and batches of any length share their code; nothing falls back to eager
+        unnoticed (`fullgraph`). `options` are `torch.compile`'s and go before these.
+        """
         # Layers share one code: each passes it in training, prefill and denoising, with and without gradients.
         torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
         for module in (self.vision, *self.transformer.layers):
-            module.compile(**options)
+            module.compile(**{"fullgraph": True, "dynamic": True, **options})
 
     def encode_images(self, images: Tensor) -> Tensor:
         """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is frozen."""

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from mme_vla.backbone.base import Hook
-from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, token_positions
+from mme_vla.backbone.base import Hook, bind_hook
+from mme_vla.backbone.layers.attention import attend, sight_mask
+from mme_vla.backbone.layers.blocks import Block, Span, Visibility, token_positions
 from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.layers.rope import Rotation, rotate, rotation
+from mme_vla.backbone.layers.sight import Sight
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 
 KeyValue = tuple[Tensor, Tensor]
@@ -228,8 +229,7 @@ class JointTransformer(nn.Module):
         asking = torch.cat([block.mask for block in blocks], 1)
         positions = token_positions(asking, past.mask if past else None)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
-        seen = attention_mask(spans, all_spans, asking, valid, table)
-        mask = additive_mask(seen, compute_dtype(blocks[0].tokens))
+        mask = sight_mask(Sight.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens))
         return Layout(all_spans, valid, mask, rotation(positions, self.head_dim))
 
     def forward(
@@ -256,8 +256,7 @@ class JointTransformer(nn.Module):
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
-            of_hook = None if hook is None else _bind(hook, i)
-            args = (segments, layout.turn, layout.mask, of_layer, of_hook, past.layers[i] if past else None)
+            args = (segments, layout.turn, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
             if self.gradient_checkpointing and torch.is_grad_enabled():
                 segments, kv = checkpoint(block, *args, use_reentrant=False)
             else:
@@ -285,7 +284,3 @@ def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
             runs.append((block.expert, []))
         runs[-1][1].append(block.tokens.to(dtype))
     return [Segment(expert, _join(tokens)) for expert, tokens in runs]
-
-
-def _bind(hook: Hook, layer: int) -> Callable[[Tensor], Tensor]:
-    return lambda x: hook(layer, x)

@@ -48,6 +48,8 @@ class MemoryVlaPolicy(Policy):
         "action": "",
     }
 
+    acts_in_bfloat16 = True
+
     def __init__(
         self,
         vlm: Prismatic,
