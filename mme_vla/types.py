@@ -37,6 +37,10 @@ class TensorStruct:
         """Return a copy whose tensors went through `Tensor.to` with these arguments."""
         return self._map(lambda x: x.to(*args, **kwargs))
 
+    def sent(self, device: torch.device) -> Self:
+        """Return a copy on a device that nobody waits for: see `send`."""
+        return self._map(lambda x: send(x, device))
+
     def rows(self, chosen: Tensor) -> Self:
         """Return the rows of every tensor that `chosen` names: numbers [n], or a mask."""
         return self._map(lambda x: x[chosen])

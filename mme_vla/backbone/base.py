@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.layers.blocks import Block, Visibility
+from mme_vla.errors import UserError
 from mme_vla.types import Batch
 
 Hook = Callable[[int, Tensor], Tensor]
@@ -31,6 +32,7 @@ class LayerHooks:
 def bind_hook(hook: Hook | None, layer: int) -> Callable[[Tensor], Tensor] | None:
     """A hook with its layer already said."""
     return hook.layers[layer] if isinstance(hook, LayerHooks) else None if hook is None else partial(hook, layer)
+
 
 Draws = dict[str, Tensor]
 """Random numbers by name, one row a sample: drawn by the caller, so that batching and sharding cannot change them."""
@@ -71,6 +73,7 @@ class Backbone(nn.Module):
         image_size: side of the square pictures it reads.
         vocab_size: words it knows; None where it does not say.
         hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition` and `beside`.
+        compiles_sampling: whether `sample` runs without waiting for the GPU, so that `compile_sampling` is for it.
 
     and implements the methods below. Losses and samples are its own affair (a flow, a regression, a diffusion): whoever
     trains or evaluates hands back the numbers it asked for in `loss_draws` and `sample_draws`.
@@ -89,6 +92,7 @@ class Backbone(nn.Module):
     image_size: int
     vocab_size: int | None = None
     hosts: frozenset[str] = frozenset({"blocks"})
+    compiles_sampling: bool = False
 
     @property
     def device(self) -> torch.device:
@@ -158,6 +162,20 @@ class Backbone(nn.Module):
             steps: of an iterative head; its own number by default. Heads that answer at once take no notice.
         """
         raise NotImplementedError
+
+    def compile_sampling(self) -> None:
+        """Keep between chunks whatever depends on weights alone; `sample` can be captured as a CUDA graph from now on.
+
+        Raises:
+            UserError: this backbone cannot.
+        """
+        raise UserError(
+            f"The backbone {type(self).__name__} has no sampler that can be compiled: leave sampling=eager."
+        )
+
+    def sampling_stamp(self) -> object:
+        """What `sample` keeps between chunks was made from: where this changes, captured graphs are of no use."""
+        return None
 
     # Parts
 

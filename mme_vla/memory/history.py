@@ -195,17 +195,34 @@ class OnlineHistory(History):
         wanted, numbers = self.wanted(count, drawn), np.arange(count) if drawn is None else drawn
         if len(tokens) != len(wanted):
             raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
-        if self._scorer is not None:
-            shown = zip((numbers + self._length).tolist(), frames, strict=True)
-            rows = [(number, self._scorer(number, frame)) for number, frame in shown]
-            self._score_frames += [frame for frame, values in rows if values is not None]
-            self._score_values += [np.asarray(values, np.float32) for _, values in rows if values is not None]
+        self._score(frames, numbers)
         if len(tokens):
             self._grow(len(self._kept) + len(tokens), tokens)
             assert self._tokens is not None
             self._tokens[len(self._kept) : len(self._kept) + len(tokens)] = tokens
             self._kept.extend((wanted + self._length).tolist())
         self._length += count
+
+    def take(
+        self,
+        frames: np.ndarray,
+        encode: Callable[[np.ndarray], Tensor],
+        drawn: np.ndarray | None = None,
+        count: int | None = None,
+    ) -> None:
+        """Add frames in order, through `encode`: pictures [n, H, W, 3] → tokens [n, patches, d_vision]."""
+        wanted = self.wanted(len(frames) if count is None else count, drawn)
+        places = wanted if drawn is None else np.searchsorted(drawn, wanted)
+        self.append(frames, encode(frames[places]), drawn, count)
+
+    def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
+        """Show the scorer the next frames that have a picture; `numbers` says which they are."""
+        if self._scorer is None:
+            return
+        shown = zip((numbers + self._length).tolist(), frames, strict=True)
+        rows = [(number, self._scorer(number, frame)) for number, frame in shown]
+        self._score_frames += [frame for frame, values in rows if values is not None]
+        self._score_values += [np.asarray(values, np.float32) for _, values in rows if values is not None]
 
     def _grow(self, needed: int, like: Tensor) -> None:
         capacity = 0 if self._tokens is None else len(self._tokens)

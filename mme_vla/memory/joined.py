@@ -48,6 +48,7 @@ class JoinedMemory(Memory):
         self.budget = sum(member.budget for member in built)
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
+        self.lazy = all(member.lazy for member in built)
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 

@@ -5,8 +5,9 @@ Two forms of the same computation: `forward` runs a whole window, for training a
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,12 +54,6 @@ class RecurrentLayer(nn.Module):
         """
         raise NotImplementedError
 
-    def forward(
-        self, state: State, x: Tensor, valid: Tensor, following: int, statistics: bool
-    ) -> tuple[State, Statistics]:
-        """A whole chunk of a window: what is compiled."""
-        return self.advance(state, x, valid, following, statistics)
-
     def read(self, state: State) -> tuple[Tensor, Tensor]:
         """Tokens [b, budget, d] and their mask [b, budget]."""
         raise NotImplementedError
@@ -84,6 +79,7 @@ class RecurrentMemory(Memory):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
 
     pad_left = True
+    lazy = True
 
     def __init__(
         self,
@@ -133,6 +129,7 @@ class RecurrentMemory(Memory):
         self.jitter, self.chunk = jitter, chunk
         self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden)
         self.layer = layer
+        self._compiled: Callable[..., tuple[State, Statistics]] | None = None
         self.output = nn.Linear(hidden, width)
         nn.init.normal_(self.output.weight, std=0.02)
         nn.init.zeros_(self.output.bias)
@@ -168,16 +165,18 @@ class RecurrentMemory(Memory):
 
         Gradients flow through every step. Between chunks only the state is kept for the backward pass.
         """
-        # Statistics are wanted of one update in many: not worth code of their own.
-        step, window = self.layer.advance if self.reporting else self.layer, self.layer.window
+        # Statistics are wanted of one update in many: not worth compiling for.
+        eager = self._compiled is None or self.reporting
+        step = self.layer.advance if eager else partial(self._compiled, self.layer)
+        window = self.layer.window
         start = self.init_state(len(x))
-        # Laid out as every later state is, so that all chunks share one code.
+        # All chunks are laid out alike, whatever the window's length: they share one code.
         state = tuple(tensor.contiguous() for tensor in start)
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
             counted = following if window is None else min(following, window)
-            inputs = (state, part, real, counted, self.reporting)
+            inputs = (state, part.contiguous(), real.contiguous(), counted, self.reporting)
             if torch.is_grad_enabled():
                 state, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
@@ -190,7 +189,7 @@ class RecurrentMemory(Memory):
 
     def compile(self, **options: Any) -> None:
         """Compile the steps of a chunk, whose number does not depend on how long a window is."""
-        self.layer.compile(**{**options, "fullgraph": True, "dynamic": False})
+        self._compiled = torch.compile(type(self.layer).advance, **{**options, "fullgraph": True, "dynamic": False})
 
     # Frame by frame
 

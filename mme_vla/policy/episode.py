@@ -50,7 +50,7 @@ class Episode:
         self.subgoal: str | None = None
         """The current language subgoal, for policies whose prompt has one; set it before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
+        self.history = None if memory is None else memory.start_history(policy.encode_frames)
         self.stream = None if memory is None else memory.start_stream()
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.frames_seen = 0
@@ -167,9 +167,7 @@ class Episode:
     ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            wanted = self.history.wanted(len(demo), drawn)
-            places = wanted if drawn is None else np.searchsorted(drawn, wanted)
-            self.history.append(frames, self._policy.encode_frames(frames[places]), drawn, len(demo))
+            self.history.take(frames, self._policy.encode_frames, drawn, len(demo))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().past_actions

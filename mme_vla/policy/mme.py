@@ -21,11 +21,12 @@ from mme_vla.memory.base import Memory
 from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
+from mme_vla.policy.graphs import CapturedSampling
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import INTEGRATIONS, MEMORIES, POLICIES
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens, send
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -50,6 +51,7 @@ class MMEPolicy(Policy):
     """
 
     acts_in_bfloat16 = True
+    _sampler: CapturedSampling | None = None
 
     def __init__(
         self,
@@ -243,10 +245,49 @@ class MMEPolicy(Policy):
         if draws is None:
             source = torch.default_generator if generator is None else generator
             draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
-        drawn = map_draws(named_draws(draws), lambda value: value.to(self.device))
+        drawn = map_draws(named_draws(draws), lambda value: send(value, self.device))
+        if memory is None:
+            with self.autocast():
+                memory = self.encode_memory(self._marked(batch))
+        if self._sampler is not None and not self.training:
+            return self._sampler(batch, memory, drawn, steps or self.sample_steps)
+        return self._sample(batch, memory, drawn, steps)
+
+    def _sample(
+        self, batch: Batch, memory: MemoryTokens | None, drawn: Mapping[str, Tensor], steps: int | None
+    ) -> Tensor:
         with self.autocast():
-            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             return self.backbone.sample(batch, self._views(batch), self._inject(memory), drawn, steps)
+
+    @property
+    def compiles_sampling(self) -> bool:
+        """Whether its backbone's sampler can be compiled."""
+        return self.backbone.compiles_sampling
+
+    def compile_sampling(self, layers: bool = False) -> None:
+        """Make chunks quick, for a policy whose weights are done: they are the same to the rounding of their kernels.
+
+        What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one CUDA graph for each
+        size of batch, captured when it first occurs; here for one episode and every length of prompt.
+
+        Args:
+            layers: compile the tower and the layers too, which takes a minute or more at full size.
+
+        Raises:
+            UserError: this backbone has no sampler that can be captured.
+        """
+        self.backbone.compile_sampling()
+        if layers:
+            self.backbone.compile(dynamic=False)
+        if self.device.type != "cuda":
+            return
+        self._sampler = CapturedSampling(self._sample, self.backbone.sampling_stamp)
+        if self.processor is None:
+            return
+        full = self.full_batch(self.device)
+        for length in range(16, self._prompt_length() + 16, 16):
+            cut = replace(full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length])
+            self.sample_actions(cut)
 
     # Episodes
 
@@ -260,7 +301,7 @@ class MMEPolicy(Policy):
             prompt_mask=torch.stack(masks),
             state=torch.stack([e.state for e in episodes]),
         )
-        return batch.without_prompt_padding().to(self.device)
+        return batch.without_prompt_padding().sent(self.device)
 
     def answer(
         self, batch: Batch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
