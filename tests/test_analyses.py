@@ -44,7 +44,7 @@ def test_attention_mass_is_that_of_the_networks_own_logits(model: str, monkeypat
     original = gemma.attend
 
     def spy(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-        seen.append((q, k, mask))
+        seen.append((q, k.clone(), mask))  # the next step writes its keys into the same place
         return original(q, k, v, mask)
 
     monkeypatch.setattr(gemma, "attend", spy)

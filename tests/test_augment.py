@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.processing.augment import augment_views, crop_and_rotate, jitter_colours
+from mme_vla.processing.augment import augment_views, augmentation_draws, crop_and_rotate, jitter_colours
 
 VIEWS = ("all", "colour")
 
@@ -18,7 +18,7 @@ def pictures(batch: int = 4, size: int = 40) -> Tensor:
 
 
 def augmented(images: Tensor, seed: int = 7) -> Tensor:
-    return augment_views(images, VIEWS, torch.Generator().manual_seed(seed))
+    return augment_views(images, VIEWS, augmentation_draws(len(images), torch.Generator().manual_seed(seed)))
 
 
 def test_same_generator_gives_same_pictures_and_another_seed_others() -> None:
@@ -116,6 +116,6 @@ def test_colour_jitter_works_on_the_hsv_value_and_hue(
 
 def test_wrong_shapes_are_refused() -> None:
     with pytest.raises(UserError, match="2 views but 1 cameras"):
-        augment_views(pictures(), VIEWS[:1])
+        augment_views(pictures(), VIEWS[:1], augmentation_draws(4))
     with pytest.raises(UserError, match="square"):
-        augment_views(torch.zeros(1, 2, 3, 8, 9), VIEWS)
+        augment_views(torch.zeros(1, 2, 3, 8, 9), VIEWS, augmentation_draws(1))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -10,10 +11,30 @@ from torch import Tensor, nn
 from mme_vla.backbone.layers.blocks import Block, Visibility
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
+from mme_vla.errors import UserError
 from mme_vla.types import Batch
 
 Hook = Callable[[int, Tensor], Tensor]
 """`hook(layer, x)`: what the answering expert's MLP of a layer reads instead of its residual stream x [b, h, d]."""
+
+
+class LayerHooks:
+    """A hook made of one callable a layer. Compiled layers share one code; any other hook makes each compile its own.
+
+    layers: `layers[i](x)` is what layer i's MLP reads.
+    """
+
+    def __init__(self, layers: Sequence[Callable[[Tensor], Tensor]]) -> None:
+        self.layers = list(layers)
+
+    def __call__(self, layer: int, x: Tensor) -> Tensor:
+        return self.layers[layer](x)
+
+
+def bind_hook(hook: Hook | None, layer: int) -> Callable[[Tensor], Tensor] | None:
+    """A hook with its layer already said."""
+    return hook.layers[layer] if isinstance(hook, LayerHooks) else None if hook is None else partial(hook, layer)
+
 
 Draws = dict[str, Tensor]
 """Random numbers by name, one row a sample: drawn by the caller, so that batching and sharding cannot change them."""
@@ -54,6 +75,7 @@ class Backbone(nn.Module):
         image_size: side of the square pictures it reads.
         vocab_size: words it knows; None where it does not say.
         agrees: whether its samples can agree with actions that are already promised (`Batch.overlap`).
+        compiles_sampling: whether `sample` runs without waiting for the GPU, so that `compile_sampling` is for it.
         hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside` and
             `positions` (blocks that stand at rotary positions of their own).
 
@@ -75,6 +97,7 @@ class Backbone(nn.Module):
     vocab_size: int | None = None
     hosts: frozenset[str] = frozenset({"blocks"})
     agrees: bool = False
+    compiles_sampling: bool = False
 
     @property
     def device(self) -> torch.device:
@@ -153,6 +176,20 @@ class Backbone(nn.Module):
             steps: of an iterative head; its own number by default. Heads that answer at once take no notice.
         """
         raise NotImplementedError
+
+    def compile_sampling(self) -> None:
+        """Keep between chunks whatever depends on weights alone; `sample` can be captured as a CUDA graph from now on.
+
+        Raises:
+            UserError: this backbone cannot.
+        """
+        raise UserError(
+            f"The backbone {type(self).__name__} has no sampler that can be compiled: leave sampling=eager."
+        )
+
+    def sampling_stamp(self) -> object:
+        """What `sample` keeps between chunks was made from: where this changes, captured graphs are of no use."""
+        return None
 
     # Parts
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.commands.loading import load_policy, words_of
+from mme_vla.commands.loading import load_policy, prepare_sampling, words_of
 from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean
@@ -64,6 +64,7 @@ def main(cfg: DictConfig) -> None:
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
+    prepare_sampling(policy, cfg.sampling, logger)
     subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]), device)
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,

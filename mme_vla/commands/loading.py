@@ -1,6 +1,7 @@
 """The policy a command is about: a checkpoint, or a model with fresh weights for trying things out."""
 
 import logging
+import time
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from omegaconf import DictConfig
 
 from mme_vla.config.devices import find_device
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     import torch
@@ -77,12 +78,34 @@ def load_policy(
         )
     from mme_vla.testing.small import unit_stats
 
-    if cfg.dtype != "float32":
+    if cfg.dtype not in ("auto", "float32"):
         raise UserError(f"dtype={cfg.dtype} is for checkpoints; fresh weights are float32.")
     policy = build_from_config(cfg).to(device)
     policy.require_processor().stats = unit_stats(policy.embodiment)
     logger.warning("%s is UNTRAINED: its actions mean nothing; use it to try things out", cfg.name)
     return LoadedPolicy(policy, str(cfg.name), None)
+
+
+SAMPLING = ("auto", "eager", "graph", "compiled")
+"""How a command computes chunks: `sampling` of configs/evaluate.yaml and configs/serve.yaml."""
+
+
+def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) -> None:
+    """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU.
+
+    Raises:
+        UserError: an unknown way, or one that this policy or device has not.
+    """
+    if sampling not in SAMPLING:
+        raise UserError(f"sampling={sampling!r}. {did_you_mean(str(sampling), SAMPLING)}")
+    on_gpu = policy.device.type == "cuda"
+    if sampling == "graph" and not on_gpu:
+        raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")
+    if sampling == "eager" or (sampling == "auto" and not (on_gpu and policy.compiles_sampling)):
+        return
+    begun = time.perf_counter()
+    policy.compile_sampling(layers=sampling == "compiled")
+    logger.info("sampler compiled in %.1f s (sampling=%s)", time.perf_counter() - begun, sampling)
 
 
 def shipped_checkpoint(name: str) -> Path | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.commands.loading import load_policy
+from mme_vla.commands.loading import load_policy, prepare_sampling
 from mme_vla.config.composition import cli, log_to_terminal
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ def main(cfg: DictConfig) -> None:
     settings = ServeSettings.from_dict({str(key): value for key, value in config.items()})
     log_to_terminal(logger, clock=True)
     policy, name, _ = load_policy(cfg, "serve", logger)
+    prepare_sampling(policy, cfg.sampling, logger)
     server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
     if not settings.local_only and settings.api_key is None:
         logger.warning("host=%s without api_key: whoever reaches this port can use it", settings.host)

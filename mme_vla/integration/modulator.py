@@ -1,9 +1,11 @@
 """Memory as modulator: each action layer's MLP input is scaled and shifted by what it recalls (paper, section 4.3)."""
 
+from functools import partial
+
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Hook
+from mme_vla.backbone.base import Hook, LayerHooks
 from mme_vla.backbone.layers.attention import additive_mask, attend
 from mme_vla.backbone.layers.norms import EPS, RMSNorm, rms_normalise
 from mme_vla.backbone.layers.precision import compute_dtype
@@ -87,9 +89,11 @@ class Modulator(Integration):
         memory = required(memory)
         tokens = memory.tokens.to(compute_dtype(memory.tokens))
         positions = None if self.memory_position == "slot" else tokens.shape[1] - 1 - ages_of(memory)
-        cached = [layer.keys_values(tokens, positions) for layer in self.layers]  # type: ignore[operator]
         mask = additive_mask(memory.mask[:, None], tokens.dtype)  # b 1 1 m: every action sees the same keys
-        return lambda layer, x: self.layers[layer](x, *cached[layer], mask)
+        cached = [layer.keys_values(tokens, positions) for layer in self.layers]  # type: ignore[operator]
+        return LayerHooks([
+            partial(layer, k=k, v=v, mask=mask) for layer, (k, v) in zip(self.layers, cached, strict=True)
+        ])  # fmt: skip
 
 
 def _positions(start: int, x: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """`Memory`: choose stored tokens, then encode them into at most `budget` memory tokens."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,7 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.history import FrameScorer, History, StorageSpec
+from mme_vla.memory.history import FrameScorer, History, OnlineHistory, StorageSpec
+from mme_vla.memory.lazy import LazyHistory
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 LINES = 16
@@ -23,6 +24,7 @@ class Memory(nn.Module):
         capacity: most stored tokens it may select (`budget` unless the encoder reads more than it writes); selections
             are padded to it unless `padded_length` says otherwise.
         storage: what has to be stored of each frame.
+        lazy: True encodes a frame of an episode when it is first read, for memories that read few of those they keep.
         pad_left: True puts the padding before the tokens (recurrent memories), False after them.
         timed: whether each memory token speaks of one moment, which `MemoryTokens.ages` tells: what
             `integration.memory_position=time` reads.
@@ -40,6 +42,7 @@ class Memory(nn.Module):
     pad_left: bool = False
     timed: bool = False
     reads_motion: bool = False
+    lazy: bool = False
     reporting: bool = False
 
     def check_grid(self, views: int) -> None:
@@ -94,6 +97,9 @@ class Memory(nn.Module):
         """
         raise NotImplementedError
 
+    def compile(self, **options: Any) -> None:
+        """Compile in place what many small steps make slow; by default nothing is. `options` are `torch.compile`'s."""
+
     def make_scorer(self) -> FrameScorer | None:
         """Return a fresh scorer for one episode, or None when frames need no scores."""
         return None
@@ -128,6 +134,12 @@ class Memory(nn.Module):
             torch.ones(1, n, dtype=torch.bool, device=device),
             torch.zeros(1, dtype=torch.int64, device=device),
         )
+
+    def start_history(self, encode: Callable[[np.ndarray], Tensor]) -> OnlineHistory:
+        """An episode's history, empty; `encode` takes frames [n, H, W, 3] uint8 to stored tokens."""
+        if self.lazy:
+            return LazyHistory(self.storage, encode, self.make_scorer())
+        return OnlineHistory(self.storage, self.make_scorer())
 
     def start_stream(self) -> Any:
         """Return what this memory carries through one episode besides its history; None for nothing."""

@@ -216,12 +216,7 @@ class OnlineHistory(History):
         wanted, numbers = self.wanted(count, drawn), np.arange(count) if drawn is None else drawn
         if len(tokens) != len(wanted):
             raise ValueError(f"append() got tokens of {len(tokens)} frames but {len(wanted)} are kept: see wanted().")
-        if self._scorer is not None:
-            shown = zip((numbers + self._length).tolist(), frames, strict=True)
-            for number, frame in shown:
-                values = self._scorer(number, frame)
-                if values is not None:
-                    self._note_score(number, values)
+        self._score(frames, numbers)
         if len(tokens):
             self._grow(len(self._kept) + len(tokens), tokens)
             assert self._tokens is not None
@@ -238,6 +233,27 @@ class OnlineHistory(History):
             )
         self._scores.frames[self._scored], self._scores.values[self._scored] = frame, values
         self._scored += 1
+
+    def take(
+        self,
+        frames: np.ndarray,
+        encode: Callable[[np.ndarray], Tensor],
+        drawn: np.ndarray | None = None,
+        count: int | None = None,
+    ) -> None:
+        """Add frames in order, through `encode`: pictures [n, H, W, 3] → tokens [n, patches, d_vision]."""
+        wanted = self.wanted(len(frames) if count is None else count, drawn)
+        places = wanted if drawn is None else np.searchsorted(drawn, wanted)
+        self.append(frames, encode(frames[places]), drawn, count)
+
+    def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
+        """Show the scorer the next frames that have a picture; `numbers` says which they are."""
+        if self._scorer is None:
+            return
+        shown = zip((numbers + self._length).tolist(), frames, strict=True)
+        for number, frame in shown:
+            if (values := self._scorer(number, frame)) is not None:
+                self._note_score(number, values)
 
     def _grow(self, needed: int, like: Tensor) -> None:
         capacity = 0 if self._tokens is None else len(self._tokens)

@@ -50,8 +50,13 @@ class JoinedMemory(Memory):
         self.pad_left = any(member.pad_left for member in built)
         self.timed = all(member.timed for member in built)
         self.reads_motion = any(member.reads_motion for member in built)
+        self.lazy = all(member.lazy for member in built)
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
+
+    def compile(self, **options: Any) -> None:
+        for member in self.memories:
+            member.compile(**options)
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """What any member remembers, as the stored tokens it is made of."""

@@ -5,8 +5,9 @@ Two forms of the same computation: `forward` runs a whole window, for training a
 """
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,12 @@ Statistics = dict[str, Tensor]
 
 
 class RecurrentLayer(nn.Module):
-    """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose."""
+    """How a frame changes the state, in float32 whatever surrounds it. Subclasses choose.
+
+    window: most frames at the end of a list whose outputs `read` hands over; None where `following` may count further.
+    """
+
+    window: int | None = None
 
     def initial(self, batch: int) -> State:
         """The learned state before the first frame, for a batch of `batch`."""
@@ -73,6 +79,7 @@ class RecurrentMemory(Memory):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
 
     pad_left = True
+    lazy = True
 
     def __init__(
         self,
@@ -122,6 +129,7 @@ class RecurrentMemory(Memory):
         self.jitter, self.chunk = jitter, chunk
         self.encoder = FeatureEncoder(d_vision, hidden, position_dim, position_hidden)
         self.layer = layer
+        self._compiled: Callable[..., tuple[State, Statistics]] | None = None
         self.output = nn.Linear(hidden, width)
         nn.init.normal_(self.output.weight, std=0.02)
         nn.init.zeros_(self.output.bias)
@@ -157,21 +165,31 @@ class RecurrentMemory(Memory):
 
         Gradients flow through every step. Between chunks only the state is kept for the backward pass.
         """
-        advance = self.layer.advance
-        start = state = self.init_state(len(x))
+        # Statistics are wanted of one update in many: not worth compiling for.
+        eager = self._compiled is None or self.reporting
+        step = self.layer.advance if eager else partial(self._compiled, self.layer)
+        window = self.layer.window
+        start = self.init_state(len(x))
+        # All chunks are laid out alike, whatever the window's length: they share one code.
+        state = tuple(tensor.contiguous() for tensor in start)
         statistics, following = [], x.shape[1]
         for part, real in zip(x.split(self.chunk, 1), valid.split(self.chunk, 1), strict=True):
             following -= part.shape[1]
+            counted = following if window is None else min(following, window)
+            inputs = (state, part.contiguous(), real.contiguous(), counted, self.reporting)
             if torch.is_grad_enabled():
-                inputs = (state, part, real, following, self.reporting)
-                state, numbers = checkpoint(advance, *inputs, use_reentrant=False, preserve_rng_state=False)
+                state, numbers = checkpoint(step, *inputs, use_reentrant=False, preserve_rng_state=False)
             else:
-                state, numbers = advance(state, part, real, following, self.reporting)
+                state, numbers = step(*inputs)
             statistics.append(numbers)
         tokens = self.read(state)
         if self.reporting:
             tokens.metrics = self._metrics(statistics, valid) | self.layer.summary(start, state)
         return tokens
+
+    def compile(self, **options: Any) -> None:
+        """Compile the steps of a chunk, whose number does not depend on how long a window is."""
+        self._compiled = torch.compile(type(self.layer).advance, **{**options, "fullgraph": True, "dynamic": False})
 
     # Frame by frame
 

@@ -36,6 +36,8 @@ class RMTLayer(RecurrentLayer):
     State: the slots [b, budget, d], carried in the dtype their initial values are stored in.
     """
 
+    window = 0
+
     def __init__(
         self,
         hidden: int,

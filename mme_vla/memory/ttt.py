@@ -61,7 +61,7 @@ class TTTLayer(RecurrentLayer):
         if base_rate <= 0 or max_rate <= 0 or max_grad_norm <= 0:
             raise UserError("memory.base_rate, memory.max_rate and memory.max_grad_norm must be above 0.")
         width = hidden // heads
-        self.heads, self.budget, self.patches = heads, budget, patches
+        self.heads, self.budget, self.patches, self.window = heads, budget, patches, -(-budget // patches)
         self.base_rate, self.max_rate, self.max_grad_norm = base_rate, max_rate, max_grad_norm
         self.q, self.k, self.v, self.out = (nn.Linear(hidden, hidden, bias=False) for _ in range(4))
         self.q_norm, self.k_norm, self.v_norm = (nn.LayerNorm(width, eps=EPS) for _ in range(3))
@@ -80,7 +80,7 @@ class TTTLayer(RecurrentLayer):
         return math.log(math.expm1(self.base_rate))
 
     def initial(self, batch: int) -> State:
-        window = -(-self.budget // self.patches)
+        window = self.window
         outputs = self.weight.new_zeros(batch, window, self.patches, self.out.out_features, dtype=torch.float32)
         seen = torch.zeros(batch, window, dtype=torch.bool, device=outputs.device)
         weight, bias = (p.expand(batch, *p.shape) for p in (self.weight, self.bias))

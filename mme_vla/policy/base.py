@@ -96,6 +96,19 @@ class Policy(Saved):
         """
         raise NotImplementedError
 
+    def compile_sampling(self, layers: bool = False) -> None:
+        """Make chunks quick, for a policy whose weights are done; see `MMEPolicy.compile_sampling`.
+
+        Raises:
+            UserError: this policy's sampler cannot be compiled.
+        """
+        raise UserError(f"{type(self).__name__} has no sampler that can be compiled: leave sampling=eager.")
+
+    @property
+    def compiles_sampling(self) -> bool:
+        """Whether `compile_sampling` is for this policy."""
+        return False
+
     # Episodes
 
     def start_episode(self, goal: str, seed: int = 0) -> Episode:

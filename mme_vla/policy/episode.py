@@ -53,7 +53,7 @@ class Episode:
         self.options: tuple[Option, ...] = ()
         """What can be chosen, for policies that choose; set it before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else OnlineHistory(memory.storage, memory.make_scorer())
+        self.history = None if memory is None else memory.start_history(policy.encode_frames)
         if self.history is not None and memory is not None and memory.reads_motion:
             self.history.motion = lambda frames: torch.stack([self._moved[int(frame)] for frame in frames])
         self.stream = None if memory is None else memory.start_stream()
@@ -189,9 +189,7 @@ class Episode:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
             self._moved += self._motion(demo, executed, states)
-            wanted = self.history.wanted(len(demo), drawn)
-            places = wanted if drawn is None else np.searchsorted(drawn, wanted)
-            self.history.append(frames, self._policy.encode_frames(frames[places]), drawn, len(demo))
+            self.history.take(frames, self._policy.encode_frames, drawn, len(demo))
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().past_actions

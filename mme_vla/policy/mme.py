@@ -23,12 +23,13 @@ from mme_vla.memory.base import Memory
 from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
+from mme_vla.policy.graphs import CapturedSampling
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.promises import promised_overlap
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import INTEGRATIONS, MEMORIES, POLICIES
-from mme_vla.types import Batch, HistoryTokens, MemoryTokens
+from mme_vla.types import Batch, HistoryTokens, MemoryTokens, send
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -51,6 +52,9 @@ class MMEPolicy(Policy):
 
     The two independent choices meet here and nowhere else; no method asks which variant it is.
     """
+
+    acts_in_bfloat16 = True
+    _sampler: CapturedSampling | None = None
 
     def __init__(
         self,
@@ -130,8 +134,14 @@ class MMEPolicy(Policy):
     # Training
 
     def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
-        return self.backbone.loss_draws(count, generator)
+        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n].
+
+        While training with augmentation also `changes` [n, …]: what happens to a sample's pictures.
+        """
+        draws = self.backbone.loss_draws(count, generator)
+        if self.training and self.augment:
+            draws = {**draws, "changes": self._draw_changes(count, generator)}
+        return draws
 
     def forward(
         self,
@@ -157,9 +167,10 @@ class MMEPolicy(Policy):
         if set(self.loss_draws(0, torch.default_generator)) - set(given):
             given = self.loss_draws(len(batch.actions), torch.default_generator) | given
         drawn = map_draws(given, lambda value: value.to(self.device))
+        views = self._views(batch, drawn.pop("changes", None))
         with self.autocast():
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            losses = self.backbone.loss(batch, self._views(batch), self._inject(memory), drawn)  # b h
+            losses = self.backbone.loss(batch, views, self._inject(memory), drawn)  # b h
         if batch.action_mask is None:
             loss = losses.mean()
         else:
@@ -180,8 +191,10 @@ class MMEPolicy(Policy):
         self.backbone.recompute(wanted)
 
     def compile(self, **options: Any) -> None:
-        """Compile the backbone's tower and layers in place, each by itself."""
+        """Compile the backbone's tower and layers in place, each by itself, and what of the memory is worth it."""
         self.backbone.compile(**options)
+        if self.memory is not None:
+            self.memory.compile(**options)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """The backbone's groups. Memory and integration stand in none: they are small, and compute in float32."""
@@ -203,12 +216,19 @@ class MMEPolicy(Policy):
         features = self.backbone.mark(batch.history.features, batch.prompt, batch.prompt_mask)
         return replace(batch.history, features=features)
 
-    def _views(self, batch: Batch) -> Tensor:
+    def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
+        """The random numbers that change the pictures of `count` training samples, [count, …] on the CPU."""
+        from mme_vla.processing.augment import augmentation_draws
+
+        return augmentation_draws(count, generator)
+
+    def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
+        """The current views in [−1, 1], changed where random numbers say how (`_draw_changes`)."""
         from mme_vla.processing.augment import augment_views
         from mme_vla.processing.pictures import to_unit_range
 
         images = to_unit_range(batch.images)
-        return augment_views(images, self.embodiment.augmentations) if self.training and self.augment else images
+        return images if changes is None else augment_views(images, self.embodiment.augmentations, changes)
 
     # Sampling
 
@@ -235,10 +255,49 @@ class MMEPolicy(Policy):
         if draws is None:
             source = torch.default_generator if generator is None else generator
             draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
-        drawn = map_draws(named_draws(draws), lambda value: value.to(self.device))
+        drawn = map_draws(named_draws(draws), lambda value: send(value, self.device))
+        if memory is None:
+            with self.autocast():
+                memory = self.encode_memory(self._marked(batch))
+        if self._sampler is not None and not self.training:
+            return self._sampler(batch, memory, drawn, steps or self.sample_steps)
+        return self._sample(batch, memory, drawn, steps)
+
+    def _sample(
+        self, batch: Batch, memory: MemoryTokens | None, drawn: Mapping[str, Tensor], steps: int | None
+    ) -> Tensor:
         with self.autocast():
-            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             return self.backbone.sample(batch, self._views(batch), self._inject(memory), drawn, steps)
+
+    @property
+    def compiles_sampling(self) -> bool:
+        """Whether its backbone's sampler can be compiled."""
+        return self.backbone.compiles_sampling
+
+    def compile_sampling(self, layers: bool = False) -> None:
+        """Make chunks quick, for a policy whose weights are done: they are the same to the rounding of their kernels.
+
+        What depends on the flow time alone is computed once and kept. On a GPU a chunk becomes one CUDA graph for each
+        size of batch, captured when it first occurs; here for one episode and every length of prompt.
+
+        Args:
+            layers: compile the tower and the layers too, which takes a minute or more at full size.
+
+        Raises:
+            UserError: this backbone has no sampler that can be captured.
+        """
+        self.backbone.compile_sampling()
+        if layers:
+            self.backbone.compile(dynamic=False)
+        if self.device.type != "cuda":
+            return
+        self._sampler = CapturedSampling(self._sample, self.backbone.sampling_stamp)
+        if self.processor is None:
+            return
+        full = self.full_batch(self.device)
+        for length in range(16, self._prompt_length() + 16, 16):
+            cut = replace(full, prompt=full.prompt[:, :length], prompt_mask=full.prompt_mask[:, :length])
+            self.sample_actions(cut)
 
     # Episodes
 
@@ -255,7 +314,7 @@ class MMEPolicy(Policy):
             state=states,
             overlap=promised_overlap(promises, states, self.require_processor(), self.action_dim),
         )
-        return batch.without_prompt_padding().to(self.device)
+        return batch.without_prompt_padding().sent(self.device)
 
     def answer(
         self, batch: Batch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None

@@ -34,10 +34,11 @@ class OpenVlaPolicy(MMEPolicy):
         """As `MMEPolicy.full_batch`, with a state."""
         return replace(super().full_batch(device), proprio=torch.zeros(1, self.embodiment.state.width, device=device))
 
-    def _views(self, batch: Batch) -> Tensor:
+    def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
+        views = len(self.embodiment.cameras)
+        return draw_changes(count * views, generator).unflatten(0, (count, views))
+
+    def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
         pictures = batch.images.flatten(0, 1)
-        if self.training and self.augment:
-            shown = augment(pictures, draw_changes(len(pictures), device=pictures.device))
-        else:
-            shown = centre_crop(pictures)
+        shown = centre_crop(pictures) if changes is None else augment(pictures, changes.flatten(0, 1))
         return to_unit_range(shown).view(batch.images.shape)

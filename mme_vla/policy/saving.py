@@ -4,7 +4,7 @@ import json
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
@@ -41,6 +41,8 @@ class Saved(nn.Module):
 
     config: dict[str, Any]
     processor: "PolicyProcessor | None"
+    acts_in_bfloat16: ClassVar[bool] = False
+    """Whether `dtype="auto"` rounds its weights to bfloat16 on a GPU."""
 
     @classmethod
     def from_config(
@@ -97,7 +99,8 @@ class Saved(nn.Module):
             source: a folder on disk (of a checkpoint, or of a run: then its newest; `…/latest`: of the newest run), or
                 `owner/name` of a hub repository.
             device: where to put the weights.
-            dtype: what the weights become. `bfloat16` halves the memory, for inference; compute is then bfloat16 too.
+            dtype: what the weights become. `bfloat16` halves the memory, for inference: compute is then bfloat16 too,
+                and no weight asks for a gradient. `auto`: bfloat16 on a GPU if the policy is made for it, else float32.
             revision: branch, tag or commit of the repository. token: for private repositories.
             trust_plugins: import the modules that the checkpoint names under `plugins`: code of whoever wrote it.
             tokenizer: in place of the one the checkpoint names, which is fetched from the hub only if it is π0.5's own.
@@ -109,7 +112,7 @@ class Saved(nn.Module):
         """
         from mme_vla.processing.base import load_processor
 
-        kind, folder = dtype_of(dtype), local_folder(source, revision, token)
+        wanted, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
         if not (folder / CONFIG).is_file():
             raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
         config = read_config(folder)
@@ -118,14 +121,19 @@ class Saved(nn.Module):
                 f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
                 "are read by mme_vla.weights.load_weights() and converted by python -m mme_vla.weights.convert."
             )
-        if dtype == "bfloat16":
-            policy = {"compute_dtype": "bfloat16", **policy}
         import_trusted(config, str(source), trust_plugins)
-        loaded = policy_class_for(cls, config, str(source)).from_saved(config, str(folder / CONFIG), policy)
+        chosen = policy_class_for(cls, config, str(source))
+        on_gpu = torch.device(device).type == "cuda"
+        kind = wanted or (torch.bfloat16 if on_gpu and chosen.acts_in_bfloat16 else torch.float32)
+        if kind == torch.bfloat16:
+            policy = {"compute_dtype": "bfloat16", **policy}
+        loaded = chosen.from_saved(config, str(folder / CONFIG), policy)
         assign_tensors(loaded, load_tensors(folder), str(source), kind)
         loaded.compute_unsaved()
         loaded.processor = load_processor(folder, tokenizer)
         loaded.check_processor(str(source))
+        if kind == torch.bfloat16:
+            loaded.requires_grad_(False)
         return loaded.to(device).eval()
 
     @classmethod

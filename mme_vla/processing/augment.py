@@ -17,18 +17,24 @@ CROP = 0.95  # side of the crop, rounded down to whole pixels: 212 of 224
 ROTATION = math.radians(5)
 JITTER_PROBABILITY = 0.5
 BRIGHTNESS, CONTRAST, HUE = 0.3, 0.4, 0.1
+NUMBERS = 7  # random numbers a sample: place of the crop (2), angle, brightness, contrast, hue, whether it is coloured
+
+
+def augmentation_draws(count: int, generator: torch.Generator | None = None) -> Tensor:
+    """The random numbers of `count` samples, uniform [count, 7] on the CPU: none depends on which cameras there are."""
+    return torch.rand(count, NUMBERS, generator=generator)
 
 
 @torch.no_grad()
-def augment_views(images: Tensor, augmentations: Sequence[str], generator: torch.Generator | None = None) -> Tensor:
-    """Augment a batch of current observations on the device they are on.
+def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -> Tensor:
+    """Augment a batch of current observations on the device they are on, without waiting for it.
 
     All views of one sample share their random numbers, as released.
 
     Args:
         images: [b, v, 3, s, s] float in [-1, 1].
         augmentations: what is done to each of the v views: `all`, `colour` (neither cropped nor rotated) or `none`.
-        generator: source of all randomness; None uses PyTorch's default one.
+        draws: [b, 7] as `augmentation_draws` makes them, on that device.
 
     Returns:
         [b, v, 3, s, s] float32 in [-1, 1].
@@ -40,22 +46,23 @@ def augment_views(images: Tensor, augmentations: Sequence[str], generator: torch
         raise UserError(f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.")
     if images.shape[1] != len(augmentations):
         raise UserError(f"Got {images.shape[1]} views but {len(augmentations)} cameras are described.")
-    # Everything is drawn at once, so that the numbers do not depend on which cameras there are.
-    source = images.device if generator is None else generator.device
-    draws = torch.rand(len(images), 7, generator=generator, device=source).to(images.device)
     symmetric = draws[:, :6] * 2 - 1
     offset, angle = symmetric[:, :2], symmetric[:, 2] * ROTATION
-    brightness, contrast, hue = symmetric[:, 3:6].mul(symmetric.new_tensor([BRIGHTNESS, CONTRAST, HUE])).unbind(1)
-    jittered = draws[:, 6] < JITTER_PROBABILITY
+    brightness, contrast, hue = symmetric[:, 3] * BRIGHTNESS, symmetric[:, 4] * CONTRAST, symmetric[:, 5] * HUE
+    jittered = (draws[:, 6] < JITTER_PROBABILITY)[:, None, None, None]
 
     pixels = (images.float() + 1) / 2  # in [0, 1] the zero fill of the resampling is black
+    views = list(pixels.unbind(1))
     base = [i for i, kind in enumerate(augmentations) if kind == "all"]
     if base:
-        pixels[:, base] = crop_and_rotate(pixels[:, base], offset, angle)
-    coloured = jitter_colours(pixels, brightness, contrast, hue)
-    coloured_views = torch.tensor([kind != "none" for kind in augmentations], device=pixels.device)
-    pixels = torch.where((jittered[:, None] & coloured_views)[:, :, None, None, None], coloured, pixels)
-    return pixels.clamp(0, 1) * 2 - 1
+        moved = crop_and_rotate(torch.stack([views[i] for i in base], 1), offset, angle)
+        for i, view in zip(base, moved.unbind(1), strict=True):
+            views[i] = view
+    coloured = jitter_colours(torch.stack(views, 1), brightness, contrast, hue)
+    for i, kind in enumerate(augmentations):
+        if kind != "none":
+            views[i] = torch.where(jittered, coloured[:, i], views[i])
+    return torch.stack(views, 1).clamp(0, 1) * 2 - 1
 
 
 def crop_and_rotate(pixels: Tensor, offset: Tensor, angle: Tensor) -> Tensor:

@@ -107,12 +107,11 @@ def quantised(pixels: Tensor) -> Tensor:
 
 
 def draw_changes(count: int, generator: torch.Generator | None = None, device: torch.device | None = None) -> Tensor:
-    """Draws of `count` pictures [n, 6]: top, left, brightness, contrast, saturation, hue."""
-    source = device if generator is None else generator.device
-    u = torch.rand(count, 6, generator=generator, device=source).to(device)
-    low = u.new_tensor([0, 0, -BRIGHTNESS, CONTRAST[0], SATURATION[0], -HUE])
-    high = u.new_tensor([1 - SIDE, 1 - SIDE, BRIGHTNESS, CONTRAST[1], SATURATION[1], HUE])
-    return low + (high - low) * u
+    """Draws of `count` pictures [n, 6], made on the CPU: top, left, brightness, contrast, saturation, hue."""
+    u = torch.rand(count, 6, generator=generator)
+    low = torch.tensor([0, 0, -BRIGHTNESS, CONTRAST[0], SATURATION[0], -HUE])
+    high = torch.tensor([1 - SIDE, 1 - SIDE, BRIGHTNESS, CONTRAST[1], SATURATION[1], HUE])
+    return (low + (high - low) * u).to(device)
 
 
 def augment(images: Tensor, draws: Tensor) -> Tensor:

@@ -34,6 +34,7 @@ from mme_vla.training.shards import ShardWriter
 from mme_vla.training.stopping import leave_signals_alone, stop_asked
 from mme_vla.training.validation import Collate, Samples, Validation
 from mme_vla.training.window import Window
+from mme_vla.types import send
 
 
 class _InEpoch(Dataset[Any]):
@@ -157,8 +158,8 @@ class Trainer:
                     return False
         return True
 
-    def update(self, step: int, batches: Iterator[Any], window: Window) -> dict[str, Tensor]:
-        """One optimizer update from the next `accumulate` pieces of `batches`; its metrics, detached."""
+    def update(self, step: int, batches: Iterator[Any], window: Window) -> dict[str, Tensor | float]:
+        """One optimizer update from the next `accumulate` pieces of `batches`; its metrics, detached, unwaited for."""
         settings, device = self.settings, self.accelerator.device
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
@@ -169,11 +170,11 @@ class Trainer:
             with window.waiting():
                 batch = next(batches).to(device, non_blocking=True)
             rows = self.order.rows(piece)
-            # Whatever else draws (augmentation, a memory's dropout) takes it from the default generator.
+            # Whatever else draws (a memory's dropout) takes it from the default generator.
             torch.manual_seed(seed_of(settings.seed, "model", step, piece, self.accelerator.process_index))
             last = piece == settings.accumulate - 1
             with self._gradients_shared(last):
-                loss, metrics = self.model(batch, {name: value[rows].to(device) for name, value in draws.items()})
+                loss, metrics = self.model(batch, {name: send(value[rows], device) for name, value in draws.items()})
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
@@ -183,7 +184,7 @@ class Trainer:
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.ema.update(step)
-        return {**sums, "grad_norm": norm, "lr": torch.tensor(rate, device=device)}
+        return {**sums, "grad_norm": norm, "lr": rate}
 
     @contextmanager
     def _gradients_shared(self, shared: bool) -> Iterator[None]:

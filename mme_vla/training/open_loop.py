@@ -56,6 +56,7 @@ class OpenLoop:
         }
 
 
+@torch.compiler.set_stance("force_eager")  # a few chunks are not worth compiling for
 def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, held_out: bool = True) -> OpenLoop:
     """Predict chunks that tile the first of the samples' episodes, at most `chunks` of them.
 

@@ -32,6 +32,8 @@ class Validation:
         self.indices = np.linspace(0, size - 1, min(count, size)).round().astype(int).tolist()
         self._batches: list[Any] = []
 
+    # Compiled code of the training step does not fit here, and a few batches are not worth code of their own.
+    @torch.compiler.set_stance("force_eager")
     @torch.no_grad()
     def loss(
         self, policy: Policy, process: int = 0, processes: int = 1, reduce: Callable[..., Any] | None = None

@@ -24,14 +24,14 @@ class Window:
 
     def restart(self) -> None:
         """Begin anew."""
-        self._sums: dict[str, Tensor] = {}
+        self._sums: dict[str, Tensor | float] = {}
         self._counts: dict[str, int] = {}
         self._updates = 0
         self._waited = self._paused = 0.0
         self._begun = time.perf_counter()
 
-    def add(self, metrics: Mapping[str, Tensor]) -> None:
-        """Take one update's numbers."""
+    def add(self, metrics: Mapping[str, Tensor | float]) -> None:
+        """Take one update's numbers; plain ones, such as the learning rate, are the same in every process."""
         for name, value in metrics.items():
             self._sums[name] = self._sums[name] + value if name in self._sums else value
             self._counts[name] = self._counts.get(name, 0) + 1
@@ -60,9 +60,11 @@ class Window:
         Raises:
             UserError: the loss is no longer a number.
         """
-        averages = [total / self._counts[name] for name, total in self._sums.items()]
-        means = reduce(torch.stack(averages), reduction="mean").tolist()
-        values = {f"train/{name}": mean for name, mean in zip(self._sums, means, strict=True)}
+        averages = {name: total / self._counts[name] for name, total in self._sums.items()}
+        measured = {name: average for name, average in averages.items() if isinstance(average, Tensor)}
+        means = reduce(torch.stack(list(measured.values())), reduction="mean").tolist()
+        known = averages | dict(zip(measured, means, strict=True))
+        values = {f"train/{name}": float(mean) for name, mean in known.items()}
         seconds = time.perf_counter() - self._begun - self._paused
         values["speed/samples_per_s"] = self._updates * self._batch_size / seconds
         values["speed/waiting_for_data"] = self._waited / seconds

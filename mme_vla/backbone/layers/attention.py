@@ -1,11 +1,22 @@
-"""Attention behind one function, so that the backend is chosen in one place."""
+"""Attention behind one function, so that the kernel is chosen in one place."""
+
+from contextlib import AbstractContextManager, nullcontext
 
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.nn.attention import SDPBackend, sdpa_kernel
 
-BIG_NEGATIVE = -2.3819763e38
-"""Finite: a row that sees no key (a padding query) averages all values instead of becoming NaN."""
+from mme_vla.backbone.layers.sight import Sight
+
+BIG_NEGATIVE = -1e30
+"""Far below any logit, and still finite where kernels count in base 2 (times 1.44): no row becomes NaN."""
+
+ALIGNMENT = 8
+"""Keys a row of the mask is padded to, as fused kernels want it: otherwise they copy the mask in every layer."""
+
+KERNELS = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+"""On a GPU. cuDNN, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths (pytorch#196678)."""
 
 
 def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
@@ -13,7 +24,24 @@ def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
 
     Added to finite logits in float32 it absorbs them, so this equals replacing them.
     """
-    return torch.zeros_like(mask, dtype=dtype).masked_fill_(~mask, BIG_NEGATIVE).unsqueeze(1)
+    return _padded(mask, dtype)[..., : mask.shape[-1]].unsqueeze(1)
+
+
+def sight_mask(sight: Sight, dtype: torch.dtype) -> Tensor:
+    """The same from who may see whom: [b, 1, n, k]."""
+    return sight.spread(_padded(sight.seen, dtype))[..., : sight.seen.shape[-1]].unsqueeze(1)
+
+
+def _padded(seen: Tensor, dtype: torch.dtype) -> Tensor:
+    *rows, keys = seen.shape
+    mask = torch.zeros(*rows, -(-keys // ALIGNMENT) * ALIGNMENT, dtype=dtype, device=seen.device)
+    mask[..., :keys].masked_fill_(~seen, BIG_NEGATIVE)
+    return mask
+
+
+def our_kernels(x: Tensor) -> AbstractContextManager[object]:
+    """The context of every attention on a GPU: kernels we choose, never PyTorch by its own order."""
+    return sdpa_kernel(KERNELS) if x.is_cuda else nullcontext()
 
 
 def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
@@ -31,4 +59,5 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Tensor | None) -> Tensor:
     if groups > 1:
         # One shared key head broadcasts without a copy; several are repeated.
         k, v = ((x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1)) for x in (k, v))
-    return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)
+    with our_kernels(q):
+        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)

@@ -45,6 +45,17 @@ class Span(NamedTuple):
     length: int
 
 
+def row_of(name: str, table: Visibility) -> frozenset[str] | set[str]:
+    """What a block of this name may look at.
+
+    Raises:
+        UserError: it has no row in the table.
+    """
+    if name not in table:
+        raise UserError(f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.")
+    return table[name]
+
+
 def attention_mask(
     queries: Sequence[Span], keys: Sequence[Span], query_mask: Tensor, key_mask: Tensor, table: Visibility
 ) -> Tensor:
@@ -64,9 +75,8 @@ def attention_mask(
     device = key_mask.device
     rows = []
     for query in queries:
-        if query.name not in table:
-            raise UserError(f"Block {query.name!r} has no row in the visibility table; it has rows {sorted(table)}.")
-        sees = [torch.full((key.length,), key.name in table[query.name], device=device) for key in keys]
+        row = row_of(query.name, table)
+        sees = [torch.full((key.length,), key.name in row, device=device) for key in keys]
         rows.append(torch.cat(sees).expand(query.length, -1))
     return torch.cat(rows) & query_mask[:, :, None] & key_mask[:, None, :]
 

@@ -34,6 +34,7 @@ class Pi05Backbone(Backbone):
     sample_steps = EULER_STEPS
     hosts = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions"})
     agrees = True
+    compiles_sampling = True
     heads = ("action_in", "action_out", "time_in", "time_out")
     # `kv` is what the VLM's last layer has in place of `qkv`.
     adapted = tuple(
@@ -65,6 +66,9 @@ class Pi05Backbone(Backbone):
         self.embedding = nn.Embedding(config.vocab_size, config.vlm.width)
         experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
         self.transformer = JointTransformer(config, experts)
+        self.keep_times = False
+        self._kept: dict[int, Conditioning] = {}
+        self._kept_stamp: tuple[object, ...] = ()
         self.action_in = nn.Linear(config.action_dim, width)
         self.action_out = nn.Linear(width, config.action_dim)
         self.time_in = nn.Linear(width, width)
@@ -79,11 +83,15 @@ class Pi05Backbone(Backbone):
                 initialise(block.experts[name])  # type: ignore[index, arg-type]
 
     def compile(self, **options: Any) -> None:
-        """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still."""
+        """Compile the vision tower and every layer in place, each by itself: quick to compile, and shardable still.
+
+        Lengths are symbols, so that prompts and batches of any length share their code; nothing falls back to eager
+        unnoticed (`fullgraph`). `options` are `torch.compile`'s and go before these.
+        """
         # Layers share one code: each passes it in training, prefill and denoising, with and without gradients.
         torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
         for module in (self.vision, *self.transformer.layers):
-            module.compile(**options)
+            module.compile(**{"fullgraph": True, "dynamic": True, **options})
 
     def encode_images(self, images: Tensor) -> Tensor:
         """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is frozen."""
@@ -177,17 +185,43 @@ class Pi05Backbone(Backbone):
         prefix, injection = self.prefill(batch, images, inject)
         blocks = [*injection.beside, self.action_block(noise)]
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
-        times = flow.euler_times(steps, noise.device)
-        condition, rows = self.time_condition(times), 1
-        if injection.condition is not None:  # what memory says differs from sample to sample: every time for each
-            rows = len(noise)
-            condition = torch.cat([injection.condition(one.expand(rows, -1)) for one in condition])
-        conditions = self.transformer.conditioning(condition)
+        past = prefix.with_room(sum(map(len, blocks)))
+        if injection.condition is None:
+            conditions, rows = self.conditions(steps), 1
+        else:  # what memory says differs from sample to sample: every time for each
+            rows, condition = len(noise), self.time_condition(flow.euler_times(steps, noise.device))
+            changed = torch.cat([injection.condition(one.expand(rows, -1)) for one in condition])
+            conditions = self.transformer.conditioning(changed)
 
         def velocity(x: Tensor, i: int) -> Tensor:
-            return self.denoise(x, conditions.at(i, rows), layout, prefix, injection)
+            return self.denoise(x, conditions.at(i, rows), layout, past, injection)
 
+        times = flow.euler_times(steps, noise.device)
         return flow.euler(noise, steps, agreeing(velocity, batch.overlap, times))
+
+    def conditions(self, steps: int) -> Conditioning:
+        """Every layer's time modulations at the times of so many steps; kept for the next chunk while `keep_times`."""
+        if not self.keep_times:
+            return self._conditions(steps)
+        stamp = self.sampling_stamp()
+        if stamp != self._kept_stamp:
+            self._kept, self._kept_stamp = {}, stamp
+        if steps not in self._kept:
+            self._kept[steps] = self._conditions(steps)
+        return self._kept[steps]
+
+    def sampling_stamp(self) -> tuple[object, ...]:
+        """What kept time modulations were computed from: the weights by place and version, and their precision."""
+        layers = self.transformer.modulating()
+        weights = [p for module in (self.time_in, self.time_out, *layers) for p in module.parameters()]
+        return torch.is_autocast_enabled(self.device.type), *((p.data_ptr(), p._version) for p in weights)
+
+    def _conditions(self, steps: int) -> Conditioning:
+        return self.transformer.conditioning(self.time_condition(flow.euler_times(steps, self.device)))
+
+    def compile_sampling(self) -> None:
+        """Keep the time modulations; see `Backbone`."""
+        self.keep_times = True
 
     def prefill(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[KVCache, Injection]:
         """Run what a chunk's steps share: keys and values of the prefix, and what the memory injects."""

@@ -44,11 +44,12 @@ def time_embedding(time: Tensor, width: int) -> Tensor:
 
 def euler_times(steps: int, device: torch.device) -> Tensor:
     """The times 1, 1 − 1/steps, … at which the velocity is asked for, added up in float32 as released."""
-    times, time = [], torch.tensor(1.0)
+    # Added up where they are needed: a copy from the CPU would wait for the GPU, and could not be in a CUDA graph.
+    times, time = [], torch.ones((), device=device)
     for _ in range(steps):
         times.append(time)
         time = time - 1.0 / steps
-    return torch.stack(times).to(device)
+    return torch.stack(times)
 
 
 def euler(noise: Tensor, steps: int, velocity: Callable[[Tensor, int], Tensor]) -> Tensor:

@@ -10,16 +10,34 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Hook
-from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.blocks import Block, Span, Visibility, attention_mask, placed, token_positions
+from mme_vla.backbone.base import Hook, bind_hook
+from mme_vla.backbone.layers.attention import attend, sight_mask
+from mme_vla.backbone.layers.blocks import Block, Span, Visibility, placed, token_positions
 from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.layers.recomputing import Recompute, run_layer
 from mme_vla.backbone.layers.rope import Rotation, rotate, rotation
+from mme_vla.backbone.layers.sight import Sight
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 
 KeyValue = tuple[Tensor, Tensor]
+
+
+class Room(NamedTuple):
+    """Keys and values of one layer [b, past + n, K, h]: those of the past, and room for a pass of n tokens."""
+
+    k: Tensor
+    v: Tensor
+
+    def filled(self, k: Tensor, v: Tensor) -> KeyValue:
+        """All keys and values, this pass's [b, n, K, h] written where the room is."""
+        for whole, new in ((self.k, k), (self.v, v)):
+            whole[:, -new.shape[1] :].copy_(new)
+        return self.k, self.v
+
+    def past(self, n: int) -> KeyValue:
+        """What is there without the last n."""
+        return self.k[:, :-n], self.v[:, :-n]
 
 
 class LayerModulation(NamedTuple):
@@ -125,7 +143,7 @@ class JointBlock(nn.Module):
         mask: Tensor,
         condition: Tensor | LayerModulation | None,
         hook: Callable[[Tensor], Tensor] | None = None,
-        past: KeyValue | None = None,
+        past: KeyValue | Room | None = None,
     ) -> tuple[list[Segment], KeyValue]:
         """Run one layer.
 
@@ -134,7 +152,7 @@ class JointBlock(nn.Module):
             mask: additive [b, 1, n, past + n].
             condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
             hook: see `Hook`, layer already bound.
-            past: keys and values [b, past, K, h] of earlier passes, rotated.
+            past: keys and values [b, past, K, h] of earlier passes, rotated; or these with room for this pass's own.
 
         Returns:
             The updated segments (of those that asked), and this pass's keys (rotated) and values.
@@ -155,7 +173,7 @@ class JointBlock(nn.Module):
         k, v = _join(keys), _join(values)
         if not asked:
             return [], (k, v)
-        all_k, all_v = (k, v) if past is None else (torch.cat([past[0], k], 1), torch.cat([past[1], v], 1))
+        all_k, all_v = _after(past, k, v)
         seen = mask if len(asked) == len(segments) else torch.cat([mask[:, :, rows] for *_, rows in asked], 2)
         attended = attend(_join(queries), all_k, all_v, seen)
         pieces = attended.split([rows.stop - rows.start for *_, rows in asked], dim=1)
@@ -170,9 +188,20 @@ class JointBlock(nn.Module):
 class KVCache:
     """Keys and values of every layer, and what is needed to see them: their blocks and which tokens are valid."""
 
-    layers: list[KeyValue]
+    layers: Sequence[KeyValue | Room]
     spans: list[Span]
     mask: Tensor  # [b, past] bool
+
+    def with_room(self, tokens: int) -> "KVCache":
+        """The same with room behind it, in which every one of many passes of so many tokens writes its own.
+
+        It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites the last.
+        """
+        rooms = [
+            Room(*(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1])))
+            for layer in self.layers
+        ]
+        return KVCache(rooms, self.spans, self.mask)
 
 
 class Layout(NamedTuple):
@@ -215,12 +244,14 @@ class JointTransformer(nn.Module):
 
     def conditioning(self, condition: Tensor) -> Conditioning:
         """Compute every layer's modulation for conditions [m, c] at once: the weights are read once, not m times."""
-        layers = []
-        for block in self.layers:
-            layer: Any = block.experts[self.answering]  # type: ignore[index]
-            norms = (layer.attention_norm, layer.mlp_norm)
-            layers.append(LayerModulation(*(norm.modulation(condition) for norm in norms)))
-        return Conditioning(layers, self.final_norm.modulation(condition))
+        *of_layers, final = (norm.modulation(condition) for norm in self.modulating())
+        pairs = zip(of_layers[::2], of_layers[1::2], strict=True)
+        return Conditioning([LayerModulation(*pair) for pair in pairs], final)
+
+    def modulating(self) -> list[AdaRMSNorm]:
+        """The norms that a condition modulates: two of every layer, and the final one."""
+        experts: list[Any] = [block.experts[self.answering] for block in self.layers]  # type: ignore[index]
+        return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [self.final_norm]
 
     def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
         """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
@@ -228,8 +259,7 @@ class JointTransformer(nn.Module):
         asking = torch.cat([block.mask for block in blocks], 1)
         positions = placed(token_positions(asking, past.mask if past else None), blocks)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
-        seen = attention_mask(spans, all_spans, asking, valid, table)
-        mask = additive_mask(seen, compute_dtype(blocks[0].tokens))
+        mask = sight_mask(Sight.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens))
         return Layout(all_spans, valid, mask, rotation(positions, self.head_dim))
 
     def forward(
@@ -256,17 +286,24 @@ class JointTransformer(nn.Module):
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
-            of_hook = None if hook is None else _bind(hook, i)
-            args = (segments, layout.turn, layout.mask, of_layer, of_hook, past.layers[i] if past else None)
+            args = (segments, layout.turn, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
             segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
             if keep:
-                old = past.layers[i] if past else None
-                cached.append(kv if old is None else (torch.cat([old[0], kv[0]], 1), torch.cat([old[1], kv[1]], 1)))
+                cached.append(_after(past.layers[i] if past else None, *kv))
         answer = None
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
             answer, _ = self.final_norm(segments[-1].tokens, final)
         return answer, KVCache(cached, layout.spans, layout.valid) if keep else None
+
+
+def _after(past: KeyValue | Room | None, k: Tensor, v: Tensor) -> KeyValue:
+    """Keys and values of a pass behind those of the past."""
+    if past is None:
+        return k, v
+    if isinstance(past, Room):
+        return past.filled(k, v)
+    return torch.cat([past[0], k], 1), torch.cat([past[1], v], 1)
 
 
 def _join(parts: list[Tensor]) -> Tensor:
@@ -280,9 +317,7 @@ def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
     for block in blocks:
         if not runs or runs[-1][0] != block.expert:
             runs.append((block.expert, []))
-        runs[-1][1].append(block.tokens.to(dtype))
+        # Not a view of something else, as no later layer's tokens are: the first layer then shares their compiled code.
+        view = torch.is_grad_enabled() and block.tokens._is_view()
+        runs[-1][1].append(block.tokens.to(dtype, copy=view))
     return [Segment(expert, _join(tokens)) for expert, tokens in runs]
-
-
-def _bind(hook: Hook, layer: int) -> Callable[[Tensor], Tensor]:
-    return lambda x: hook(layer, x)

@@ -1,7 +1,7 @@
 """SigLIP: timm's vision transformer, which computes the same function, with the released model's dtype rules."""
 
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 import torch
 from torch import Tensor, nn
@@ -33,6 +33,11 @@ class VisionTower(nn.Module):
             norm_layer=partial(nn.LayerNorm, eps=1e-6),
             weight_init="skip",
         )
+        self.eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Nothing in it differs in training: it stays as it is, and compiled code serves both modes."""
+        return super().train(False)
 
     def forward(self, images: Tensor) -> Tensor:
         vit: Any = self.vit

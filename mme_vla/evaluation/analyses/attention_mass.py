@@ -12,7 +12,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.pi05.gemma import JointBlock, KeyValue, LayerModulation, Layout
+from mme_vla.backbone.pi05.gemma import JointBlock, KeyValue, LayerModulation, Layout, Room
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 
@@ -132,7 +132,9 @@ class AttentionWatch:
         given = {**dict.fromkeys(names), **dict(zip(names, args, strict=False)), **kwargs}
         segments, condition = given["segments"], given["condition"]
         of_attention = condition.attention if isinstance(condition, LayerModulation) else condition
-        past: KeyValue | None = given["past"]
+        past: KeyValue | Room | None = given["past"]
+        if isinstance(past, Room):
+            past = past.past(sum(segment.tokens.shape[1] for segment in segments))
         keys: list[Tensor] = [] if past is None else [past[0]]
         row, q = 0, None
         for segment in segments:

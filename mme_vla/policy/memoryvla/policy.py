@@ -50,6 +50,8 @@ class MemoryVlaPolicy(Policy):
         "action": "",
     }
 
+    acts_in_bfloat16 = True
+
     def __init__(
         self,
         vlm: Prismatic,
