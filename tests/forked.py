@@ -1,7 +1,7 @@
 """Runs commands of the library as a user's shell would, but for their imports: each is a fork of one process that has
 imported PyTorch, LeRobot and the simulator once. Seconds of CPU time are saved for every command a test runs.
 
-Tests of what happens while a command is imported, or when it is killed, start real processes.
+Tests of what happens while a command is imported, or of process groups, start real processes.
 """
 
 import importlib
@@ -18,39 +18,53 @@ from conftest import REPOSITORY
 from mme_vla.envs.vector import processes
 
 
+class Command:
+    """What `python -W ignore -m <words>` is, started in a folder with these environment variables besides the own.
+
+    Args:
+        words: a module, or a file that ends with `.py`, and its arguments.
+        hidden: modules that do not exist for it.
+    """
+
+    def __init__(
+        self,
+        *words: str,
+        cwd: Path = REPOSITORY,
+        env: Mapping[str, str] | None = None,
+        hidden: Sequence[str] = (),
+    ) -> None:
+        self._words = list(words)
+        self._folder = tempfile.TemporaryDirectory()
+        self._printed = [Path(self._folder.name, name) for name in ("out", "err")]
+        arguments = (words, cwd, hidden, *self._printed)
+        self.process = processes.simulating_processes().Process(
+            target=processes.begin, args=({**os.environ, **(env or {})}, _be, *arguments)
+        )
+        self.process.start()
+
+    def finish(self, timeout: float = 280.0) -> "subprocess.CompletedProcess[str]":
+        """Wait for its end; one that takes longer than `timeout` seconds is killed, and an error."""
+        self.process.join(timeout)
+        late = self.process.exitcode is None
+        if late:
+            self.process.kill()
+            self.process.join()
+        out, err = (path.read_text() if path.exists() else "" for path in self._printed)
+        self._folder.cleanup()
+        if late:
+            raise subprocess.TimeoutExpired(self._words, timeout, out, err)
+        return subprocess.CompletedProcess(self._words, self.process.exitcode, out, err)
+
+
 def run(
     *words: str,
     cwd: Path = REPOSITORY,
     env: Mapping[str, str] | None = None,
     hidden: Sequence[str] = (),
     timeout: float = 280.0,
-):
-    """What `python -W ignore -m <words>` would end as in a folder, with these environment variables besides the own.
-
-    Args:
-        hidden: modules that do not exist for it.
-
-    Returns:
-        A `subprocess.CompletedProcess` with text.
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        out, err = Path(folder, "out"), Path(folder, "err")
-        variables = {**os.environ, **(env or {})}
-        process = processes.simulating_processes().Process(
-            target=processes.begin, args=(variables, _be, words, cwd, hidden, out, err)
-        )
-        process.start()
-        process.join(timeout)
-        if process.exitcode is None:
-            process.kill()
-            process.join()
-            raise subprocess.TimeoutExpired(list(words), timeout, out.read_bytes(), err.read_bytes())
-        return subprocess.CompletedProcess(list(words), process.exitcode, out.read_text(), err.read_text())
-
-
-def script(path: Path, *words: str, **how):
-    """The same for `python <path> <words>`."""
-    return run(str(path), *words, **how)
+) -> "subprocess.CompletedProcess[str]":
+    """How a command ended, and what it printed; arguments as for `Command`."""
+    return Command(*words, cwd=cwd, env=env, hidden=hidden).finish(timeout)
 
 
 def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: Path) -> None:
@@ -60,7 +74,7 @@ def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: 
         sys.path.insert(0, str(Path(__file__).parent / "extras"))
         importlib.import_module("sitecustomize")
     os.chdir(cwd)
-    sys.path[0:0] = [str(cwd)]
+    sys.path.insert(0, str(cwd))
     for path, number in ((out, 1), (err, 2)):
         with path.open("wb") as file:
             os.dup2(file.fileno(), number)

@@ -179,7 +179,7 @@ def app(tree: Path, tmp_path: Path) -> Path:
 
 
 def run(app: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return forked.script(app, *arguments, cwd=app.parent)
+    return forked.run(str(app), *arguments, cwd=app.parent)
 
 
 def test_a_command_runs_with_hydras_run_folder(app: Path) -> None:

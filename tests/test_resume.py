@@ -2,15 +2,13 @@
 
 import io
 import json
-import os
 import signal
-import subprocess
-import sys
 import time
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
+import forked
 import pytest
 import torch
 
@@ -28,17 +26,15 @@ SMALL = [
 ]  # fmt: skip
 
 
-def start(cache: Path, *overrides: str) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "mme_vla.train", *SMALL, f"data.cache.root={cache}", *overrides]
-    environment = {**os.environ, "OMP_NUM_THREADS": str(torch.get_num_threads()), "HF_HUB_OFFLINE": "1"}
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, env=environment, cwd=cache)
+def start(cache: Path, *overrides: str) -> forked.Command:
+    words = ["mme_vla.train", *SMALL, f"data.cache.root={cache}", *overrides]
+    return forked.Command(*words, cwd=cache, env={"OMP_NUM_THREADS": str(torch.get_num_threads())})
 
 
-def finish(process: "subprocess.Popen[str]") -> str:
-    out, err = process.communicate(timeout=240)
-    assert process.returncode == 0, err[-3000:]
-    return out
+def finish(command: forked.Command) -> str:
+    done = command.finish()
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
 
 
 def numbers(folder: Path) -> list[dict[str, Any]]:
@@ -56,11 +52,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     killed = start(base, "output=killed", "train.steps=500")
     deadline = time.monotonic() + 200
     while not any(line["step"] > SAVE_EVERY + 1 for line in read_metrics(base / "killed")):
-        assert killed.poll() is None, killed.communicate()[1][-3000:]
+        assert killed.process.is_alive(), killed.finish().stderr[-3000:]
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    killed.send_signal(signal.SIGKILL)
-    killed.communicate()
+    killed.process.kill()
+    assert killed.finish().returncode == -signal.SIGKILL
     printed = io.StringIO()
     with redirect_stdout(printed):  # in this process, which has imported everything: the same numbers, sooner
         main(compose("train", [*SMALL, f"data.cache.root={base}", f"output={base / 'whole'}"]))

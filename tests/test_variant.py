@@ -79,10 +79,10 @@ def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path
         '    print("at", cfg.name, cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
     )
     words = ["integration=modulator", "memory=framesamp"]
-    done = forked.script(app, *words, cwd=tmp_path)
+    done = forked.run(str(app), *words, cwd=tmp_path)
     assert done.stdout.startswith(f"at framesamp_modul framesamp_modul {tmp_path}/outputs/framesamp_modul/"), done
     words = ["--multirun", "integration=modulator", "memory=framesamp,tokendrop"]
-    done = forked.script(app, *words, cwd=tmp_path)
+    done = forked.run(str(app), *words, cwd=tmp_path)
     lines = [line.split() for line in done.stdout.splitlines() if line.startswith("at ")]
     assert [(line[1], Path(line[3]).name) for line in lines] == [
         ("framesamp_modul", "0_framesamp_modul"),

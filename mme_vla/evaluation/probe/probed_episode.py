@@ -88,7 +88,11 @@ class ProbedEpisode(Episode):
         self.inner.acted(chunk)
 
     def remember(
-        self, frames: np.ndarray, is_demo: bool | np.ndarray = False, actions: np.ndarray | None = None
+        self,
+        frames: np.ndarray,
+        is_demo: bool | np.ndarray = False,
+        actions: np.ndarray | None = None,
+        states: np.ndarray | None = None,
     ) -> None:
         """Not offered: an arm decides on whole observations."""
         raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
