@@ -242,7 +242,7 @@ def test_a_request_that_waited_does_not_go_on_with_an_episode_that_failed_meanwh
     async def meet():
         first = sessions.find(name, Reset())
         await first.turn.acquire()
-        waiting = asyncio.ensure_future(sessions.answer(name, AddBuffer([], 0), 0.0))
+        waiting = asyncio.ensure_future(sessions.answer(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0))
         await asyncio.sleep(0)
         assert first.requests == 1
         sessions.drop(name)  # as an error of the request before it does
