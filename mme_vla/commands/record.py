@@ -220,14 +220,14 @@ def run(cfg: "DictConfig") -> None:
         missing = wanted.missing(options)  # asked again: another process may have finished it meanwhile
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
-            begun, there = time.perf_counter(), len(list((work / "episodes").glob("*.json")))
+            begun, there = time.perf_counter(), {path.stem for path in (work / "episodes").glob("*.json")}
             done = record(jobs, work / "episodes", cfg.workers, previews)
             seconds = time.perf_counter() - begun
             wanted.write(missing, work / "episodes", options)
             steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
             print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
-            if new := len(done) - there:
-                print(_throughput(new, steps * new // len(done), seconds, cfg.workers))
+            if new := [d for job, d in zip(jobs, done, strict=True) if job.name not in there]:
+                print(_throughput(len(new), sum(d["stored"] for d in new), seconds, cfg.workers))
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
         wanted.tidy()
