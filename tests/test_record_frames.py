@@ -26,17 +26,23 @@ from mme_vla.errors import UserError
 POSES = [np.full(7, float(i), np.float32) for i in range(3)]
 
 
-def step(video: bool, waypoint: np.ndarray) -> RecordedStep:
-    return RecordedStep({}, {"waypoint_action": waypoint, "eef_action": POSES[2]}, {"is_video_demo": video})
+def step(video: bool, waypoint: np.ndarray, begins: bool = False, completed: bool = False) -> RecordedStep:
+    action = {"waypoint_action": waypoint, "eef_action": POSES[2], "choice_action": '{"choice": "B", "point": []}'}
+    return RecordedStep({}, action, {"is_video_demo": video, "is_subgoal_boundary": begins, "is_completed": completed})
 
 
-STEPS = [step(True, POSES[2])] * 20 + [step(False, POSES[0])] * 30 + [step(False, POSES[1])] * 10
+STEPS = [
+    *[step(True, POSES[2])] * 20,
+    *[step(False, POSES[0], begins=k in (0, 16)) for k in range(30)],
+    *[step(False, POSES[1], begins=k in (5, 8), completed=k >= 8) for k in range(10)],
+]
 
 
 @pytest.mark.parametrize(
     ("choice", "front", "wrist"),
     [
         (FrameChoice("decisions"), [20, 49], [20, 49]),
+        (FrameChoice("choices"), [20, 35, 54], [20, 35, 54]),
         (FrameChoice(16), [20, 36, 52], [20, 36, 52]),
         (FrameChoice(["0-2", 59, "70-80"]), [0, 1, 2, 59], [0, 1, 2, 59]),
         (

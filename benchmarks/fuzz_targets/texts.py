@@ -52,7 +52,7 @@ QUESTION = ("You plan.", [("user", ["What next?"])])
 
 def _api(folder: Path, answer: str) -> Api:
     api = Api(Settings(cache=str(folder / "answers"), requests_per_minute=None), Usage(), client=object())
-    api._once = lambda contents, config: Reply(answer, 12, 7)  # type: ignore[method-assign]
+    api._once = lambda connection, system, turns: Reply(answer, 12, 7)  # type: ignore[method-assign]
     return api
 
 

@@ -1,8 +1,10 @@
 """`python -m mme_vla.envs.record`: demonstrate episodes of the benchmark and keep them as a dataset."""
 
 import multiprocessing
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,6 +113,34 @@ def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | Non
     return [read_json(folder / f"{job.name}.json", "what is known of a recorded episode") for job in jobs]
 
 
+def _pool(workers: int) -> ProcessPoolExecutor:
+    begun = (settings(), _begin_worker, imported_plugins())
+    return ProcessPoolExecutor(workers, simulating_processes(), begin, begun)
+
+
+def report_coverage(tasks: str | Sequence[str], wanted: Wanted, file: Path, workers: int, split: str = "test") -> None:
+    """Say which goals of a split the recorded episodes lack, and write it as JSON.
+
+    Args:
+        wanted: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
+    """
+    from mme_vla.data.progress import progress
+    from mme_vla.envs.recording.coverage import compare, goal_of, goals_recorded, in_words
+
+    specs, goals = choose_episodes(tasks, None, split), []
+    with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
+        with signals_held():
+            run = map if workers == 1 else stack.enter_context(_pool(workers)).map
+            found = run(goal_of, specs)
+        for goal in found:
+            goals.append(goal)
+            advance(1)
+    official = [place for place in wanted.places if place != wanted.dataset]
+    coverage = compare(goals_recorded(wanted.dataset, official), zip(specs, goals, strict=True))
+    write_json(file, {task: found.to_dict() for task, found in coverage.items()}, indent=1)
+    print(f"{in_words(coverage, split)}\n{file}")
+
+
 def _begin_worker(plugins: Sequence[str]) -> None:
     """A worker process ends with the one that started it, and knows the same tasks."""
     end_with_parent()
@@ -123,8 +153,7 @@ def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path |
 
         yield from (record_episode(job, folder, previews) for job in jobs)
         return
-    begun = (settings(), _begin_worker, imported_plugins())
-    with ProcessPoolExecutor(workers, simulating_processes(), begin, begun) as pool:
+    with _pool(workers) as pool:
         with signals_held():  # the workers are started here, and inherit that
             futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
         try:
@@ -184,6 +213,9 @@ def run(cfg: "DictConfig") -> None:
     work = Path(cfg.output).with_name(Path(cfg.output).name + ".recording")
     if not wanted.missing(options) and not work.exists():
         print(f"{places}: {len(jobs)} episodes, all there already.")
+        if cfg.coverage is not None:
+            require_simulator()
+            report_coverage(named_tasks(cfg), wanted, Path(cfg.coverage), cfg.workers)
         return
     require_simulator()
     with FolderLock(work, "recording"):
@@ -191,14 +223,30 @@ def run(cfg: "DictConfig") -> None:
         missing = wanted.missing(options)  # asked again: another process may have finished it meanwhile
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
+            begun, there = time.perf_counter(), {path.stem for path in (work / "episodes").glob("*.json")}
             done = record(jobs, work / "episodes", cfg.workers, previews)
+            seconds = time.perf_counter() - begun
             wanted.write(missing, work / "episodes", options)
             steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
             print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
+            if new := [d for job, d in zip(jobs, done, strict=True) if job.name not in there]:
+                print(_throughput(len(new), sum(d["stored"] for d in new), seconds, cfg.workers))
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
         wanted.tidy()
         drop_plan(work)
+    if cfg.coverage is not None:
+        report_coverage(named_tasks(cfg), wanted, Path(cfg.coverage), cfg.workers)
+
+
+def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
+    """How fast it went, in words; of a recording that was continued, what was new in it."""
+    hours = max(seconds, 1e-9) / 3600
+    named = f"{workers} worker{'s'[: workers > 1]}"
+    return (
+        f"{episodes} episodes in {seconds:.0f} s with {named}: {episodes / hours:,.0f} episodes and "
+        f"{steps / hours:,.0f} steps an hour."
+    )
 
 
 def _claim(work: Path, jobs: Sequence[Job]) -> None:

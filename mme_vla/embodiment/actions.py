@@ -136,11 +136,7 @@ class ActionSpace:
         """
         if not self.choice:
             return goal
-        if not options:
-            raise UserError(
-                "This policy chooses among options, and the episode offers none: set episode.options. The "
-                "benchmark's are info['available_multi_choices'] of the action space multi_choice."
-            )
+        _require(options)
         return f"{goal.rstrip(' .')}. Options: {in_words(options)}"
 
     def decide(self, actions: "Tensor", options: Sequence[Option]) -> "Tensor":
@@ -151,9 +147,13 @@ class ActionSpace:
 
         Returns:
             [..., w], the point within the picture; `actions` themselves where nothing is chosen.
+
+        Raises:
+            UserError: the episode says nothing of its options.
         """
         if not self.choice:
             return actions
+        _require(options)
         out = actions.clone()
         offered = [self.choice[option.number] for option in options]
         best = actions[..., offered].argmax(-1, keepdim=True)
@@ -161,6 +161,14 @@ class ActionSpace:
         out[..., offered] = out[..., offered].scatter(-1, best, 1)
         out[..., list(self.point)] = out[..., list(self.point)].clamp(0, 1)
         return out
+
+
+def _require(options: Sequence[Option]) -> None:
+    if not options:
+        raise UserError(
+            "This policy chooses among options, and the episode offers none: set episode.options. The "
+            "benchmark's are info['available_multi_choices'] of the action space multi_choice."
+        )
 
 
 def _choices(found: Mapping[str, Any], where: str, width: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:

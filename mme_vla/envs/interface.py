@@ -5,7 +5,8 @@ or all frames of the motion in the action spaces that plan. Images appear only w
 """
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,10 @@ from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
+from mme_vla.envs.rewards import earned_by
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.saved_state import EpisodeState, play_again
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError
@@ -51,6 +54,11 @@ class _Run:
     """Frames handed out since the reset."""
     count: int = 0
     """Control steps that count towards the limit."""
+    earned: float = 0.0
+    """What the reward has given so far."""
+    options: dict[str, Any] = field(default_factory=dict)
+    actions: list[Any] = field(default_factory=list)
+    """Of the reset, and all since: what the episode can be played again from."""
     terminated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
     truncated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
 
@@ -68,13 +76,14 @@ class RoboMMEEnv(gymnasium.Env):
         max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
+        reward: `none`, as in the benchmark, `sparse` or `subtask` (`mme_vla.envs.rewards`).
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.
         drawing: which frames have pictures, from the next call on; None for all. The others' are None in the lists.
 
     Raises:
-        UserError: an unknown action space, or a limit that is no positive integer.
+        UserError: an unknown action space or reward, or a limit that is no positive integer.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -86,10 +95,11 @@ class RoboMMEEnv(gymnasium.Env):
         max_steps: int = 1300,
         include: Include | None = None,
         render: bool = True,
+        reward: str = "none",
     ) -> None:
         if isinstance(max_steps, bool) or not isinstance(max_steps, int) or max_steps < 1:
             raise UserError(f"max_steps is {max_steps!r}; expected a positive integer.")
-        self._space = action_space(action)
+        self._space, self._earned = action_space(action), earned_by(reward)
         self.include = include or Include()
         self.max_steps = max_steps
         self.on_frame: FrameHook | None = None
@@ -137,7 +147,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._muted = False
         self._episodes += 1
         control = Control(task, self._step_control, Demonstrator(task, self._step_control))
-        run = self._run = _Run(control, task.progress.shown, task.reset_action)
+        run = self._run = _Run(control, task.progress.shown, task.reset_action, options=options)
         self._grounding.clear()
         self._observer.start()
         for subtask in task.progress.subtasks:
@@ -154,7 +164,7 @@ class RoboMMEEnv(gymnasium.Env):
             action: as the action space describes it.
 
         Returns:
-            Observation lists, reward (always 0), terminated, truncated (0-d tensors) and the info of the last frame.
+            Observation lists, reward, terminated, truncated (0-d tensors) and the info of the last frame.
             After an exception `(None, 0.0, True, False, info)` with the status `error`; after failed inverse kinematics
             the observation is `{}`.
 
@@ -164,8 +174,10 @@ class RoboMMEEnv(gymnasium.Env):
         self._open_task()
         run = self._require_run()
         run.frames = []
+        run.actions.append(deepcopy(action))
         try:
             self._space.act(run.control, action)
+            reward = self._reward(run)
             if run.frames and run.terminated:
                 self._settle()
         except UnreachableError as error:
@@ -175,7 +187,31 @@ class RoboMMEEnv(gymnasium.Env):
             info = {"status": "error", "error_message": str(error), "exception_type": type(error).__name__}
             return None, 0.0, True, False, info
         observation = as_lists(run.frames, self._keys)
-        return observation, torch.zeros(()), run.terminated, run.truncated, dict(run.info)
+        return observation, reward, run.terminated, run.truncated, dict(run.info)
+
+    def save_state(self) -> EpisodeState:
+        """Where the running episode stands, for `restore_state`; it costs next to nothing.
+
+        Raises:
+            UserError: the environment is closed, or was never reset.
+        """
+        run = self._require_run()
+        return self.state_of(run.options, run.actions)
+
+    def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
+        """Go on from a saved state of the same episode, whichever environment it is of; as if nothing had been between.
+
+        The episode is played again, without pictures but of the present frame and where a text needs a pixel. Nothing
+        of it reaches `on_frame`.
+
+        Returns:
+            Observation lists and info, as the last `reset` or `step` before `save_state` returned them, pictures of the
+            newest frame alone.
+
+        Raises:
+            UserError: the state is of another scene, action space or limit, or the environment is closed.
+        """
+        return play_again(self, state)
 
     def render(self) -> np.ndarray | None:
         """The newest front picture [256, 256, 3]; None if it was not drawn, or before the first reset."""
@@ -257,6 +293,20 @@ class RoboMMEEnv(gymnasium.Env):
             self._open_task().step(self._require_run().last_action)
         finally:
             self._muted = False
+
+    # What it is made of ------------------------------------------------------------------------------------------
+
+    def state_of(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
+        """This environment's episode after these actions."""
+        task = self._open_task()
+        scene = type(task).__name__, task.seed, task.difficulty, task.recovery
+        return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
+
+    def _reward(self, run: _Run) -> torch.Tensor:
+        """What the present step adds to what the episode has earned."""
+        success = bool(run.info.get("success", False))
+        before, run.earned = run.earned, self._earned(self._open_task().progress, success)
+        return torch.tensor(run.earned - before)
 
     # What is handed out -------------------------------------------------------------------------------------------
 

@@ -29,6 +29,7 @@ def make_env(
     recovery: str | None = None,
     max_steps: int = 1300,
     render: bool = True,
+    reward: str = "none",
     env: str = "mme_vla",
     **include: bool,
 ) -> "RoboMMEEnv | OfficialEnv":
@@ -45,6 +46,8 @@ def make_env(
             (it changes the order of BinFill's colours); by default nothing, as in the official evaluation.
         max_steps: control steps until the status becomes `timeout`.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
+        reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
+            share for each sub-task of the execution as it is done, 1 in all.
         env: `mme_vla`, or `official` for the installed package `robomme`.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
@@ -60,13 +63,16 @@ def make_env(
     if env == "official":
         from mme_vla.envs.official import make_official_env
 
-        if seed is not None or recovery is not None or not render:
-            raise UserError('env="official" takes episodes of a split and renders: leave out seed, recovery, render.')
+        if seed is not None or recovery is not None or not render or reward != "none":
+            raise UserError(
+                'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, '
+                "render, reward."
+            )
         return make_official_env(task, split, episode, action_space, max_steps, include)
     if seed is None:
         spec = metadata.episode(task, split, episode)
         seed, difficulty = spec.seed, spec.difficulty
-    return _make_own(task, action_space, seed, difficulty, recovery, max_steps, render, include)
+    return _make_own(task, action_space, seed, difficulty, recovery, max_steps, render, reward, include)
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
@@ -144,6 +150,7 @@ def _make_own(
     recovery: str | None,
     max_steps: int,
     render: bool,
+    reward: str,
     options: dict[str, Any],
 ) -> "RoboMMEEnv":
     from mme_vla.envs.observations import Include
@@ -159,4 +166,4 @@ def _make_own(
     from mme_vla.envs.interface import RoboMMEEnv
 
     built = make_task(task, render=render, obs_mode=obs_mode, seed=seed, difficulty=difficulty, recovery=recovery)
-    return RoboMMEEnv(built, space, max_steps, include, render)
+    return RoboMMEEnv(built, space, max_steps, include, render, reward)

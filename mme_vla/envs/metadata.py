@@ -22,8 +22,11 @@ from mme_vla.registry import TASKS
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split."""
+MORE = "more"
+"""Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
+_MORE_COUNT = 900
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
-_FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000)}
+_FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000), MORE: (2_000_000, 100_000)}
 _CYCLE = ("easy", "easy", "medium", "hard")
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 _PACKAGE_FOLDER = Path("env_metadata")
@@ -57,7 +60,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`.
+        split: `train`, `val` or `test`; or `more`, 900 episodes a task that the benchmark does not have.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
 
@@ -66,10 +69,11 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     """
     if task not in TASK_NAMES and task not in TASKS:
         raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
-    if split not in SPLITS:
-        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), SPLITS)}")
-    if task not in TASK_NAMES:
-        return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(SPLITS[split])]
+    counts = {**SPLITS, MORE: _MORE_COUNT}
+    if split not in counts:
+        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), counts)}")
+    if task not in TASK_NAMES or split == MORE:
+        return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(counts[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
         return read_official(_file(Path(folder), task, split), task, split)

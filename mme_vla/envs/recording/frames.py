@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mme_vla.data.choice_rows import CHOICE_NUMBERS, find_choices, row_of
 from mme_vla.data.waypoints import find_motions, known_poses
-from mme_vla.embodiment.robomme import CAMERAS
+from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.episodes import spans
 from mme_vla.errors import UserError
@@ -17,8 +18,8 @@ if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.memory.base import Memory
 
-DECISIONS = "decisions"
-GRAMMAR = "decisions, a number n for every n-th frame of the execution, or numbers and ranges such as [0-9,40]"
+DECISIONS, CHOICES = "decisions", "choices"
+GRAMMAR = "decisions, choices, a number n for every n-th frame of the execution, or numbers and ranges such as [0-9,40]"
 MEMORY_CAMERA = "front"
 _SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of its tokens
 
@@ -28,8 +29,9 @@ class FrameChoice:
     """A list of frames that every demonstration is drawn at; all other steps have no pictures.
 
     at: the frames that both cameras show. `decisions`: the last frame before each planned motion of the execution,
-        where a waypoint policy acts; n: the execution's first frame and every n-th after it; or numbers and ranges,
-        counted from the episode's first stored frame.
+        where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
+        among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
+        episode's first stored frame.
     memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames.
 
     Raises:
@@ -42,14 +44,14 @@ class FrameChoice:
     def __post_init__(self) -> None:
         if isinstance(self.at, bool) or (isinstance(self.at, int) and self.at < 1):
             raise UserError(f"frames={self.at!r} is not understood; write all, {GRAMMAR}.")
-        if self.at != DECISIONS and not isinstance(self.at, int):
+        if self.at not in (DECISIONS, CHOICES) and not isinstance(self.at, int):
             spans(self.at, "frames", f"all, {GRAMMAR}")
         if self.memory is not None:
             _build(self.memory)
 
     def beforehand(self) -> Drawing | None:
         """What is drawn, where no demonstration has to be seen for it: numbers that no memory adds to; else None."""
-        if isinstance(self.at, int) or self.at == DECISIONS or self.memory is not None:
+        if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
             return None
         numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
         return Drawing(dict.fromkeys(CAMERAS, numbers), now=())
@@ -76,6 +78,14 @@ class FrameChoice:
             poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
             found: list[int] = find_motions(poses[video:], video).decisions.tolist()
             return found
+        if self.at == CHOICES:
+            rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
+            for k, step in enumerate(steps):
+                begins = step.info["is_subgoal_boundary"] and not step.info["is_completed"]
+                row = row_of(step.action["choice_action"]) if begins or k == video else None
+                rows[k] = 0 if row is None else row
+            chosen: list[int] = find_choices(rows[video:], video, range(len(LETTERS))).decisions.tolist()
+            return chosen
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
 
 

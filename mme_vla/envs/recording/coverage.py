@@ -1,0 +1,89 @@
+"""What demonstrations cover: which goals of another split, in words, occur among them and which never do."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import EpisodeSpec
+from mme_vla.files import read_json
+
+
+def goal_of(spec: EpisodeSpec) -> str:
+    """The goal of an episode as policies are told it; its scene is built for that, without pictures."""
+    env = make_task(spec.task, render=False, seed=spec.seed, difficulty=spec.difficulty)
+    try:
+        goal: str = env.goals()[0].lower()
+        return goal
+    finally:
+        env.close()
+
+
+def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, set[str]]:
+    """The goals of a recording, by task: out of its dataset, or of its official files where there is none."""
+    found: dict[str, set[str]] = {}
+    if dataset is not None:
+        from mme_vla.data.conversion import SIDE_FILE
+
+        for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")["episodes"]:
+            found.setdefault(episode["task"], set()).add(episode["goals"][0])
+        return found
+    from mme_vla.data.hdf5 import list_episodes, open_episode
+
+    for ref in list_episodes(official):
+        with open_episode(ref) as opened:
+            found.setdefault(ref.task, set()).add(opened.goals[0])
+    return found
+
+
+@dataclass
+class TaskCoverage:
+    """Of one task: how many goals and episodes there are, and the numbers of the episodes whose goal is missing."""
+
+    goals: int = 0
+    episodes: int = 0
+    missing: dict[str, list[int]] = field(default_factory=dict)
+
+    @property
+    def missing_episodes(self) -> int:
+        """How many episodes ask for what was never shown."""
+        return sum(map(len, self.missing.values()))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, fit for JSON."""
+        counts = {"goals": self.goals, "goals_covered": self.goals - len(self.missing), "episodes": self.episodes}
+        return {**counts, "episodes_covered": self.episodes - self.missing_episodes, "missing": self.missing}
+
+
+def compare(recorded: Mapping[str, set[str]], asked: Iterable[tuple[EpisodeSpec, str]]) -> dict[str, TaskCoverage]:
+    """Which of the goals that episodes ask for were recorded, by task.
+
+    Args:
+        recorded: goals by task. asked: episodes with their goals.
+    """
+    found: dict[str, TaskCoverage] = {}
+    seen: dict[str, set[str]] = {}
+    for spec, goal in asked:
+        task = found.setdefault(spec.task, TaskCoverage())
+        task.episodes += 1
+        if goal not in recorded.get(spec.task, set()):
+            task.missing.setdefault(goal, []).append(spec.episode)
+        if goal not in seen.setdefault(spec.task, set()):
+            seen[spec.task].add(goal)
+            task.goals += 1
+    return found
+
+
+def in_words(coverage: Mapping[str, TaskCoverage], split: str) -> str:
+    """A line a task, and the missing goals under it."""
+    lines = []
+    for name, task in coverage.items():
+        covered, episodes = task.goals - len(task.missing), task.episodes - task.missing_episodes
+        lines.append(f"{name}: {covered} of {task.goals} goals of {split!r}, {episodes} of {task.episodes} episodes")
+        lines += [f"  never shown: {goal} (episode {_few(numbers)})" for goal, numbers in task.missing.items()]
+    return "\n".join(lines)
+
+
+def _few(numbers: Sequence[int], most: int = 5) -> str:
+    return ", ".join(map(str, numbers[:most])) + (", …" if len(numbers) > most else "")
