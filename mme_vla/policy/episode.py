@@ -183,10 +183,11 @@ class Episode:
     ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            self._moved += self._motion(demo, executed, states)
+            moved = self._motion(demo, executed, states)
             wanted = self.history.wanted(len(demo), drawn)
             places = wanted if drawn is None else np.searchsorted(drawn, wanted)
             self.history.append(frames, self._policy.encode_frames(frames[places]), drawn, len(demo))
+            self._moved += moved
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().past_actions
