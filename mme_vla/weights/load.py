@@ -35,6 +35,9 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "memoryvla": memoryvla_adapter,
 }
 
+LEROBOT_MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")
+"""Switches of LeRobot's π0.5: attention across past frames inside the vision tower, and past states in the prefix."""
+
 # What a memory adds to π0.5, as our names and the released leaves tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
 _MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
@@ -68,6 +71,12 @@ def load_weights(
         raise UserError(
             f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
             "To begin training from it use start_from() (on the command line: init_from=…)."
+        )
+    if found.format == "lerobot" and (memories := [key for key in LEROBOT_MEMORIES if found.config.get(key)]):
+        raise UserError(
+            f"{source} was trained with LeRobot's own memory ({', '.join(memories)} in its config.json), which is not "
+            "built here: without it the same weights are another policy. To begin training from them use start_from() "
+            "(on the command line: init_from=…)."
         )
     stats, datasets = None, list(stats_files(found.folder))
     if policy.processor is not None and found.format != "lerobot" and len(datasets) < 2:
