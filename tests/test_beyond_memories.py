@@ -78,7 +78,7 @@ def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_
 def test_retrieval_looks_at_tokens_as_they_are_stored() -> None:
     """What a prompt does to tokens (`mark`) is not known when a dataset is read, so it must not decide."""
     policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2})
-    policy.backbone.mark = lambda tokens, prompt, mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
+    policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
     frames, seen = moving_frames(40), []
     select = policy.require_memory().select
     policy.require_memory().select = lambda *given: seen.append(select(*given)) or seen[-1]  # type: ignore[method-assign]

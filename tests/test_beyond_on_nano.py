@@ -2,9 +2,10 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
-from test_nano import SMALL, demonstration
+from test_nano import demonstration
 
 from mme_vla import UserError, build_policy
 from mme_vla.nano.learning import Decisions, statistics
@@ -19,14 +20,15 @@ LITTLE: dict[str, dict[str, Any]] = {
 
 
 def nano(model: str) -> MMEPolicy:
-    words: dict[str, Any] = {"backbone": {"name": "nano", **SMALL}, "policy": {"augment": False}}
-    memory = LITTLE[model.rsplit("_", 1)[0]]
-    return build_policy(model, embodiment="robomme_waypoint_front", memory=memory, **words)
+    words: dict[str, Any] = {"backbone": "nano", "embodiment": "robomme_waypoint_front", "policy": {"augment": False}}
+    return build_policy(model, memory=LITTLE[model.rsplit("_", 1)[0]], **words)
 
 
 @pytest.mark.parametrize("name", BEYOND_MEMORIES)
 def test_it_trains_for_twenty_steps_on_what_a_demonstration_shows(name: str) -> None:
-    policy, shown = nano(f"{name}_modul"), demonstration(tuple(range(156)))
+    policy = nano(f"{name}_modul")
+    decisions = np.array([66, 120, 155])
+    shown = demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
     policy.require_processor().stats = statistics([shown], policy)
     batch, generator, losses = Decisions.of(policy, [shown]).batch, torch.Generator().manual_seed(0), []
     draws = policy.loss_draws(len(batch.prompt), generator)

@@ -38,9 +38,9 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
 LEROBOT_MEMORIES = ("use_visual_memory", "use_proprioceptive_memory")
 """Switches of LeRobot's π0.5: attention across past frames inside the vision tower, and past states in the prefix."""
 
-# What a memory adds to π0.5, as our names and the released leaves tell.
+# What a memory adds to π0.5, as our names, the released leaves and LeRobot's own memory tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
-_MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)")
+_MEMORY_LEAF = re.compile(r"(^|/)mem_|_mem(/|$)|^proprio_history_proj\.")
 
 
 def load_weights(
