@@ -19,7 +19,7 @@ from mme_vla import build_policy
 from mme_vla.config.composition import compose
 from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.testing.small import ALL_MODELS, NEURAL, random_batch
+from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS, NEURAL, random_batch
 from mme_vla.types import Batch
 
 TERA, MIB = 1e12, 2**20
@@ -47,7 +47,7 @@ def count(models: list[str]) -> None:
             f"{found.chunk / TERA:.3f} T", f"{found.chunk / reference:.2f}x",
             f"{found.memory / TERA:.4f} T" if found.memory else "",
             "" if found.streamed is None else f"{found.streamed / TERA:.4f} T",
-            f"{found.frames / TERA:.3f} T" if model in NEURAL else "",
+            f"{found.frames / TERA:.3f} T" if model in (*NEURAL, *ALL_BEYOND) else "",
         ]  # fmt: skip
         print(f"| `{model}` | {' | '.join(cells)} |")
 
@@ -127,7 +127,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=4, help="of what is measured")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--models", nargs="+", default=ALL_MODELS, choices=ALL_MODELS, metavar="NAME")
+    parser.add_argument("--models", nargs="+", default=ALL_MODELS, choices=[*ALL_MODELS, *ALL_BEYOND], metavar="NAME")
     parser.add_argument("--child", help=argparse.SUPPRESS)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

@@ -78,7 +78,7 @@ def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_
 def test_retrieval_looks_at_tokens_as_they_are_stored() -> None:
     """What a prompt does to tokens (`mark`) is not known when a dataset is read, so it must not decide."""
     policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2})
-    policy.backbone.mark = lambda tokens, prompt, mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
+    policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
     frames, seen = moving_frames(40), []
     select = policy.require_memory().select
     policy.require_memory().select = lambda *given: seen.append(select(*given)) or seen[-1]  # type: ignore[method-assign]
@@ -217,6 +217,17 @@ def test_past_frames_without_states_are_refused() -> None:
     assert episode.history is not None and len(episode.history) == 3
 
 
+def test_frames_that_could_not_be_taken_leave_no_motion_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    episode, frames = mover().start_episode("press the button"), moving_frames(4)
+    both, states = {"front": frames, "wrist": frames}, np.arange(32, dtype=np.float32).reshape(4, 8) / 32
+    with monkeypatch.context() as patch:
+        patch.setattr(mover(), "encode_frames", lambda frames: torch.zeros(7, 1, 1))
+        with pytest.raises(ValueError, match="append"):
+            episode.observe(both, states)
+    episode.observe(both, states)
+    assert torch.allclose(episode.required_history().moved(np.arange(4))[:, :8], torch.from_numpy(states), atol=1e-6)
+
+
 # All of them
 
 SMALLER: dict[str, dict[str, Any]] = {
@@ -263,6 +274,16 @@ def test_memory_compiles_in_one_piece(policy: MMEPolicy) -> None:
     compiled = torch.compile(memory, fullgraph=True, backend="eager")
     with torch.no_grad():
         assert torch.allclose(compiled(batch.history).tokens, memory(batch.history).tokens, atol=1e-6)
+
+
+def test_in_bfloat16_it_computes_what_it_computes_in_float32(policy: MMEPolicy) -> None:
+    batch, draws = random_batch(policy, valid=64), policy.loss_draws(2, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        exact = float(policy(batch, draws)[0])
+        policy.compute_dtype = torch.bfloat16
+        rounded = float(policy(batch, draws)[0])
+        policy.compute_dtype = torch.float32
+    assert rounded != exact and abs(rounded - exact) < 0.02 * exact
 
 
 def test_at_its_own_size_a_memory_keeps_the_budget_of_512(policy: MMEPolicy) -> None:

@@ -96,7 +96,7 @@ class Moment(Memory):
         x = by_frame(self.encoder(history.features, history.positions, history.mask), patches)  # b t p d
         valid = by_frame(history.mask, patches)[..., 0]  # b t
         rows, frames = valid.shape
-        questions = self.questions.to(x.dtype).expand(rows * frames, -1, -1)
+        questions = self.questions.to(x.dtype).repeat(rows * frames, 1, 1)
         everything = torch.ones(rows * frames, self.moments, patches, dtype=torch.bool, device=x.device)
         tokens = self.ask(questions, x.flatten(0, 1), everything).unflatten(0, (rows, frames)).flatten(1, 2)
         seen = self._of_frames(valid)

@@ -170,9 +170,14 @@ def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
         return None
     taken = found.pictures[policy.embodiment.memory_camera]
     tokens = policy.encode_frames(np.stack(list(taken.values())))
-    return SparseHistory(
+    history = SparseHistory(
         policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start
     )  # fmt: skip
+    if policy.memory.reads_motion:  # an action is a motion of many frames here, so the states alone tell what was done
+        nothing = np.zeros((found.length, policy.embodiment.action.width), np.float32)
+        moved = policy.require_processor().motion(found.states[: found.length], nothing, np.zeros(found.length, bool))
+        history.motion = moved.__getitem__
+    return history
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:

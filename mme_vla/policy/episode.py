@@ -188,8 +188,9 @@ class Episode:
     ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            self._moved += self._motion(demo, executed, states)
+            moved = self._motion(demo, executed, states)
             self.history.take(frames, self._policy.encode_frames, drawn, len(demo))
+            self._moved += moved
             if not self._video_over:
                 self.history.exec_start = self.frames_seen + int(demo.sum())
         longest = self._policy.require_processor().past_actions

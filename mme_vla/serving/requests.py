@@ -34,12 +34,12 @@ class AddBuffer:
 
     frames: t pictures [H, W, 3] uint8 of the camera that feeds memory.
     exec_start: index of the episode's first execution frame; 0 where it is not said.
-    states: what the robot felt at these frames, [t, s].
+    states: what the robot felt at these frames, [t, s]; only a memory of its own motion needs them.
     """
 
     frames: Sequence[np.ndarray]
     exec_start: int
-    states: np.ndarray
+    states: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "memoryvla": memoryvla_adapter,
 }
 
-# What a memory adds to π0.5, as our names and the released leaves tell.
+# What a memory adds to π0.5, as our names, the released leaves and LeRobot's own memory tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
 _MEMORY_LEAF = re.compile(rf"(^|/)mem_|_mem(/|$)|^{HISTORY}\.")
 
