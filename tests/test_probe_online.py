@@ -55,7 +55,7 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(tmp_
     page = found.page.read_text()
     for words in ("Decay with distance", "In closed loop", "tiny · shuffle", "data:image/webp;base64,"):
         assert words in page
-    assert "<script" not in page and "src=\"http" not in page and "href=\"http" not in page
+    assert "<script" not in page and 'src="http' not in page and 'href="http' not in page
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.jsonl")}
     assert len(before) == 4
     again = probe_both(tmp_path)

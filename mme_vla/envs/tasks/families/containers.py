@@ -11,10 +11,17 @@ from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 
 
-def add_containers(env: Task, draws: Draws, count: int, avoid: Sequence[Avoid] = ()) -> list[Container]:
-    """Place containers in the middle of the table until there are `count` or one finds no place."""
-    containers: list[Container] = []
-    while len(containers) < count:
+def add_containers(
+    env: Task, draws: Draws, count: int, avoid: Sequence[Avoid] = (), there: list[Container] | None = None
+) -> list[Container]:
+    """Place containers in the middle of the table until there are `count` or one finds no place.
+
+    Args:
+        there: those that stand already, to which `count` more are added.
+    """
+    containers = [] if there is None else there
+    stop = len(containers) + count
+    while len(containers) < stop:
         place = draw_container(draws, Region((0, 0), 0.2), [*avoid, *containers], gap=2 * H)
         if place is None:
             break
