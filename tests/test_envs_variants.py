@@ -42,16 +42,15 @@ def test_at_zero_a_dial_changes_nothing_and_beyond_it_the_scene_stays(dial: str,
     for turned in (None, 0, 2):
         env = built(task, stress=None if turned is None else {dial: turned})
         wait(env, STEPS)
-        found[turned] = scene(env), len(env.progress.subtasks)
+        homes = {thing.name: np.concatenate([thing.initial_pose.p, thing.initial_pose.q]) for thing in env.things}
+        found[turned] = scene(env), homes, len(env.progress.subtasks)
         env.close()
-    (official, steps), (at_zero, _), (more, more_steps) = found.values()
+    (official, places, steps), (at_zero, _, _), (_, more, more_steps) = found.values()
     assert official.keys() == at_zero.keys()
     assert all(np.array_equal(official[name], at_zero[name]) for name in official)
-    if dial == "path":  # another path is drawn, over the same discs
-        return
-    assert [name for name in official if name != "texts" and not np.array_equal(official[name], more[name])] == []
+    assert [name for name in places if not np.array_equal(places[name], more[name])] == []
     if dial in ("containers", "distractors"):
-        assert len(more) == len(official) + 2
+        assert len(more) == len(places) + 2
     if dial == "count" and task != "StopCube":
         assert more_steps > steps
 
@@ -94,7 +93,7 @@ def test_in_a_twin_the_fact_is_in_view_and_nothing_else_is_changed(task: str) ->
     discs = [disc.position for disc in twin._cue_discs]
     assert len(discs) == len(twin.cues()) and not plain._cue_discs
     for disc, (thing, _) in zip(discs, twin.cues(), strict=True):
-        assert np.allclose(disc[:2], thing.position[:2], atol=1e-6) and 0 < disc[2] < 0.01
+        assert np.allclose(disc[:2], thing.position[:2], atol=1e-3) and 0 < disc[2] < 0.01
     assert discs or plain.goals()[0] != twin.goals()[0]
     plain.close()
     twin.close()
@@ -113,7 +112,7 @@ def test_an_environment_of_a_variant_is_made_by_its_split() -> None:
     ("task", "split", "words"),
     [
         ("PickXtimes", "stress", "say which dial is turned how far, as stress:count=2"),
-        ("PickXtimes", "stress:counts=2", "there is no dial 'counts'. Did you mean 'count'?"),
+        ("PickXtimes", "stress:counts=2", "there is no dial 'counts'. Did you mean 'count'"),
         ("PickXtimes", "stress:swaps=2", "PickXtimes has no dial 'swaps'; it has count"),
         ("BinFill", "twin", "BinFill has no twin"),
         ("BinFill", "tset", "Unknown split 'tset'. Did you mean 'test'?"),
