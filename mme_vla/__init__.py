@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mme_vla.envs.vector.pool import make_vec_env
     from mme_vla.errors import UserError
     from mme_vla.evaluation.from_python import evaluate
-    from mme_vla.evaluation.probe.from_python import probe
+    from mme_vla.evaluation.probe.calling import probe
     from mme_vla.integration.base import Integration
     from mme_vla.memory.base import Memory
     from mme_vla.memory.history import CachedHistory, History, OnlineHistory, StorageSpec
@@ -56,7 +56,7 @@ _HOME = {
     "make_env": "mme_vla.envs.make",
     "make_vec_env": "mme_vla.envs.vector.pool",
     "evaluate": "mme_vla.evaluation.from_python",
-    "probe": "mme_vla.evaluation.probe.from_python",
+    "probe": "mme_vla.evaluation.probe.calling",
     "load_weights": "mme_vla.weights.load",
     "register": "mme_vla.registry",
     "UserError": "mme_vla.errors",

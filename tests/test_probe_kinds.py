@@ -10,7 +10,7 @@ from rollout_stand_ins import quick_policy
 
 from mme_vla import build_policy
 from mme_vla.errors import UserError
-from mme_vla.evaluation.probe.arms import choose_arms, read_arm
+from mme_vla.evaluation.probe.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.evaluation.probe.channels import channel_of
 from mme_vla.evaluation.probe.feed import Feed
 from mme_vla.evaluation.probe.lending import Lenders
@@ -54,9 +54,9 @@ def chunks(policy: Any, word: str | None, step: int = 36) -> tuple[ProbedPolicy,
     """What a policy chooses under an arm at two moments of a made-up episode."""
     recordings = made_up(robot=policy.embodiment)
     own = recordings[0]
-    arm = read_arm(word) if word else read_arm("nodemo")
-    probe = ProbedPolicy(policy, *([arm, recordings[1:]] if word else []))
-    probe.lenders = Lenders(policy, probe.channel, recordings)
+    arm = read_arm(word) if word else UNPROBED
+    lenders = Lenders(policy, channel_of(policy), recordings) if word == "swap" else None
+    probe = ProbedPolicy(policy, arm, recordings[1:], lenders)
     probe.eval()
     episode = probe.start_episode(own.goal, 5)
     episode.recording = own

@@ -15,9 +15,9 @@ from mme_vla.evaluation.probe.findings import Findings
 from mme_vla.evaluation.probe.lines import LINES
 from mme_vla.evaluation.probe.offline import OfflineSettings
 from mme_vla.evaluation.probe.online import named
-from mme_vla.evaluation.probe.page import table_of
+from mme_vla.evaluation.probe.probe_page import table_of
 from mme_vla.evaluation.probe.probed import ProbedPolicy
-from mme_vla.evaluation.probe.run import Probe, Wanted, probed_folder, run_probe
+from mme_vla.evaluation.probe.probing import Probe, Wanted, probed_folder, run_probe
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
 

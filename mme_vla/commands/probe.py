@@ -32,7 +32,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
     from mme_vla.evaluation.probe.offline import OfflineSettings
-    from mme_vla.evaluation.probe.run import NO_DATA, Wanted, run_probe
+    from mme_vla.evaluation.probe.probing import NO_DATA, Wanted, run_probe
     from mme_vla.evaluation.rollout.evaluation import RunFacts, checkpoint_label, memory_budget
     from mme_vla.evaluation.rollout.plan import choose_episodes, choose_shard
     from mme_vla.evaluation.rollout.settings import RolloutSettings
@@ -95,8 +95,8 @@ def _chosen(recordings: "list[Recording]", which: Any) -> "list[Recording]":
 
 
 def _table(folders: Any) -> str:
-    from mme_vla.evaluation.probe.page import table_of
-    from mme_vla.evaluation.probe.run import probed_folder
+    from mme_vla.evaluation.probe.probe_page import table_of
+    from mme_vla.evaluation.probe.probing import probed_folder
 
     listed = [folders] if isinstance(folders, str) else list(folders)
     return table_of({folder: probed_folder(Path(folder)) for folder in listed})

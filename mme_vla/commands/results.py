@@ -6,6 +6,7 @@ RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or be
 import argparse
 import sys
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 
 from mme_vla.config.composition import print_user_errors
@@ -17,6 +18,7 @@ from mme_vla.evaluation.results.compare import Comparison, common_episodes, comp
 from mme_vla.evaluation.results.demo import demo_records
 from mme_vla.evaluation.results.process_scores import process_tables
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.stress import Curves, stress_curves, stress_figures, stress_table
 from mme_vla.evaluation.results.submission import read_runs, training_details
 from mme_vla.evaluation.results.tables import (
     Table,
@@ -70,6 +72,9 @@ def run(args: argparse.Namespace) -> None:
     if args.demo == bool(args.runs):
         raise UserError("Name files or folders of episode records, or --demo for made-up ones (not both).")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
+    if args.stress:
+        show_curves(stress_curves(records, args.confidence, args.conflicts), args)
+        return
     results = aggregate(records, protocol, args.split, args.conflicts)
     if any(record.extra.get("made_up") for record in records):
         results.notes.insert(0, "Made-up records, drawn from the paper's rates: not a result of anything.")
@@ -84,6 +89,23 @@ def run(args: argparse.Namespace) -> None:
         console.print(f"• {note}", markup=False, highlight=False, soft_wrap=True)
     for path in write(results, comparisons, args):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def show_curves(curves: Curves, args: argparse.Namespace) -> None:
+    """Print success over the dials, and write it where a file is named."""
+    from mme_vla.evaluation.results.report import document, html_table, section
+
+    table = stress_table(curves)
+    print_table(table, 200)
+    if args.markdown:
+        args.markdown.parent.mkdir(parents=True, exist_ok=True)
+        args.markdown.write_text(to_markdown(table), encoding="utf-8")
+    if args.html:
+        boxes = [section(name, drawn, "Episodes that every place of the dial has.") for name, drawn in
+                 stress_figures(curves).items()]  # fmt: skip
+        args.html.parent.mkdir(parents=True, exist_ok=True)
+        page = document(args.title, [f"<h1>{escape(args.title)}</h1>", *boxes, section(table.title, html_table(table))])
+        args.html.write_text(page, encoding="utf-8")
 
 
 def write(results: Results, comparisons: list[Comparison], args: argparse.Namespace) -> list[Path]:
@@ -147,6 +169,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--markdown", type=Path, help="tables in the leaderboard's format")
     parser.add_argument("--html", type=Path, help="one self-contained page with plots")
     parser.add_argument("--title", default="RoboMME results", help="of the page")
+    parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
     parser.add_argument("--brief", action="store_true", help="print the overview only")
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="what a whole run consists of (default: all 16)")
     parser.add_argument("--episodes", type=int, default=TEST_EPISODES, help="episodes of a task (default: %(default)s)")

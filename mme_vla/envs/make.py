@@ -37,7 +37,7 @@ def make_env(
 
     Args:
         task: one of the 16 task names, or a task of your own registered in `TASKS`.
-        split: `train`, `val` or `test`.
+        split: `train`, `val` or `test`; `twin` or `stress:<dial>=<n>` for variants of the latter.
         episode: which episode of the split.
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
@@ -69,10 +69,12 @@ def make_env(
                 "render, reward."
             )
         return make_official_env(task, split, episode, action_space, max_steps, include)
+    variant: dict[str, Any] = {}
     if seed is None:
         spec = metadata.episode(task, split, episode)
         seed, difficulty = spec.seed, spec.difficulty
-    return _make_own(task, action_space, seed, difficulty, recovery, max_steps, render, reward, include)
+    return _make_own(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
+                     recovery=recovery, **variant)  # fmt: skip
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
@@ -143,15 +145,7 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
 
 
 def _make_own(
-    task: str,
-    space: str,
-    seed: int,
-    difficulty: str | None,
-    recovery: str | None,
-    max_steps: int,
-    render: bool,
-    reward: str,
-    options: dict[str, Any],
+    task: str, space: str, max_steps: int, render: bool, reward: str, options: dict[str, Any], **scene: Any
 ) -> "RoboMMEEnv":
     from mme_vla.envs.observations import Include
 
@@ -165,5 +159,5 @@ def _make_own(
     require_simulator()
     from mme_vla.envs.interface import RoboMMEEnv
 
-    built = make_task(task, render=render, obs_mode=obs_mode, seed=seed, difficulty=difficulty, recovery=recovery)
+    built = make_task(task, render=render, obs_mode=obs_mode, **scene)
     return RoboMMEEnv(built, space, max_steps, include, render, reward)

@@ -8,7 +8,7 @@ or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`)
 
 import csv
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.variants import BASE, STRESS, TWIN, Variant, read_variant
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json
 from mme_vla.registry import TASKS
@@ -24,7 +25,7 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split."""
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
-_MORE_COUNT = 900
+_COUNTS = {**SPLITS, MORE: 900}
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000), MORE: (2_000_000, 100_000)}
 _CYCLE = ("easy", "easy", "medium", "hard")
@@ -60,7 +61,8 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`; or `more`, 900 episodes a task that the benchmark does not have.
+        split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`, 900
+            episodes a task that the benchmark does not have.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
 
@@ -69,11 +71,12 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     """
     if task not in TASK_NAMES and task not in TASKS:
         raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
-    counts = {**SPLITS, MORE: _MORE_COUNT}
-    if split not in counts:
-        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), counts)}")
+    variant = check_split(split)
+    if variant is not None:
+        variant.check(task)
+        return [replace(spec, split=split) for spec in episodes(task, BASE, folder)]
     if task not in TASK_NAMES or split == MORE:
-        return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(counts[split])]
+        return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:
         return read_official(_file(Path(folder), task, split), task, split)
@@ -81,6 +84,18 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     if installed is not None and _file(installed, task, split).is_file():
         return read_official(_file(installed, task, split), task, split)
     return list(_table(split)[task])
+
+
+def check_split(split: str) -> Variant | None:
+    """Make sure that a split exists; what it varies, where it is a variant of the test split.
+
+    Raises:
+        UserError: there is no such split.
+    """
+    variant = read_variant(split)
+    if variant is None and split not in _COUNTS:
+        raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), [*_COUNTS, TWIN, STRESS])}")
+    return variant
 
 
 def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:

@@ -4,14 +4,16 @@ A task says which objects there are (`plan`, `build`, `start_episode`), what hap
 `after_step`), and what is to be done (`subtasks`, `goals`, `choices`). Everything else is here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import torch
 
 from mme_vla.envs.choices import Choice
+from mme_vla.envs.scene.cues import build_cue, show_cue
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.stage import Stage
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError, did_you_mean
 
@@ -26,11 +28,13 @@ class Task(Stage):
         seed: fixes the scene and the script; the `seed` of `reset` has no effect.
         difficulty: `easy`, `medium` or `hard`; by default seed % 3 decides.
         recovery: `z` or `xy` draws the pick that a recovery demonstration fails once, and how.
+        stress: how far dials are turned (`variants.DIALS`); at 0 the scene is the benchmark's.
+        in_view: the fact that is to be remembered stays in view (`variants.TWINS`).
         second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
         robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's own words for `recovery`.
 
     Raises:
-        UserError: an unknown difficulty or recovery mode, or a negative seed.
+        UserError: an unknown difficulty or recovery mode, a negative seed, or a dial that the task does not have.
     """
 
     shared_draws: ClassVar[bool] = False
@@ -40,6 +44,9 @@ class Task(Stage):
     recovery_drawn_per_episode: ClassVar[bool] = False
     """The failed pick is drawn in every initialisation (there are two), not once after the scene."""
 
+    dials: ClassVar[frozenset[str]] = frozenset()
+    """Dials of `variants.DIALS` that the task heeds."""
+
     def __init__(
         self,
         *args: Any,
@@ -48,6 +55,8 @@ class Task(Stage):
         recovery: str | None = None,
         robomme_failure_recovery: bool = False,
         robomme_failure_recovery_mode: str | None = None,
+        stress: Mapping[str, int] | None = None,
+        in_view: bool = False,
         **kwargs: Any,
     ) -> None:
         if seed < 0:
@@ -60,6 +69,11 @@ class Task(Stage):
                 raise UserError(f"robomme_failure_recovery needs a robomme_failure_recovery_mode of {RECOVERY_MODES}.")
         if recovery is not None and recovery not in RECOVERY_MODES:
             raise UserError(f"Unknown recovery mode {recovery!r}. {did_you_mean(str(recovery), RECOVERY_MODES)}")
+        for dial, turned in (stress or {}).items():
+            if dial not in self.dials or turned < 0:
+                raise UserError(f"{type(self).__name__} cannot turn {dial!r} by {turned}: its dials are "
+                                f"{', '.join(sorted(self.dials)) or 'none'}, and turn up only.")  # fmt: skip
+        self._stress, self.in_view = dict(stress or {}), in_view
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
         self.recording = False
@@ -70,6 +84,10 @@ class Task(Stage):
         self.failed_pick: int | None = None
         """Index, among the picks of the execution, of the one that a recovery demonstration fails first."""
         super().__init__(*args, seed=seed, **kwargs)
+
+    def turned(self, dial: str) -> int:
+        """How far a dial is turned; 0 as in the benchmark."""
+        return self._stress.get(dial, 0)
 
     # What a task supplies -----------------------------------------------------------------------------------------
 
@@ -101,6 +119,10 @@ class Task(Stage):
     def after_step(self, k: int) -> None:
         """Scripted changes after a step's physics, evaluation and observation; `k` steps have been done."""
 
+    def cues(self) -> Sequence[tuple[Thing, str]]:
+        """With `in_view`: things that a disc of a colour lies under all the time, known once the scene is built."""
+        return ()
+
     def failure(self) -> bool:
         """What counts as failure at any time, whatever the sub-task."""
         return False
@@ -119,6 +141,8 @@ class Task(Stage):
             draws = Draws(self.seed)
         self.build(draws)
         self.draws, self._drawn = draws, draws.state()
+        colours = [colour for _, colour in self.cues()] if self.in_view else []
+        self._cue_discs = [build_cue(self, f"cue_{i}", colour) for i, colour in enumerate(colours)]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.tidy(env_idx)
@@ -132,6 +156,7 @@ class Task(Stage):
             if self.recovery and (attempt == 0 or self.recovery_drawn_per_episode):
                 self.failed_pick = self.draw_failed_pick(self.draws, sum(s.pick and not s.video for s in subtasks))
         self.progress = Progress(subtasks, self.latch_failure)
+        self._show_cues()
 
     def draw_failed_pick(self, draws: Draws, picks: int) -> int | None:
         """Which pick of the execution a recovery demonstration fails first; None where there is none to fail."""
@@ -151,6 +176,12 @@ class Task(Stage):
 
     def _before_control_step(self) -> None:
         self.before_physics(self.steps_done)
+        self._show_cues()
+
+    def _show_cues(self) -> None:
+        if self._cue_discs:
+            for disc, (thing, _) in zip(self._cue_discs, self.cues(), strict=True):
+                show_cue(disc, thing)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Move the pointer over the sub-tasks; success and failure, each bool [1]."""

@@ -6,6 +6,7 @@ from mme_vla.envs.scene.motions import Cover
 from mme_vla.envs.scene.objects import build_button
 from mme_vla.envs.scene.placement import draw_button
 from mme_vla.envs.scene.predicates import pressed
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -25,11 +26,17 @@ LETTERS = ("b", "c")
 class ButtonUnmask(Task):
     """Containers cover three cubes while the robot presses a button."""
 
+    dials = frozenset({"containers"})
+
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0), (0.1, 0.1))))
         self.containers = add_containers(self, draws, CONTAINERS[self.difficulty], [self.button])
         self.colours = [("red", "green", "blue")[i] for i in draws.permutation(3)]
         add_hidden_cubes(self, self.colours, self.containers)
+        add_containers(self, draws, self.turned("containers"), [self.button], self.containers)
+
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
 
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers)

@@ -85,6 +85,9 @@ class InsertPeg(Task):
                 return place
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(self.ends(getattr(self, "end", ENDS[0]))[0], "white")]
+
     def after_step(self, k: int) -> None:
         self.mark.update(k, touched=self._inserted(self.end, self.side))
         if self.reset_in_progress:
@@ -271,6 +274,9 @@ class InsertPeg(Task):
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then grasp the same"
+        if self.in_view:
+            side = "right" if self.side == 1 else "left"
+            return [f"grasp the marked end of the peg and insert it into the {side} side of the box"]
         return [
             f"{goal} end of the same peg you've picked before and insert it into the same side of the box",
             f"{goal} peg at the same end and insert it into the same side of the box as in the video",

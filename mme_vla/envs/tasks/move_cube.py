@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
+TOLD = {
+    "hook": "hook the cube with the peg",
+    "push": "push the cube with the closed gripper",
+    "grasp": "pick up the cube and place it",
+}
 PEG_LENGTH, PEG_RADIUS = 0.1, 0.01
 TARGET_RADIUS = 0.04
 CUBE_FROM_TARGET = 5 * H
@@ -34,6 +39,7 @@ class MoveCube(Task):
     """Hook it with a peg, push it with the closed gripper, or pick and place it; the difficulty changes nothing."""
 
     shared_draws = True
+    dials = frozenset({"delay"})
 
     def build(self, draws: Draws) -> None:
         for _ in range(2):
@@ -86,7 +92,7 @@ class MoveCube(Task):
                 thing.displace(pose)
 
     def subtasks(self) -> list[SubTask]:
-        steps = HOLD_STEPS[self.manner]
+        steps = HOLD_STEPS[self.manner] + self.turned("delay")
         between = [
             SubTask("static", StaticFor(self, steps), lambda demo: demo.hold(steps), video=True),
             SubTask(
@@ -212,4 +218,5 @@ class MoveCube(Task):
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then move the cube to the target in the same manner"
-        return [f"{goal} as before", f"{goal} shown in the video"]
+        told = f": {TOLD[self.manner]}" if self.in_view else ""
+        return [f"{goal} as before{told}", f"{goal} shown in the video{told}"]

@@ -39,6 +39,7 @@ class PatternLock(Task):
     """Rows of the grid run along x, columns along y."""
 
     stick = True
+    dials = frozenset({"path"})
 
     def build(self, draws: Draws) -> None:
         n = GRID[self.difficulty]
@@ -50,7 +51,7 @@ class PatternLock(Task):
         self._trace = Trace(self)
 
     def _draw_path(self, draws: Draws, n: int) -> list[int]:
-        low, high = PATH_LENGTH[self.difficulty]
+        low, high = (length + self.turned("path") for length in PATH_LENGTH[self.difficulty])
         for _ in range(TRIES):
             start, goal = draws.permutation(n * n)[:2]
             path = search(draws, n, start, goal, {start})
@@ -142,6 +143,9 @@ class PatternLock(Task):
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then use the stick attached to the robot to retrace the same pattern"
+        if self.in_view:
+            moves = [direction(b.position - a.position) for a, b in zip(self.path, self.path[1:], strict=False)]
+            goal = f"{goal}: {', then '.join(f'move {word}' for word in moves)}"
         return [goal, f"{goal} shown in the video"]
 
 

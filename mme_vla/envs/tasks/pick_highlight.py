@@ -7,6 +7,7 @@ from mme_vla.envs.scene.motions import Highlight
 from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_highlight
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -22,6 +23,7 @@ class PickHighlight(Task):
     """Success needs every highlighted cube to have been picked up once, in any order."""
 
     latch_failure = True
+    dials = frozenset({"distractors"})
 
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
@@ -34,6 +36,16 @@ class PickHighlight(Task):
             self.cubes.append(self.add(build_cube(self, f"cube_{i}", colour, *place)))
         self.goal_cubes = [self.cubes[i] for i in draws.permutation(len(self.cubes))[: GOALS[self.difficulty]]]
         self._discs = [build_highlight(self, f"highlight_{i}", 0.05, 0.001) for i in range(len(self.goal_cubes))]
+
+        for i in range(self.turned("distractors")):
+            colour = ("red", "blue", "green")[draws.integer(0, 3)]
+            place = draw_cube(draws, Region((-0.1, 0), 0.2), [self.button, *self.cubes], gap=2 * H)
+            if place is None:
+                raise SceneError(f"PickHighlight, seed {self.seed}: distractor {i} finds no place.")
+            self.cubes.append(self.add(build_cube(self, f"distractor_{i}", colour, *place)))
+
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(cube, "white") for cube in self.goal_cubes]
 
     def start_episode(self, draws: Draws) -> None:
         pairs = zip(self._discs, self.goal_cubes, strict=True)

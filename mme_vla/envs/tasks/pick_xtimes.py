@@ -22,10 +22,11 @@ class PickXtimes(Task):
     """One cube is picked up and placed on the target again and again, as often as the goal says."""
 
     latch_failure = True
+    dials = frozenset({"count"})
 
     def plan(self, draws: Draws) -> None:
         fewest, most = REPETITIONS[self.difficulty]
-        self.repetitions = draws.integer(fewest, most + 1)
+        self.repetitions = draws.integer(fewest, most + 1) + self.turned("count")
 
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0.0))))

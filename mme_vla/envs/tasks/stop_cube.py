@@ -35,6 +35,7 @@ class StopCube(Task):
     """The difficulty changes nothing."""
 
     latch_failure = True
+    dials = frozenset({"count"})
 
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))
@@ -47,7 +48,7 @@ class StopCube(Task):
         draws = Draws(self.seed)
         draws.integer(27, 33)
         self.interval = INTERVALS[draws.integer(0, 3)]
-        self.visit = draws.integer(2, 6)
+        self.visit = draws.integer(2, 6) + self.turned("count")
         angle = math.radians(draws.between(-30, 30))
         self._reach = REACH * np.array([-math.sin(angle), math.cos(angle)])
         self.stopped_at: int | None = None
@@ -55,9 +56,10 @@ class StopCube(Task):
 
     def _place(self, k: int) -> None:
         """Put the cube where it is after `k` steps."""
-        turn, steps = divmod(min(k, self.interval * PASSES), self.interval)
-        if turn == PASSES:
-            turn, steps = PASSES - 1, self.interval
+        passes = PASSES + self.turned("count")
+        turn, steps = divmod(min(k, self.interval * passes), self.interval)
+        if turn == passes:
+            turn, steps = passes - 1, self.interval
         side = 2 * smoothstep(steps / self.interval) - 1
         xy = self.target.position[:2] + self._reach * (side if turn % 2 == 0 else -side)
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))

@@ -48,10 +48,11 @@ class SwingXtimes(Task):
     """The cube goes right, then left, `repetitions` times."""
 
     latch_failure = True
+    dials = frozenset({"count"})
 
     def plan(self, draws: Draws) -> None:
         low, high = SWINGS[self.difficulty]
-        self.repetitions = draws.integer(low, high + 1)
+        self.repetitions = draws.integer(low, high + 1) + self.turned("count")
 
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0))))

@@ -10,6 +10,7 @@ from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
 from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -31,9 +32,10 @@ class VideoRepick(Task):
     shared_draws = True
     latch_failure = True
     recovery_drawn_per_episode = True
+    dials = frozenset({"count", "delay"})
 
     def plan(self, draws: Draws) -> None:
-        self.repetitions = draws.integer(1, 4)
+        self.repetitions = draws.integer(1, 4) + self.turned("count")
         low, high = SWAPS[self.difficulty]
         self.swap_count = draws.integer(low, high + 1)
 
@@ -72,6 +74,9 @@ class VideoRepick(Task):
         for swap in self.swaps:
             swap.apply(k)
 
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(self.cube, "white")]
+
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules belong to the stages."""
         self._swaps_due = self._swap_stage is not None and self.progress.current is self._swap_stage
@@ -107,7 +112,9 @@ class VideoRepick(Task):
             for _ in self.initiators
         ]
         self._swap_stage = swaps[0] if swaps else None
-        home = [SubTask("static", StaticFor(self, GO_HOME_STEPS), self._go_home, video=True)] if swaps else []
+        rest = GO_HOME_STEPS + self.turned("delay")
+        home = [SubTask("static", StaticFor(self, rest), lambda demo: self._go_home(demo, rest), video=True)]
+        home = home if swaps or self.turned("delay") else []
         back = SubTask(
             NO_RECORD,
             done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
@@ -117,9 +124,9 @@ class VideoRepick(Task):
         return [pick, drop, *home, *swaps, back]
 
     @staticmethod
-    def _go_home(demo: "Demonstrator") -> None:
+    def _go_home(demo: "Demonstrator", steps: int) -> None:
         demo.go_home()
-        demo.hold(GO_HOME_STEPS)
+        demo.hold(steps)
 
     def _execution(self) -> list[SubTask]:
         press = SubTask(

@@ -4,6 +4,7 @@ from mme_vla.envs.choices import Choice
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, Cover
 from mme_vla.envs.scene.predicates import StaticFor
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -23,10 +24,16 @@ PICKS = {"easy": 1, "medium": 1, "hard": 2}
 class VideoUnmask(Task):
     """Containers cover three cubes during the conditioning video."""
 
+    dials = frozenset({"containers", "delay"})
+
     def build(self, draws: Draws) -> None:
         self.containers = add_containers(self, draws, CONTAINERS[self.difficulty])
         self.colours = [("red", "green", "blue")[i] for i in draws.permutation(3)]
         add_hidden_cubes(self, self.colours, self.containers)
+        add_containers(self, draws, self.turned("containers"), [], self.containers)
+
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
 
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers)
@@ -35,10 +42,11 @@ class VideoUnmask(Task):
         self.cover.apply(k)
 
     def subtasks(self) -> list[SubTask]:
-        static = StaticFor(self, COVER_STEPS)
+        watched = COVER_STEPS + self.turned("delay")
+        static = StaticFor(self, watched)
         wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
         picks = container_picks(self, wanted, self.containers)
-        return [SubTask("static", static, lambda demo: demo.hold(COVER_STEPS), video=True), *picks]
+        return [SubTask("static", static, lambda demo: demo.hold(watched), video=True), *picks]
 
     def choices(self) -> list[Choice]:
         return container_choices(self.containers)

@@ -14,12 +14,15 @@ from mme_vla.envs.tasks.families.unmask_swap import CONTAINERS, UnmaskSwap
 class VideoUnmaskSwap(UnmaskSwap):
     """Covering and swapping take place in the conditioning video."""
 
+    dials = frozenset({"swaps", "delay"})
+
     def build(self, draws: Draws) -> None:
         self.build_containers(draws, rotated_anchors(draws, CONTAINERS[self.difficulty]))
 
     def subtasks(self) -> list[SubTask]:
-        static = StaticFor(self, self.swapped_after)
-        watch = SubTask("static", static, lambda demo: demo.hold(self.swapped_after), video=True)
+        watched = self.swapped_after + self.turned("delay")
+        static = StaticFor(self, watched)
+        watch = SubTask("static", static, lambda demo: demo.hold(watched), video=True)
         return [watch, *container_picks(self, self.wanted, self.containers)]
 
     def choices(self) -> list[Choice]:

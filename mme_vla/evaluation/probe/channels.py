@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.evaluation.probe.altered_history import Exchanged, OnlyFrames
 from mme_vla.evaluation.probe.remembered import Entry, Remembered
-from mme_vla.evaluation.probe.views import Exchanged, OnlyFrames
 from mme_vla.memory.bank import BankState
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import History

@@ -215,7 +215,7 @@ def default_output(facts: RunFacts) -> Path:
     model = safe_name(facts.model, "the policy's name")  # which a checkpoint may have brought
     name = model if facts.memory_budget is None else f"{model}-{facts.memory_budget}"
     run = f"seed{facts.model_seed}" + (f"-{facts.subgoal}" if facts.subgoal else "")
-    run += "" if facts.split == "test" else f"-{facts.split}"
+    run += "" if facts.split == "test" else f"-{re.sub('[:=]', '-', facts.split)}"
     return Path("outputs", "evaluation", name, str(facts.checkpoint), run)
 
 

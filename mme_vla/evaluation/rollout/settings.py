@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from mme_vla.config.sections import read_section
 from mme_vla.envs.make import ENVS
-from mme_vla.envs.metadata import SPLITS
+from mme_vla.envs.metadata import check_split
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.rollout.film import KEPT
 from mme_vla.evaluation.suites import MAX_STEPS
@@ -48,11 +48,13 @@ class RolloutSettings:
 
     def __post_init__(self) -> None:
         for name, value, known in (
-            ("split", self.split, SPLITS), ("env", self.env, ENVS), ("video", self.video, KEPT),
+            ("env", self.env, ENVS), ("video", self.video, KEPT),
             ("draw", self.draw, DRAWN),
         ):  # fmt: skip
             if value not in known:
                 raise UserError(f"{name}={value!r}. {did_you_mean(str(value), known)}")
+        if check_split(self.split) is not None and self.env == "official":
+            raise UserError(f"split={self.split} varies this library's scenes: leave out env=official.")
         least = {"max_steps": 1, "max_batch": 1, "encode_chunk": 1, "retries": 0}
         for name, smallest in least.items():
             self._whole(name, getattr(self, name), smallest)

@@ -10,12 +10,22 @@ from mme_vla.envs.scene.predicates import container_picked_up, container_put_dow
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 
+WIDER = 0.25  # half of the side of the square in which more containers than the benchmark's stand, metres
 
-def add_containers(env: Task, draws: Draws, count: int, avoid: Sequence[Avoid] = ()) -> list[Container]:
-    """Place containers in the middle of the table until there are `count` or one finds no place."""
-    containers: list[Container] = []
-    while len(containers) < count:
-        place = draw_container(draws, Region((0, 0), 0.2), [*avoid, *containers], gap=2 * H)
+
+def add_containers(
+    env: Task, draws: Draws, count: int, avoid: Sequence[Avoid] = (), there: list[Container] | None = None
+) -> list[Container]:
+    """Place containers in the middle of the table until there are `count` or one finds no place.
+
+    Args:
+        there: those that stand already, to which `count` more are added: closer together, and further out.
+    """
+    containers = [] if there is None else there
+    half, gap = (0.2, 2 * H) if there is None else (WIDER, H)
+    stop = len(containers) + count
+    while len(containers) < stop:
+        place = draw_container(draws, Region((0, 0), half), [*avoid, *containers], gap=gap)
         if place is None:
             break
         containers.append(env.add(build_container(env, f"container_{len(containers)}", *place)))

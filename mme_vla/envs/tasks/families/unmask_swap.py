@@ -7,6 +7,7 @@ from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
 from mme_vla.envs.scene.objects import Container, H, build_container
 from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_container
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.families.containers import add_hidden_cubes
 
@@ -17,6 +18,8 @@ PICKS = {"easy": (1, 2), "medium": (1, 1), "hard": (2, 2)}
 
 class UnmaskSwap(Task):
     """Where the containers stand, and what comes before the picks, is for the task to say."""
+
+    dials = frozenset({"swaps"})
 
     def plan(self, draws: Draws) -> None:
         self.swap_count, self.pick_count = (
@@ -43,6 +46,12 @@ class UnmaskSwap(Task):
         others = [i for i in range(len(anchors)) if i not in initiators]
         initiators.append(others[draws.integer(0, len(others))])
         self.initiators = [self.containers[i] for i in initiators[: self.swap_count]]
+        for _ in range(self.turned("swaps")):
+            self.initiators.append(self.containers[draws.integer(0, len(anchors))])
+        self.swap_count = len(self.initiators)
+
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(container, colour) for colour, container in zip(self.colours, self.over_cubes, strict=True)]
 
     @property
     def swapped_after(self) -> int:

@@ -19,6 +19,7 @@ from mme_vla.envs.scene.predicates import (
     pressed,
     reset_reached,
 )
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.task import Task
 
@@ -36,6 +37,7 @@ SWAP_LANE = 0.1
 class VideoPlace(Task):
     """The cube visits targets, then a spot of the table; in hard episodes two targets then change places."""
 
+    dials = frozenset({"delay"})
     spot_radius: ClassVar[float]
     """How far the spot where the video puts the cube at its end stays from the edge of its region."""
     target_counts: ClassVar[dict[str, int]]
@@ -94,12 +96,16 @@ class VideoPlace(Task):
         if self._swap is not None:
             self._swap.apply(k)
 
+    def cues(self) -> list[tuple[Thing, str]]:
+        return [(self.goal_target, "white")]
+
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong to the stages."""
         self._swap_due = bool(self._swapped) and self.progress.current is self._swap_stage
         return False
 
     def subtasks(self) -> list[SubTask]:
+        rest = GO_HOME_STEPS + self.turned("delay")
         self._swap_stage = SubTask(
             "static", StaticFor(self, SWAP_STAGE_STEPS), lambda demo: demo.hold(SWAP_STAGE_STEPS), video=True
         )
@@ -111,7 +117,7 @@ class VideoPlace(Task):
                 run=lambda demo: demo.place_on(self.spot, TABLE_Z),
                 video=True,
             ),
-            SubTask("static", StaticFor(self, GO_HOME_STEPS), self._go_home, video=True),
+            SubTask("static", StaticFor(self, rest), lambda demo: self._go_home(demo, rest), video=True),
             self._swap_stage,
             SubTask(
                 NO_RECORD,
@@ -123,9 +129,9 @@ class VideoPlace(Task):
         return [*self.visits(), *after, *self._execution()]
 
     @staticmethod
-    def _go_home(demo: "Demonstrator") -> None:
+    def _go_home(demo: "Demonstrator", steps: int) -> None:
         demo.go_home()
-        demo.hold(GO_HOME_STEPS)
+        demo.hold(steps)
 
     def show_pick(self) -> SubTask:
         """The video's picking up of the cube."""

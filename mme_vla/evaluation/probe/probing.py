@@ -16,7 +16,7 @@ from mme_vla.evaluation.probe.channels import channel_of
 from mme_vla.evaluation.probe.findings import Findings
 from mme_vla.evaluation.probe.offline import OfflineSettings, probe_offline
 from mme_vla.evaluation.probe.online import online_records, paired, probe_online
-from mme_vla.evaluation.probe.page import write_page, write_pictures
+from mme_vla.evaluation.probe.probe_page import write_page, write_pictures
 from mme_vla.evaluation.probe.recordings import Recording, check_robot
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.rollout.plan import Shard

@@ -10,8 +10,8 @@ from mme_vla.envs.make import make_env, require_simulator
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.from_python import load
 from mme_vla.evaluation.probe.offline import OfflineSettings
+from mme_vla.evaluation.probe.probing import NO_DATA, Probe, Wanted, run_probe
 from mme_vla.evaluation.probe.recordings import all_recordings
-from mme_vla.evaluation.probe.run import NO_DATA, Probe, Wanted, run_probe
 from mme_vla.evaluation.rollout.evaluation import checkpoint_label, memory_budget
 from mme_vla.evaluation.rollout.plan import choose_episodes
 from mme_vla.evaluation.rollout.runner import RunFacts

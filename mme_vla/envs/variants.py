@@ -1,0 +1,92 @@
+"""Splits that are the test split's scenes turned a little: harder by a dial, or with what is to be remembered in view.
+
+`stress:count=2` is every test episode with two repetitions more, `stress:count=0` the test episodes themselves; `twin`
+is every test episode with the needed fact in view, so that failures of memory and of control can be told apart.
+Importing this needs no simulator.
+"""
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.errors import UserError, did_you_mean
+
+BASE = "test"
+TWIN, STRESS = "twin", "stress"
+DIALS: dict[str, tuple[str, ...]] = {
+    "count": ("PickXtimes", "SwingXtimes", "StopCube", "VideoRepick"),
+    "containers": ("VideoUnmask", "ButtonUnmask"),
+    "swaps": ("VideoUnmaskSwap", "ButtonUnmaskSwap"),
+    "delay": ("VideoUnmask", "VideoUnmaskSwap", "VideoPlaceButton", "VideoPlaceOrder", "VideoRepick", "MoveCube"),
+    "path": ("PatternLock",),
+    "distractors": ("PickHighlight",),
+}
+"""Dial → the tasks that have it.
+
+count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps more between
+what is shown and the execution. path: discs more on the way. distractors: more objects that are not asked for.
+"""
+TWINS = (
+    "VideoUnmask", "ButtonUnmask", "VideoUnmaskSwap", "ButtonUnmaskSwap", "PickHighlight", "VideoRepick",
+    "VideoPlaceButton", "VideoPlaceOrder", "MoveCube", "InsertPeg", "PatternLock",
+)  # fmt: skip
+"""Tasks of which there is a twin. Of VideoRepick the cube is in view, and how often it was picked up is not.
+
+Of the others none would be honest: BinFill, PickXtimes, SwingXtimes and StopCube ask for a count that only the past
+holds, and RouteStick's way comes over the same places again, so that words do not say where on it one is.
+"""
+_STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
+
+
+@dataclass(frozen=True)
+class Variant:
+    """How the scenes of a split differ from the test split's. dial, turned: of a stress split."""
+
+    twin: bool = False
+    dial: str = ""
+    turned: int = 0
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """What a task is built with."""
+        if self.twin:
+            return {"in_view": True}
+        return {"stress": {self.dial: self.turned}} if self.turned else {}
+
+    def check(self, task: str) -> None:
+        """Make sure that a task of the benchmark can be varied so.
+
+        Raises:
+            UserError: it has no twin, or not this dial.
+        """
+        if task not in TASK_NAMES:
+            raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
+        if self.twin and task not in TWINS:
+            raise UserError(f"{task} has no twin with the needed fact in view; these have: {', '.join(TWINS)}.")
+        if self.dial and task not in DIALS[self.dial]:
+            own = [dial for dial, tasks in DIALS.items() if task in tasks]
+            raise UserError(
+                f"{task} has no dial {self.dial!r}; it has {', '.join(own) or 'none'}. {self.dial} is for "
+                f"{', '.join(DIALS[self.dial])}."
+            )
+
+
+def read_variant(split: str) -> Variant | None:
+    """What a split varies; None for one that varies nothing, or is none.
+
+    Raises:
+        UserError: a stress split without a dial and how far it is turned, or with an unknown one.
+    """
+    if split == TWIN:
+        return Variant(twin=True)
+    if not str(split).startswith(STRESS):
+        return None
+    found = _STRESS.fullmatch(split)
+    if found is None:
+        raise UserError(
+            f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(DIALS)}."
+        )
+    if found[1] not in DIALS:
+        raise UserError(f"split={split!r}: there is no dial {found[1]!r}. {did_you_mean(found[1], DIALS)}")
+    return Variant(dial=found[1], turned=int(found[2]))
