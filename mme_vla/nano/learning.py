@@ -82,7 +82,7 @@ class Decisions(Dataset[int]):
         found = load_file(path)
         far = found.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
-        now = {name: value for name, value in found.items() if not name.startswith(_PAST)}
+        now: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(_PAST)}
         return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often)
 
     def save(self, path: Path) -> None:
