@@ -69,8 +69,8 @@ def make_side_file(recordings: Path, dataset: Path, output: Path, monkeypatch: p
     return output
 
 
-def test_films_in_av1_without_flags_are_read_with_a_side_file_and_warned_of(
-    tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_films_in_av1_without_flags_are_read_with_a_side_file(
+    tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = publish(tmp_path / "av1", recordings, "video", {}, order=(2, 0, 1))
     with pytest.raises(UserError, match="does not mark its conditioning videos"):
@@ -81,15 +81,22 @@ def test_films_in_av1_without_flags_are_read_with_a_side_file_and_warned_of(
     assert source.exec_starts.tolist() == [2, 4, 0] and source.fps == 10
     assert source.frames(0, [0, 8]).shape == (2, 64, 64, 3)
     assert set(source.lossy) == {"front", "wrist"} and source.lossy["front"].startswith("av1")
-    monkeypatch.setattr(logging.getLogger("mme_vla"), "propagate", True)  # commands give it a handler of its own
+    with pytest.raises(SystemExit):
+        make_side_file(recordings, root, starts, monkeypatch)
+
+
+def test_a_memory_that_scores_patches_is_warned_of_lossy_films(
+    tmp_path: Path, recordings: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    root = publish(tmp_path / "av1", recordings, "video", {}, order=(1,))
+    (tmp_path / "starts.json").write_text('{"0": 0}')
+    source = EpisodeSource(root, exec_starts=tmp_path / "starts.json")
     for model, warned in (("tokendrop_modul", True), ("framesamp_modul", False)):
         caplog.clear()
         policy = small_policy(model)
         with caplog.at_level(logging.WARNING):
             ensure_cache(source, policy.require_memory(), policy.encode_frames, "x", root=tmp_path / "cache")
         assert ("passes for motion" in caplog.text) == warned
-    with pytest.raises(SystemExit):
-        make_side_file(recordings, root, starts, monkeypatch)
 
 
 def test_pictures_inside_the_tables_are_read_as_they_are(tmp_path: Path, recordings: Path) -> None:
