@@ -55,6 +55,7 @@ SUFFICE = [
     Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
     Case((), f"mme_vla.data.cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
     Case((), "mme_vla.data.convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
+    Case((), "mme_vla.data.exec_starts input=record_dataset_Alpha.h5 output=starts.json", "2 episodes"),
     Case((), f"mme_vla.weights.convert {STEP} lerobot --to lerobot", ""),
     Case((), "mme_vla.subgoal.build input=sample output=rows sets=[simple]", "simple"),
     Case((), "mme_vla.results --demo --brief", "Made-up records"),

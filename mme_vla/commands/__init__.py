@@ -15,6 +15,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "harness": ("harness", "put a policy behind AI2's vla-evaluation-harness"),
     "play": ("play", "play the tasks yourself, or let a model play"),
     "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
+    "exec-starts": ("exec_starts", "where the conditioning videos of a dataset end, for one that does not say"),
     "cache": ("cache", "the vision tokens of a dataset, computed once"),
     "nano": ("nano", "from nothing to a page of results on one task, on two cores"),
     "vision-pretrain": ("vision_pretrain", "the vision tower of the nano backbone, from renders of the tasks"),

@@ -7,8 +7,6 @@ def main() -> None:
     Raises:
         UserError: the extra `harness` is not installed, or a checkpoint that cannot be served.
     """
-    from vla_eval.model_servers.serve import run_server
-
-    from mme_vla.serving.harness import MMEVLAModelServer
+    from mme_vla.serving.harness import MMEVLAModelServer, run_server
 
     run_server(MMEVLAModelServer)

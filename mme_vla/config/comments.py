@@ -12,6 +12,7 @@ COMMANDS = {
     "train": "python -m mme_vla.train",
     "policy": "build_policy(…)",
     "convert": "python -m mme_vla.data.convert",
+    "exec_starts": "python -m mme_vla.data.exec_starts",
     "cache": "python -m mme_vla.data.cache",
     "inspect": "python -m mme_vla.inspect",
     "serve": "python -m mme_vla.serve",

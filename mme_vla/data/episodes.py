@@ -19,6 +19,7 @@ from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
     content_fingerprint,
+    lossy_coding,
     read_exec_starts,
     read_info,
     resolve_root,
@@ -82,6 +83,8 @@ class EpisodeSource:
         self._motions: dict[int, Motions] = {}
         videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
         self.video_cameras = tuple(videos)
+        self.lossy = {name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))}
+        """Of cameras whose films lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
         self._check_tables()
         episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))

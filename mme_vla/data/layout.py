@@ -58,6 +58,19 @@ def read_info(root: Path) -> dict[str, Any]:
     return {**info, "features": {name: {**f, "shape": tuple(f["shape"])} for name, f in features.items()}}
 
 
+def lossy_coding(feature: dict[str, Any]) -> str | None:
+    """How a film was coded if something was lost by it, such as `av1 at crf 30`; None where not, or where nothing says.
+
+    LeRobot writes what is known under `info`; its default before it wrote the quality was AV1 at crf 30.
+    """
+    about = feature.get("info")
+    about = about if isinstance(about, dict) else {}
+    codec, crf = about.get("video.codec"), about.get("video.crf")
+    if not isinstance(codec, str) or crf == 0 or (crf is None and codec != "av1"):
+        return None
+    return brief(codec, quote=False) + ("" if crf is None else f" at crf {brief(crf)}")
+
+
 def _is_feature(feature: object) -> bool:
     if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
         return False

@@ -11,7 +11,8 @@ CARD_FILE = "README.md"
 def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     """Write a card from a policy's configuration.
 
-    Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is absent is said to be.
+    Its section `card` may hold `data` (words), `recipe` and `results` (name → value); what is absent is said to be. For
+    the hub's front matter also `license`, `base_model` and `datasets` (ids on the hub).
     """
     name, known = str(config.get("name", "policy")), config.get("card") or {}
     backbone = config.get("backbone") or {}
@@ -26,8 +27,7 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     if config.get("adapters"):
         rows["adapters"] = f"LoRA, rank {config['adapters'].get('rank')}, not merged"
     return "\n".join([
-        "---", "library_name: mme-vla", "pipeline_tag: robotics", "tags:", "- robotics",
-        "- vision-language-action", "- memory", f"- {name}", "---", "",
+        "---", front_matter(name, known), "---", "",
         f"# {name}", "",
         f"A {type(policy).__name__} of the MME-VLA library"
         + (" with a memory of the episode." if config.get("memory") else " without memory."), "",
@@ -41,6 +41,37 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
         "## Recipe", "", *(_table(known["recipe"]) if known.get("recipe") else ["Not recorded."]), "",
         "## Results", "", *(_table(known["results"]) if known.get("results") else ["Not recorded."]), "",
     ])  # fmt: skip
+
+
+def front_matter(name: str, known: Mapping[str, Any]) -> str:
+    """What the hub reads of a card, as YAML: written by its own library, so that `no` or `2026-11-21` stay names.
+
+    Numbers among the results, such as success rates, become its model index.
+    """
+    from huggingface_hub import EvalResult, ModelCardData
+
+    numbers = {
+        str(key): float(value)
+        for key, value in (known.get("results") or {}).items()
+        if isinstance(value, int | float) and not isinstance(value, bool)
+    }
+    results = [
+        EvalResult(
+            task_type="robotics", dataset_type="robomme", dataset_name="RoboMME", metric_type=key, metric_value=value
+        )
+        for key, value in numbers.items()
+    ]
+    data = ModelCardData(
+        library_name="mme-vla",
+        pipeline_tag="robotics",
+        tags=["robotics", "vision-language-action", "memory", name],
+        license=known.get("license"),
+        base_model=known.get("base_model"),
+        datasets=known.get("datasets"),
+        model_name=name if results else None,
+        eval_results=results or None,
+    )
+    return data.to_yaml().strip()
 
 
 def _part(section: Mapping[str, Any] | None) -> str:

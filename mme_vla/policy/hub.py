@@ -8,6 +8,8 @@ from mme_vla.errors import UserError
 from mme_vla.policy.run_folders import newest_checkpoint
 
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_PLACE = re.compile(rf"({_REPOSITORY.pattern})((?:/[\w-][\w. -]*)*)")
+"""A repository, and a folder or file in it."""
 
 
 def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
@@ -16,7 +18,7 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
     A folder of a training run stands for its newest checkpoint, and `latest` for the newest run beside it.
 
     Args:
-        source: a path, or `owner/name` of a hub repository.
+        source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no other is fetched.
         revision: branch, tag or commit of the repository; its main branch by default.
         token: for private repositories; the one stored by `hf auth login` by default.
 
@@ -24,7 +26,8 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
         UserError: neither a path nor a repository that can be reached.
     """
     path = newest_checkpoint(Path(source).expanduser())
-    if path.exists() or not _REPOSITORY.fullmatch(str(source)):
+    place = _PLACE.fullmatch(str(source))
+    if path.exists() or place is None:
         if revision is not None:
             raise UserError(f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
         return path
@@ -32,8 +35,15 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
     from huggingface_hub import snapshot_download
     from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
 
+    repository, within = place[1], place[2].strip("/")
     try:
-        return Path(snapshot_download(str(source), revision=revision, token=token))
+        if not within:
+            return Path(snapshot_download(repository, revision=revision, token=token))
+        wanted = [within, f"{within}/*"]
+        root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=wanted))
+        if not (root / within).exists():
+            raise UserError(f"The hub repository {repository} has no {within!r}: nothing of that name was in it.")
+        return root / within
     except (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
         at = "" if revision is None else f" at revision {revision!r}"
         reason = str(error).strip().splitlines()

@@ -60,7 +60,8 @@ class Saved(nn.Module):
 
         Args:
             dtype: what the weights are stored in: `float32`, or `bfloat16` at half the size and eight bits of mantissa.
-            card: facts for the model card, kept in the configuration: `data` (words), `recipe`, `results` (tables).
+            card: facts for the model card, kept in the configuration: `data` (words), `recipe`, `results` (tables),
+                `license`, `base_model`, `datasets` (ids on the hub).
 
         Raises:
             UserError: an unknown dtype.

@@ -20,6 +20,7 @@ from mme_vla.serving.settings import ServeSettings
 try:
     from vla_eval.model_servers.base import SessionContext
     from vla_eval.model_servers.predict import PredictModelServer
+    from vla_eval.model_servers.serve import run_server as run_server
     from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW, DimSpec
 except ImportError as error:
     raise missing_extra("A model server of vla-evaluation-harness", "harness") from error

@@ -96,8 +96,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     if source.format == "lerobot":
         check_window(source.config, str(source.folder))
     adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
-    tensors = source.tensors(lambda found: adapter.check_fit(found, state, str(source.folder)))
-    return adapter.translate(tensors, state, str(source.folder))
+    tensors = source.tensors(lambda found: adapter.check_fit(found, state, source.shown))
+    return adapter.translate(tensors, state, source.shown)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,9 @@ The arrays lie in one OCDBT store or, in the plain layout, in a folder each. Lay
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +21,37 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, missing_extra
-from mme_vla.files import inside, read_text, require_file
+from mme_vla.files import decoding, inside, read_text, require_file
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
-_ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
+ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}
+VARIANT_FILE = "history_config.txt"
 _SMALL_PIECE = 2**20  # numbers
 _DICT_KEY = 2  # Orbax's number for "this step of the path is a dictionary's key"
+
+
+@dataclass(frozen=True)
+class Zipped:
+    """Arrays inside a zip archive: `place` is their folder in it, with a slash at its end, `names` what lies there."""
+
+    file: Path
+    place: str
+    names: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.file} ({self.place or 'at its top'})"
+
+    def check(self) -> None:
+        """Compare what lies there with the archive's checksums, which tensorstore does not ask for.
+
+        Raises:
+            UserError: a piece is damaged.
+        """
+        with decoding(self.file, "a zip archive", "Download or copy it again."), zipfile.ZipFile(self.file) as opened:
+            for name in self.names:
+                with opened.open(self.place + name) as piece:
+                    while piece.read(2**22):
+                        pass
 
 
 def find_params(folder: Path) -> Path | None:
@@ -37,33 +64,32 @@ def find_params(folder: Path) -> Path | None:
     return max(steps, key=lambda path: int(path.name)) / "params" if steps else None
 
 
-def variant_of(params: Path) -> str | None:
-    """What `history_config.txt` says beside a released run's steps, such as `perceptual-framesamp-modul`."""
-    for folder in (params.parent, params.parent.parent):
-        note = folder / "history_config.txt"
+def variant_of(folders: Sequence[Path]) -> str | None:
+    """What `history_config.txt` says in the first of these that has one, such as `perceptual-framesamp-modul`."""
+    for folder in folders:
+        note = folder / VARIANT_FILE
         if note.is_file():
             said = read_text(inside(folder, note.name), "the name of a variant", limit=4096)
             return Path(said.strip()).name.removesuffix(".yaml")
     return None
 
 
-def read_orbax(params: Path, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
+def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
     """Read all arrays of a checkpoint, named by their path without the leading `params/` and the trailing `/value`.
 
     Args:
-        params: the arrays' folder.
+        params: the arrays' folder, or where they are in an archive.
         fits: called with tensors of the arrays' names and shapes on meta, before memory is taken for any.
 
     Raises:
         UserError: tensorstore is not installed, or the store is incomplete or damaged, or leads out of its folder.
     """
     ts = _tensorstore()
-    for place in params.rglob("*"):
-        if place.is_symlink():
-            inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
-        if not place.is_dir():  # tensorstore would wait for a pipe without end
-            require_file(place, "a part of an Orbax checkpoint")
-    ocdbt = (params / MANIFEST).is_file()
+    if isinstance(params, Zipped):
+        params.check()
+    else:
+        _check_files(params)
+    ocdbt = (params / MANIFEST).is_file() if isinstance(params, Path) else MANIFEST in params.names
     try:
         arrays = _list_arrays(ts, params, ocdbt)
         pending = {
@@ -91,7 +117,15 @@ def read_orbax(params: Path, fits: Callable[[Mapping[str, Tensor]], None] | None
     return tree
 
 
-def _check_chunks(stores: Mapping[str, Any], params: Path) -> None:
+def _check_files(params: Path) -> None:
+    for place in params.rglob("*"):
+        if place.is_symlink():
+            inside(params, place.relative_to(params).as_posix(), "part of the checkpoint")
+        if not place.is_dir():  # tensorstore would wait for a pipe without end
+            require_file(place, "a part of an Orbax checkpoint")
+
+
+def _check_chunks(stores: Mapping[str, Any], params: Path | Zipped) -> None:
     """Refuse arrays whose pieces are larger than they are: a few bytes on disk would fill the memory."""
     for name, store in stores.items():
         piece = math.prod(store.chunk_layout.read_chunk.shape or ())
@@ -136,25 +170,32 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
 
 
 def _holds_arrays(folder: Path) -> bool:
-    return (folder / MANIFEST).is_file() or any(next(folder.glob(f"*{name}"), None) for name in _ARRAY_FILES)
+    return (folder / MANIFEST).is_file() or any(next(folder.glob(f"*{name}"), None) for name in ARRAY_FILES)
 
 
-def _list_arrays(ts: Any, params: Path, ocdbt: bool) -> dict[str, tuple[str, str]]:
+def _list_arrays(ts: Any, params: Path | Zipped, ocdbt: bool) -> dict[str, tuple[str, str]]:
     """Path in the store → (name, driver) of every array."""
     if ocdbt:
         keys = [key.decode() for key in ts.KvStore.open(_store(params, "", True)).result().list().result()]
+    elif isinstance(params, Zipped):
+        keys = [key for key in params.names if key.count("/") == 1]
     else:
-        keys = [f"{file.parent.name}/{file.name}" for name in _ARRAY_FILES for file in params.glob(f"*{name}")]
+        keys = [f"{file.parent.name}/{file.name}" for name in ARRAY_FILES for file in params.glob(f"*{name}")]
     arrays = {}
     for key in keys:
         path, slash, file = key.rpartition("/")
-        if slash + file in _ARRAY_FILES:
+        if slash + file in ARRAY_FILES:
             name = re.sub(r"^params/|/value$", "", path.replace(".", "/"))
-            arrays[path] = (name, _ARRAY_FILES[slash + file])
+            arrays[path] = (name, ARRAY_FILES[slash + file])
     return arrays
 
 
-def _store(params: Path, path: str, ocdbt: bool) -> dict[str, Any]:
+def _store(params: Path | Zipped, path: str, ocdbt: bool) -> dict[str, Any]:
+    if isinstance(params, Zipped):
+        archive = {"driver": "zip", "base": f"file://{params.file.as_posix()}"}
+        if not ocdbt:
+            return {**archive, "path": f"{params.place}{path}/"}
+        return {"driver": "ocdbt", "base": {**archive, "path": params.place}, "path": f"{path}/" if path else ""}
     base = f"file://{params.resolve().as_posix()}/"
     return {"driver": "ocdbt", "base": base, "path": f"{path}/" if path else ""} if ocdbt else {
         "driver": "file", "path": f"{params.resolve().as_posix()}/{path}/",

@@ -11,10 +11,11 @@ from mme_vla.errors import UserError, brief, did_you_mean, listed
 from mme_vla.policy.hub import local_folder
 from mme_vla.policy.saving import CONFIG, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
+from mme_vla.weights.archive import SUFFIX, find_archive, open_archive
 from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
 from mme_vla.weights.memoryvla import is_memoryvla, read_names
 from mme_vla.weights.openvla import is_openvla, with_heads
-from mme_vla.weights.orbax import find_params, read_orbax, variant_of
+from mme_vla.weights.orbax import Zipped, find_params, read_orbax, variant_of
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
 from mme_vla.weights.sam2act_files import is_sam2act, plain_sam2act_names
 from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
@@ -67,13 +68,14 @@ class Source:
     """A checkpoint that was found.
 
     format: a key of `FORMATS`. folder: what belongs to it lies here: configuration, statistics.
-    files: its safetensors files; empty for an Orbax checkpoint. params: the Orbax arrays' folder.
+    files: its safetensors files; empty for an Orbax checkpoint.
+    params: the Orbax arrays' folder, or their place in an archive.
     """
 
     format: str
     folder: Path
     files: tuple[Path, ...] = ()
-    params: Path | None = None
+    params: Path | Zipped | None = None
 
     def tensors(self, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
         """Read all tensors, under the one spelling that the format's name table knows.
@@ -95,6 +97,11 @@ class Source:
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
+    def shown(self) -> str:
+        """Where it is, for messages."""
+        return str(self.params if isinstance(self.params, Zipped) else self.folder)
+
+    @property
     def config(self) -> dict[str, Any]:
         """What `config.json` beside the weights says; empty without one."""
         return read_config(self.folder) if (self.folder / CONFIG).is_file() else {}
@@ -106,7 +113,13 @@ class Source:
             return self.format
         if self.format == "openvla":
             return "openvla_oft"
-        said = variant_of(self.params) if self.params is not None else None
+        said = None
+        if self.params is not None:
+            place = self.params.file if isinstance(self.params, Zipped) else self.params
+            beside = [place.parent, place.parent.parent]
+            said = variant_of([self.folder, *beside])
+            if said is None:  # published runs lie in folders that are called as they are
+                said = next((folder.name for folder in beside if folder.name in VARIANTS), None)
         if said is not None and said not in VARIANTS:
             # The word would become part of a configuration, where it could ask for more than a name.
             raise UserError(
@@ -126,7 +139,9 @@ def detect_format(source: str | Path) -> str:
 
 
 def open_source(source: str | Path, revision: str | None = None, token: str | None = None) -> Source:
-    """Find a checkpoint: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
+    """Find a checkpoint: a folder, a safetensors file, an Orbax run or step, an archive of one, or a place on the hub.
+
+    On the hub: `owner/name`, or `owner/name/folder/in/it`.
 
     Raises:
         UserError: nothing there, or nothing this library knows.
@@ -136,6 +151,8 @@ def open_source(source: str | Path, revision: str | None = None, token: str | No
         raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
+    if path.is_file() and path.suffix == SUFFIX:
+        return _of_archive(path)
     if path.is_file():
         return _of_files(path.parent, (path,))
     if (path / WEIGHTS).is_file() or (path / INDEX).is_file():
@@ -143,6 +160,8 @@ def open_source(source: str | Path, revision: str | None = None, token: str | No
     params = find_params(path)
     if params is not None:
         return Source("released", params.parent if params.name == "params" else params, params=params)
+    if (zipped := find_archive(path)) is not None:
+        return _of_archive(zipped)
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
     if files:
@@ -150,6 +169,11 @@ def open_source(source: str | Path, revision: str | None = None, token: str | No
     if (path / "adapter_model.safetensors").is_file():
         raise UserError(f"{path} holds a PEFT adapter alone, not a policy: merge it into its base model first.")
     raise UserError(f"{path} holds no checkpoint of a known kind. Known: {'; '.join(FORMATS.values())}.")
+
+
+def _of_archive(file: Path) -> Source:
+    found = open_archive(file)
+    return Source("released", found.folder, params=found.params)
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:

@@ -1,5 +1,6 @@
 """A cache that is there: opened, or built first where that is a matter of minutes."""
 
+import logging
 from pathlib import Path
 
 from mme_vla.data.cache.building import Encode, build_cache
@@ -14,6 +15,8 @@ from mme_vla.data.cache.store import (
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
+
+log = logging.getLogger(__name__)
 
 
 def ensure_cache(
@@ -40,6 +43,13 @@ def ensure_cache(
     Raises:
         UserError: the dataset is larger than that and its cache is not there, or the cache is stale or damaged.
     """
+    coded = source.lossy.get(source.robot.memory_camera)
+    if coded is not None and memory.make_scorer() is not None:
+        log.warning(
+            "%s: its films are coded as %s, and this memory scores patches by how little they change: what compression "
+            "moves passes for motion. Convert the recordings with lossless films, or choose another memory.",
+            source.name, coded,
+        )  # fmt: skip
     expected = fingerprint(source, memory.storage, encoder, dtype)
     folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
     try:

@@ -1,0 +1,18 @@
+# A policy behind a port: docker build -f docker/serve.Dockerfile -t mme-vla-serve .
+# docker run --gpus all -p 8001:8001 -v <checkpoint>:/checkpoint:ro -e MME_VLA_API_KEY=<key> mme-vla-serve
+FROM python:3.12-slim
+
+RUN apt-get update \
+    && apt-get install -y --no-install-recommends git libgl1 libglib2.0-0 \
+    && rm -rf /var/lib/apt/lists/*
+RUN pip install --no-cache-dir uv==0.13.9
+
+WORKDIR /app
+COPY . .
+RUN uv sync --no-cache --no-dev --extra serve
+
+RUN useradd --create-home policy
+USER policy
+EXPOSE 8001
+ENTRYPOINT [".venv/bin/python", "-m", "mme_vla.serve", "host=0.0.0.0"]
+CMD ["checkpoint=/checkpoint"]
