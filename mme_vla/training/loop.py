@@ -95,7 +95,7 @@ class Trainer:
             generator=generator_for(settings.seed, "workers"),
         )
         self.policy = policy.train()
-        policy.recompute(settings.gradient_checkpointing)
+        policy.recompute(settings.recomputation)
         if settings.compile:
             policy.compile()
         self.sharded = settings.parallel.shards(accelerator.device)
