@@ -27,7 +27,7 @@ from mme_vla.training.logging import Loggers
 from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.parallel import reshard, shard, whole_number
-from mme_vla.training.reading import readers, size_of
+from mme_vla.training.reading_ahead import readers, size_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
