@@ -28,9 +28,7 @@ from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.validation import Validation
 
-MODELS = (
-    "tokendrop_expert", "ttt_context", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus",
-)  # fmt: skip
+MODELS = ("tokendrop_expert", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus")
 SHARDED = {"parallel": {"strategy": "fsdp"}}
 BATCH = 6  # of two and of three processes
 
