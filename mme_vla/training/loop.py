@@ -173,7 +173,7 @@ class Trainer:
             torch.manual_seed(seed_of(settings.seed, "model", step, piece, self.accelerator.process_index))
             last = piece == settings.accumulate - 1
             with self._gradients_shared(last):
-                loss, metrics = self.model(batch, {name: value[rows].to(device) for name, value in draws.items()})
+                loss, metrics = self.model(batch, {name: _sent(value[rows], device) for name, value in draws.items()})
                 self.accelerator.backward(loss / settings.accumulate)
             for name, value in metrics.items():
                 part = value.detach().float() / settings.accumulate
@@ -183,7 +183,7 @@ class Trainer:
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.ema.update(step)
-        return {**sums, "grad_norm": norm, "lr": torch.tensor(rate, device=device)}
+        return {**sums, "grad_norm": norm, "lr": torch.full((), rate, device=device)}
 
     @contextmanager
     def _gradients_shared(self, shared: bool) -> Iterator[None]:
@@ -240,6 +240,11 @@ class Trainer:
         values["memory/gib"] = memory_gib(self.accelerator.device)
         loggers.write(step, values)
         line.numbers(step, values)
+
+
+def _sent(value: Tensor, device: torch.device) -> Tensor:
+    """A tensor on the device, without waiting for a GPU."""
+    return value.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else value.to(device)
 
 
 @contextmanager
