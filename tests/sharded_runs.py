@@ -148,7 +148,7 @@ def policies(folder: Path) -> dict[str, Any]:
 
 
 def resume(folder: Path) -> dict[str, Any]:
-    job = trainer(folder / "run", 8, resumed=True, **SHARDED)
+    job = trainer(folder / "run", 8, resumed=True, accumulate=2, **SHARDED)  # gradients travel with the last piece
     assert finish_run(job)
     return validation_losses(job)
 

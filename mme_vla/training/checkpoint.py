@@ -117,10 +117,10 @@ def save_shards(
     if first:
         fresh_folder(draft)
         about = [*policy.save_about(draft), STATE]
-        _write_state(draft, step, config, shards=distributed.get_world_size())
 
     def finish() -> None:
         place = draft
+        _write_state(draft, step, config, shards=len(shard_files(draft)))
         if hurry:
             write_sums(draft, about)
             place = _publish(draft, target)
