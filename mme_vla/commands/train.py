@@ -133,7 +133,7 @@ def _train(
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
     config["data"]["content"] = data.content
-    check_disk(run.folder, policy, settings.keep)
+    check_disk(run.folder, policy, settings.keep, sharded)
     validation, collate = None, policy.require_processor().collate
     if data.val is not None and settings.val_samples:
         batch_size = settings.batch_size // (settings.accumulate * accelerator.num_processes)

@@ -94,11 +94,13 @@ class Trainer:
             worker_init_fn=leave_signals_alone,
             generator=generator_for(settings.seed, "workers"),
         )
+        self.sharded = settings.parallel.shards(accelerator.device)
+        if not self.sharded:
+            policy.to(accelerator.device)
         self.policy = policy.train()
         policy.recompute(settings.recomputation)
         if settings.compile:
             policy.compile()
-        self.sharded = settings.parallel.shards(accelerator.device)
         if self.sharded:
             mesh = settings.parallel.mesh(accelerator.device.type)
             shard(policy, mesh, policy.compute_dtype, settings.compile)
