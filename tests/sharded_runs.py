@@ -28,9 +28,7 @@ from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.validation import Validation
 
-MODELS = (
-    "tokendrop_expert", "ttt_context", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus",
-)  # fmt: skip
+MODELS = ("tokendrop_expert", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus")
 SHARDED = {"parallel": {"strategy": "fsdp"}}
 BATCH = 6  # of two and of three processes
 
@@ -150,7 +148,7 @@ def policies(folder: Path) -> dict[str, Any]:
 
 
 def resume(folder: Path) -> dict[str, Any]:
-    job = trainer(folder / "run", 8, resumed=True, **SHARDED)
+    job = trainer(folder / "run", 8, resumed=True, accumulate=2, **SHARDED)  # gradients travel with the last piece
     assert finish_run(job)
     return validation_losses(job)
 

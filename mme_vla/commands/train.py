@@ -56,7 +56,7 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
         SystemExit: a signal asked it to stop, which it did after saving; the code is 128 and the signal's number.
     """
     from accelerate import Accelerator
-    from accelerate.utils import broadcast_object_list
+    from accelerate.utils import DistributedDataParallelKwargs, broadcast_object_list
 
     from mme_vla.training.logging import check_logger
     from mme_vla.training.runs import claim_run
@@ -66,7 +66,9 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
     check_logger(config)
     if settings.device == "cuda":
         find_device("cuda")  # says so where there is none
-    accelerator = Accelerator(cpu=settings.device == "cpu")
+    # Where processes have all weights each, gradients lie in what is sent instead of being copied there.
+    one_copy = DistributedDataParallelKwargs(gradient_as_bucket_view=True)
+    accelerator = Accelerator(cpu=settings.device == "cpu", kwargs_handlers=[one_copy])
     chosen: list[Any] = [None]
     with ExitStack() as held:
         if accelerator.is_main_process:  # the clock is in the folder's name: the first process decides
@@ -133,7 +135,7 @@ def _train(
     if run.checkpoint is not None:
         check_content(run.checkpoint, data.content)
     config["data"]["content"] = data.content
-    check_disk(run.folder, policy, settings.keep)
+    check_disk(run.folder, policy, settings.keep, sharded)
     validation, collate = None, policy.require_processor().collate
     if data.val is not None and settings.val_samples:
         batch_size = settings.batch_size // (settings.accumulate * accelerator.num_processes)

@@ -1,5 +1,6 @@
 """How long episodes take, from records of earlier ones: which begin first, and when a run will be over."""
 
+import warnings
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,7 +23,8 @@ def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
     else:
         found = []
         for path in sorted(output.parent.glob("*/episodes*.jsonl")):
-            with suppress(UserError):  # another run's, and damaged: its own command will say so
+            # What is damaged, or being written, is another run's: its own command will say so.
+            with suppress(UserError), warnings.catch_warnings(action="ignore"):
                 found += read_records(path)
     return [record for record in found if record.outcome != "error"]
 

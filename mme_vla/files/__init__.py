@@ -2,8 +2,8 @@
 
 from mme_vla.files.checksums import SUMS, Sums, check_sums, file_sum, sum_line, write_sums
 from mme_vla.files.foreign import decoding, require_file
-from mme_vla.files.limits import files_to_hold
 from mme_vla.files.locks import FolderLock
+from mme_vla.files.open_files import files_to_hold
 from mme_vla.files.places import inside, safe_name
 from mme_vla.files.plans import PLAN, claim_plan, drop_plan
 from mme_vla.files.reading import is_text, parse_json, read_bytes, read_json, read_json_lines, read_text

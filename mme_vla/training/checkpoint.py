@@ -117,10 +117,10 @@ def save_shards(
     if first:
         fresh_folder(draft)
         about = [*policy.save_about(draft), STATE]
-        _write_state(draft, step, config, shards=distributed.get_world_size())
 
     def finish() -> None:
         place = draft
+        _write_state(draft, step, config, shards=len(shard_files(draft)))
         if hurry:
             write_sums(draft, about)
             place = _publish(draft, target)
@@ -212,15 +212,17 @@ def read_state(checkpoint: Path) -> dict[str, Any]:
     return state
 
 
-def check_disk(folder: Path, policy: Policy, keep: KeepRule) -> None:
+def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = False) -> None:
     """Refuse to begin a run whose first checkpoints would not fit on the disk.
+
+    A sharded run's hold the weights twice: the trained ones in parts, and the averages whole.
 
     Raises:
         UserError: saying how much is needed and free.
     """
     weights = sum(p.numel() * p.element_size() for p in policy.parameters())
     trained = sum(p.numel() * p.element_size() for p in trainable(policy).values())
-    needed = (weights + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
+    needed = (weights * (1 + sharded) + 3 * trained) * (keep.last + 1)  # a new one is written before an old one goes
     existing = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     free = shutil.disk_usage(existing).free
     if needed > free:

@@ -27,7 +27,7 @@ from mme_vla.training.logging import Loggers
 from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.parallel import reshard, shard, whole_number
-from mme_vla.training.reading import readers, size_of
+from mme_vla.training.reading_ahead import readers, size_of
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
@@ -95,11 +95,13 @@ class Trainer:
             worker_init_fn=leave_signals_alone,
             generator=generator_for(settings.seed, "workers"),
         )
+        self.sharded = settings.parallel.shards(accelerator.device)
+        if not self.sharded:
+            policy.to(accelerator.device)
         self.policy = policy.train()
-        policy.recompute(settings.gradient_checkpointing)
+        policy.recompute(settings.recomputation)
         if settings.compile:
             policy.compile()
-        self.sharded = settings.parallel.shards(accelerator.device)
         if self.sharded:
             mesh = settings.parallel.mesh(accelerator.device.type)
             shard(policy, mesh, policy.compute_dtype, settings.compile)

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
-from mme_vla.backbone.layers.recomputing import SELECTIVE
+from mme_vla.backbone.layers.recomputing import ALL, SELECTIVE, Recompute
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.training.parallel import ParallelSettings
@@ -48,7 +48,8 @@ class TrainSettings:
     decay_min_dim: int = 0
     ema_warmup: bool = False
     accumulate: int = 1
-    gradient_checkpointing: bool | str = False
+    gradient_checkpointing: bool = False
+    recompute: str = ALL
     compile: bool = False
     parallel: ParallelSettings = field(default_factory=ParallelSettings)
     device: str = "auto"
@@ -91,8 +92,7 @@ class TrainSettings:
         _check("ema", self.ema, 0 <= self.ema < 1, "at least 0 (no averaging) and below 1")
         betas = len(self.betas) == 2 and all(0 <= b < 1 for b in self.betas)
         _check("betas", self.betas, betas, "two numbers in [0, 1)")
-        known = self.gradient_checkpointing in (True, False, SELECTIVE)
-        _check("gradient_checkpointing", self.gradient_checkpointing, known, f"true, false or {SELECTIVE}")
+        _check("recompute", self.recompute, self.recompute in (ALL, SELECTIVE), f"{ALL} or {SELECTIVE}")
         _check("device", self.device, self.device in ("auto", "cpu", "cuda"),
                "auto (a GPU where there is one), cuda or cpu; which GPU is said by CUDA_VISIBLE_DEVICES")  # fmt: skip
         _check(
@@ -101,6 +101,12 @@ class TrainSettings:
             self.batch_size % self.accumulate == 0,
             f"a multiple of train.accumulate={self.accumulate}",
         )
+
+
+    @property
+    def recomputation(self) -> Recompute:
+        """What the backward pass computes again."""
+        return self.gradient_checkpointing and (SELECTIVE if self.recompute == SELECTIVE else True)
 
 
 def _check(name: str, value: Any, fits: bool, expected: str) -> None:

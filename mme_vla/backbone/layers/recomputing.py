@@ -9,8 +9,8 @@ from torch.utils.checkpoint import checkpoint, create_selective_checkpoint_conte
 
 Recompute = bool | str
 """What to compute again in the backward pass: True everything inside a layer, False nothing, or SELECTIVE."""
-SELECTIVE = "selective"
-"""Everything but the results of matrix products and of attention, which are kept."""
+ALL, SELECTIVE = "all", "selective"
+"""Everything inside a layer; or all of it but the results of matrix products and of attention, which are kept."""
 
 _ATEN = torch.ops.aten
 KEPT: list[Any] = [
