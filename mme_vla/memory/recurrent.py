@@ -166,8 +166,8 @@ class RecurrentMemory(Memory):
         Gradients flow through every step. Between chunks only the state is kept for the backward pass.
         """
         # Statistics are wanted of one update in many: not worth compiling for.
-        eager = self._compiled is None or self.reporting
-        step = self.layer.advance if eager else partial(self._compiled, self.layer)
+        compiled = None if self.reporting else self._compiled
+        step = self.layer.advance if compiled is None else partial(compiled, self.layer)
         window = self.layer.window
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -35,7 +36,7 @@ class GraphSampler:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._captured: dict[tuple[object, ...], _Captured] = {}
-        self._pool: object = None
+        self._pool: Any = None
 
     def __len__(self) -> int:
         """Sizes captured so far."""
