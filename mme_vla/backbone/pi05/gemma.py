@@ -256,6 +256,10 @@ class JointTransformer(nn.Module):
         experts: list[Any] = [block.experts[self.answering] for block in self.layers]  # type: ignore[index]
         return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [self.final_norm]
 
+    @property
+    def _compiled(self) -> bool:
+        return self.layers[0]._compiled_call_impl is not None
+
     def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
         """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
         spans = [Span(block.name, len(block)) for block in blocks]
@@ -263,7 +267,7 @@ class JointTransformer(nn.Module):
         positions = token_positions(asking, past.mask if past else None)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
         sight, dtype = Sight.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
-        mask = look(sight, dtype, self.attention, compiled=self.layers[0]._compiled_call_impl is not None)
+        mask = look(sight, dtype, self.attention, self._compiled)
         return Layout(all_spans, valid, mask, rotation(positions, self.head_dim), sight, dtype)
 
     def forward(
@@ -286,7 +290,7 @@ class JointTransformer(nn.Module):
         Returns:
             The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
         """
-        segments = _segments(blocks, layout.dtype)
+        segments = _segments(blocks, layout.dtype, self._compiled)
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
@@ -318,13 +322,12 @@ def _join(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
-def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
-    """Join neighbouring blocks of one expert, in the compute dtype."""
+def _segments(blocks: Sequence[Block], dtype: torch.dtype, compiled: bool) -> list[Segment]:
+    """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or are not."""
     runs: list[tuple[str, list[Tensor]]] = []
     for block in blocks:
         if not runs or runs[-1][0] != block.expert:
             runs.append((block.expert, []))
         # Not a view of something else, as no later layer's tokens are: the first layer then shares their compiled code.
-        view = torch.is_grad_enabled() and block.tokens._is_view()
-        runs[-1][1].append(block.tokens.to(dtype, copy=view))
+        runs[-1][1].append(block.tokens.to(dtype, copy=compiled and block.tokens._is_view()))
     return [Segment(expert, _join(tokens)) for expert, tokens in runs]
