@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.layers.attention import our_kernels
 from mme_vla.errors import UserError, did_you_mean
 
 FUSIONS, CONSOLIDATIONS = ("gate", "add"), ("tome", "fifo")
@@ -66,9 +65,7 @@ class RetrievalBlock(nn.Module):
     def forward(self, query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
         """Queries [b, n, d] read keys and values [b, m, d]; mask [b, 1, m] is False on padding."""
         q, k, v = self.query(query), self.key(keys), self.value(values)
-        with our_kernels(q):
-            read = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask)
-        x = self.attention_norm(query + read)
+        x = self.attention_norm(query + functional.scaled_dot_product_attention(q, k, v, attn_mask=mask))
         return self.mlp_norm(x + self.mlp_out(functional.gelu(self.mlp_in(x))))
 
 

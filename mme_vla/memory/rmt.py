@@ -5,7 +5,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.layers.attention import our_kernels
 from mme_vla.errors import UserError
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
@@ -116,8 +115,7 @@ class RMTLayer(RecurrentLayer):
         q = q.unflatten(2, (self.kv_heads, -1)).permute(0, 2, 3, 1, 4).flatten(2, 3)  # b kv (g n) h
         k, v = k.transpose(1, 2), v.transpose(1, 2)
         if self.attention_dtype == torch.float32:
-            with our_kernels(q):
-                mixed = nn.functional.scaled_dot_product_attention(q, k, v)
+            mixed = nn.functional.scaled_dot_product_attention(q, k, v)
         else:
             mixed = attend_rounded(q, k, v, self.attention_dtype)
         return mixed.view(b, heads, n, h).transpose(1, 2).flatten(2)

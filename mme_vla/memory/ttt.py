@@ -80,7 +80,7 @@ class TTTLayer(RecurrentLayer):
         return math.log(math.expm1(self.base_rate))
 
     def initial(self, batch: int) -> State:
-        window = self.window
+        window = -(-self.budget // self.patches)
         outputs = self.weight.new_zeros(batch, window, self.patches, self.out.out_features, dtype=torch.float32)
         seen = torch.zeros(batch, window, dtype=torch.bool, device=outputs.device)
         weight, bias = (p.expand(batch, *p.shape) for p in (self.weight, self.bias))
