@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.layers.attention import check_backend
 from mme_vla.backbone.layers.blocks import Block, Visibility
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
@@ -146,6 +147,15 @@ class Backbone(nn.Module):
             inject: the memory's way in. draws: as `loss_draws` made them, on the batch's device.
         """
         raise NotImplementedError
+
+    def choose_attention(self, backend: str) -> None:
+        """Compute attention with another backend than its own choice (`auto`); see `layers.attention.BACKENDS`.
+
+        Raises:
+            UserError: there is none of that name, or this backbone has no choice.
+        """
+        if check_backend(backend) != "auto":
+            raise UserError(f"policy.attention={backend}: {type(self).__name__} has one attention; leave it at auto.")
 
     def recompute(self, wanted: Recompute) -> None:
         """Keep no activations inside layers in training, and compute them again in the backward pass; or keep them."""

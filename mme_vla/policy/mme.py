@@ -67,6 +67,7 @@ class MMEPolicy(Policy):
         compute_dtype: str = "float32",
         history_dtype: str = "bfloat16",
         augment: bool = True,
+        attention: str = "auto",
     ) -> None:
         """Put the parts together.
 
@@ -76,6 +77,7 @@ class MMEPolicy(Policy):
             compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
             history_dtype: dtype of stored vision tokens; bfloat16 as released.
             augment: augment the current views while training (memory features never are).
+            attention: what computes it: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
         """
         super().__init__()
         self.backbone, self.memory, self.integration = backbone, memory, integration
@@ -84,6 +86,7 @@ class MMEPolicy(Policy):
         self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
         self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
+        backbone.choose_attention(attention)
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         self.sample_steps = backbone.sample_steps
         self.agrees = backbone.agrees

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, Draws, Inject, Injection
+from mme_vla.backbone.layers.attention import check_backend
 from mme_vla.backbone.layers.blocks import Block
 from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.layers.precision import float32_linear
@@ -157,6 +158,10 @@ class Pi05Backbone(Backbone):
         condition = condition if injection.condition is None else injection.condition(condition)
         answer, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(answer)
+
+    def choose_attention(self, backend: str) -> None:
+        """See `Backbone`; all of them are for this one."""
+        self.transformer.attention = check_backend(backend)
 
     def recompute(self, wanted: Recompute) -> None:
         """Recompute layers in the backward pass (activation checkpointing)."""

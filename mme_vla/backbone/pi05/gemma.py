@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Hook, bind_hook
-from mme_vla.backbone.layers.attention import attend, sight_mask
+from mme_vla.backbone.layers.attention import Seen, attend, look, part_of
 from mme_vla.backbone.layers.blocks import Block, Span, Visibility, placed, token_positions
 from mme_vla.backbone.layers.norms import AdaRMSNorm, Modulation, RMSNorm
 from mme_vla.backbone.layers.precision import compute_dtype
@@ -140,7 +140,7 @@ class JointBlock(nn.Module):
         self,
         segments: Sequence[Segment],
         turn: Rotation,
-        mask: Tensor,
+        mask: Seen,
         condition: Tensor | LayerModulation | None,
         hook: Callable[[Tensor], Tensor] | None = None,
         past: KeyValue | Room | None = None,
@@ -149,7 +149,7 @@ class JointBlock(nn.Module):
 
         Args:
             segments: this pass's tokens in sequence order. turn: their rotation.
-            mask: additive [b, 1, n, past + n].
+            mask: additive [b, 1, n, past + n], or what another backend of attention reads.
             condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
             hook: see `Hook`, layer already bound.
             past: keys and values [b, past, K, h] of earlier passes, rotated; or these with room for this pass's own.
@@ -174,7 +174,7 @@ class JointBlock(nn.Module):
         if not asked:
             return [], (k, v)
         all_k, all_v = _after(past, k, v)
-        seen = mask if len(asked) == len(segments) else torch.cat([mask[:, :, rows] for *_, rows in asked], 2)
+        seen = mask if len(asked) == len(segments) else part_of(mask, [rows for *_, rows in asked], k.dtype)
         attended = attend(_join(queries), all_k, all_v, seen)
         pieces = attended.split([rows.stop - rows.start for *_, rows in asked], dim=1)
         updated = [
@@ -209,8 +209,10 @@ class Layout(NamedTuple):
 
     spans: list[Span]  # of this pass and the cached ones before it
     valid: Tensor  # [b, past + n] bool
-    mask: Tensor  # additive [b, 1, n, past + n]
+    mask: Seen  # additive [b, 1, n, past + n], or what another backend of attention reads
     turn: Rotation
+    sight: Sight
+    dtype: torch.dtype  # of the tokens in all layers
 
 
 @dataclass
@@ -236,6 +238,7 @@ class JointTransformer(nn.Module):
         super().__init__()
         self.head_dim, self.answering, self.experts = config.head_dim, answering, experts
         self.gradient_checkpointing: Recompute = False
+        self.attention = "auto"
         self.layers = nn.ModuleList(
             JointBlock(config, experts, answering, last=i == config.depth - 1) for i in range(config.depth)
         )
@@ -253,14 +256,19 @@ class JointTransformer(nn.Module):
         experts: list[Any] = [block.experts[self.answering] for block in self.layers]  # type: ignore[index]
         return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [self.final_norm]
 
+    @property
+    def _compiled(self) -> bool:
+        return self.layers[0]._compiled_call_impl is not None
+
     def layout(self, blocks: Sequence[Block], table: Visibility, past: KVCache | None = None) -> Layout:
         """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
         spans = [Span(block.name, len(block)) for block in blocks]
         asking = torch.cat([block.mask for block in blocks], 1)
         positions = placed(token_positions(asking, past.mask if past else None), blocks)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
-        mask = sight_mask(Sight.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens))
-        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim))
+        sight, dtype = Sight.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
+        mask = look(sight, dtype, self.attention, self._compiled)
+        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim), sight, dtype)
 
     def forward(
         self,
@@ -282,7 +290,7 @@ class JointTransformer(nn.Module):
         Returns:
             The answering block's output [b, n, d] (None if it is not among `blocks`) and the cache (None unless kept).
         """
-        segments = _segments(blocks, layout.mask.dtype)
+        segments = _segments(blocks, layout.dtype, self._compiled)
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
@@ -311,13 +319,12 @@ def _join(parts: list[Tensor]) -> Tensor:
     return parts[0] if len(parts) == 1 else torch.cat(parts, 1)
 
 
-def _segments(blocks: Sequence[Block], dtype: torch.dtype) -> list[Segment]:
-    """Join neighbouring blocks of one expert, in the compute dtype."""
+def _segments(blocks: Sequence[Block], dtype: torch.dtype, compiled: bool) -> list[Segment]:
+    """Join neighbouring blocks of one expert, in the compute dtype, for layers that are compiled or are not."""
     runs: list[tuple[str, list[Tensor]]] = []
     for block in blocks:
         if not runs or runs[-1][0] != block.expert:
             runs.append((block.expert, []))
         # Not a view of something else, as no later layer's tokens are: the first layer then shares their compiled code.
-        view = torch.is_grad_enabled() and block.tokens._is_view()
-        runs[-1][1].append(block.tokens.to(dtype, copy=view))
+        runs[-1][1].append(block.tokens.to(dtype, copy=compiled and block.tokens._is_view()))
     return [Segment(expert, _join(tokens)) for expert, tokens in runs]

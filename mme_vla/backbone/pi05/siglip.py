@@ -6,6 +6,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.layers.attention import our_kernels
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.pi05.sizes import VisionConfig
 from mme_vla.errors import UserError
@@ -49,8 +50,9 @@ class VisionTower(nn.Module):
             x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)
-        for block in vit.blocks:
-            x = block(x)
+        with our_kernels(x):
+            for block in vit.blocks:
+                x = block(x)
         return vit.head(vit.norm(x)).to(dtype)
 
 

@@ -12,6 +12,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from mme_vla.backbone.layers.attention import sight_mask
 from mme_vla.backbone.pi05.gemma import JointBlock, KeyValue, LayerModulation, Layout, Room
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
@@ -67,6 +68,7 @@ class AttentionWatch:
     _samples: int = 0
     _lap: tuple[Tensor | None, int] = (None, 0)
     _watching: bool = False
+    _mask: Tensor = field(default_factory=lambda: torch.empty(0))
     _handles: list[Any] = field(default_factory=list)
 
     def __enter__(self) -> Self:
@@ -122,6 +124,7 @@ class AttentionWatch:
         self._names, self._lengths = names, [span.length for span in layout.spans]
         if self._sums is None:
             self._sums = torch.zeros(len(transformer.layers), len(names), dtype=torch.float64)
+        self._mask = sight_mask(layout.sight, torch.float32)
         self._samples += len(layout.valid)
 
     @torch.no_grad()
@@ -145,11 +148,11 @@ class AttentionWatch:
             keys.append(k)
             row = rows.stop
             if answers:
-                q, mask = asked, given["mask"][:, :, rows]
+                q, mask = asked, self._mask[:, :, rows]
         assert q is not None
         assert self._sums is not None
         k = torch.cat(keys, 1).repeat_interleave(q.shape[2] // keys[0].shape[2], dim=2)
-        logits = torch.einsum("bqnh,bknh->bnqk", q.float(), k.float()) * q.shape[-1] ** -0.5 + mask.float()
+        logits = torch.einsum("bqnh,bknh->bnqk", q.float(), k.float()) * q.shape[-1] ** -0.5 + mask
         mass = logits.softmax(-1).mean((1, 2))  # b k
         parts = torch.stack([part.sum(1) for part in mass.split(self._lengths, dim=1)], 1)
         self._sums[index] += parts.sum(0).double().cpu()

@@ -1,0 +1,50 @@
+"""The benchmark of a GPU runs anywhere at tiny size; only a GPU is judged, and what is missed ends it with 1."""
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from conftest import REPOSITORY
+
+
+@pytest.fixture(scope="module")
+def gpu() -> Any:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(REPOSITORY / "benchmarks"))
+        spec = importlib.util.spec_from_file_location("gpu_benchmark", REPOSITORY / "benchmarks" / "gpu.py")
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        patch.setitem(__import__("sys").modules, "gpu_benchmark", module)
+        spec.loader.exec_module(module)
+        return module
+
+
+def test_it_runs_on_a_cpu_and_says_what_it_could_not_measure(
+    gpu: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "gpu.json"
+    words = ["--backbone", "tiny", "--device", "cpu", "--rounds", "1", "--batch", "2", "--eager", "--output", report]
+    assert gpu.main([*map(str, words), "--models", "framesamp_modul"]) == 0
+    found = json.loads(report.read_text())["models"]["framesamp_modul"]
+    assert found["training"]["mfu"] is None and found["training"]["tflop_per_sample"] > 0
+    assert found["chunk"].keys() == {"eager"} and found["chunk"]["eager"]["p50_ms"] > 0
+    printed = capsys.readouterr().out
+    assert "MFU not measured" in printed and "NaN sweep: none" in printed
+
+
+def test_recurrent_memories_compute_more_than_their_model_needs(gpu: Any) -> None:
+    needed, computed = gpu.sample_flops("rmt_context", "tiny")
+    assert 0 < needed < computed
+    assert len(set(gpu.sample_flops("pi05", "tiny"))) == 1
+
+
+def test_what_misses_a_goal_is_told(gpu: Any) -> None:
+    ways = {"eager": {"p50_ms": 90.0}, "graph": {"p50_ms": 14.0}}
+    row = {"training": {"finite": True, "mfu": 0.51}, "chunk": ways}
+    good: dict[str, Any] = {"device": "cuda", "nan": [], "models": {"pi05": row}}
+    assert gpu.judge(good) == []
+    bad = {"training": {"finite": False, "mfu": 0.4}, "chunk": {"eager": {"p50_ms": 16.0}}}
+    told = " ".join(gpu.judge({**good, "nan": ["sdpa at 576 keys"], "models": {"pi05": bad}}))
+    assert all(word in told for word in ("576", "no number", "MFU 40%", "16.0 ms"))
