@@ -61,8 +61,8 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`, 900
-            episodes a task that the benchmark does not have.
+        split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`,
+            900 episodes a task that the benchmark does not have.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
 

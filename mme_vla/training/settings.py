@@ -102,7 +102,6 @@ class TrainSettings:
             f"a multiple of train.accumulate={self.accumulate}",
         )
 
-
     @property
     def recomputation(self) -> Recompute:
         """What the backward pass computes again."""
