@@ -23,7 +23,7 @@ from mme_vla.evaluation.analyses.recurrence_plot import recurrence_plot
 from mme_vla.evaluation.analyses.replay import replay
 from mme_vla.evaluation.analyses.rerun_log import RerunLog
 from mme_vla.evaluation.results.cost_table import counted
-from mme_vla.media import of_one_size, write_film
+from mme_vla.files.media import of_one_size, write_film
 from mme_vla.testing.small import random_batch, small_policy, unit_stats
 
 

@@ -19,7 +19,7 @@ from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
-from mme_vla.media import GAP, MARGIN, TILE
+from mme_vla.files.media import GAP, MARGIN, TILE
 
 SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3)  # a single move
 ONE_OF_EACH_SUITE = {"StopCube": "easy", "VideoUnmask": "easy", "PickHighlight": "easy", "RouteStick": "easy"}

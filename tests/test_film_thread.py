@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mme_vla.evaluation.rollout.film import BEHIND, EpisodeVideo
-from mme_vla.media import Film, film_frame, write_film
+from mme_vla.files.media import Film, film_frame, write_film
 
 VIEWS = [[np.full((32, 48, 3), shade, np.uint8)] * 2 for shade in range(0, 240, 3)]
 

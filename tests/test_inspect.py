@@ -20,7 +20,7 @@ from mme_vla.commands.inspect import (
 from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.memory_picture import memory_sheet
-from mme_vla.media import MARGIN, TILE
+from mme_vla.files.media import MARGIN, TILE
 
 
 @pytest.fixture

@@ -10,7 +10,18 @@ import pytest
 from mme_vla.embodiment import ROBOMME_JOINT, Camera
 from mme_vla.evaluation.rollout.environment import ChunkEnv
 from mme_vla.evaluation.rollout.film import EpisodeVideo
-from mme_vla.media import BORDER, CAPTION, RED, Film, Tile, contact_sheet, film_bytes, film_frame, spread, write_film
+from mme_vla.files.media import (
+    BORDER,
+    CAPTION,
+    RED,
+    Film,
+    Tile,
+    contact_sheet,
+    film_bytes,
+    film_frame,
+    spread,
+    write_film,
+)
 
 GREEN, BLUE, YELLOW = ((0, 200, 0), (0, 0, 200), (200, 200, 0))
 

@@ -26,7 +26,7 @@ from mme_vla.evaluation.rollout.evaluation import checkpoint_label, default_outp
 from mme_vla.evaluation.rollout.plan import Shard, choose_episodes, choose_shard
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.media import BORDER, RED, film_frame
+from mme_vla.files.media import BORDER, RED, film_frame
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch
 

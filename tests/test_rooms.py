@@ -10,11 +10,11 @@ PACKAGE = Path(__file__).resolve().parent.parent / "mme_vla"
 # From the top: a room imports only from itself and from rooms further down.
 ROOMS = [
     "commands", "nano", "testing", "play", "evaluation", "serving", "training", "subgoal", "envs", "data", "weights",
-    "policy", "processing", "integration", "memory", "backbone", "embodiment", "config", "media", "types", "registry",
+    "policy", "processing", "integration", "memory", "backbone", "embodiment", "config", "types", "registry",
     "files",
     "errors",
 ]  # fmt: skip
-TOP_LEVEL = 13  # files
+TOP_LEVEL = 12  # files
 
 
 @cache

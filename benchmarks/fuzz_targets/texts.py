@@ -13,7 +13,7 @@ from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.run_file import claim_run, read_run
 from mme_vla.files import read_text, write_sums
-from mme_vla.media import film_bytes, png_bytes
+from mme_vla.files.media import film_bytes, png_bytes
 from mme_vla.play.game import Option
 from mme_vla.play.questions import parse_choice
 from mme_vla.subgoal.base import Usage

@@ -144,7 +144,7 @@ def selection(args: argparse.Namespace) -> None:
     from mme_vla.config.composition import compose
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.evaluation.analyses.selection import selection_sheets
-    from mme_vla.media import of_one_size, write_film
+    from mme_vla.files.media import of_one_size, write_film
 
     source = EpisodeSource(args.dataset)
     memory = build_memory(compose("inspect", [f"memory={args.memory}", *args.set]))

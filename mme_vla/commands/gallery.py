@@ -11,7 +11,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.errors import UserError
-from mme_vla.media import RED, Tile, contact_sheet, spread
+from mme_vla.files.media import RED, Tile, contact_sheet, spread
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

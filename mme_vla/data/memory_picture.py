@@ -3,7 +3,7 @@
 import numpy as np
 from PIL import Image, ImageDraw
 
-from mme_vla.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
+from mme_vla.files.media import FAINT, GAP, INK, LABEL, TILE, Tile, contact_sheet, font, thumbnail
 
 COLUMNS, MOST = 8, 47  # tiles a row, remembered frames shown at most
 TIMELINE = 90  # pixels

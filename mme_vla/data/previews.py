@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from mme_vla.data.hdf5 import open_episode
 from mme_vla.data.hdf5_episode import RawFrame
 from mme_vla.data.hdf5_values import EpisodeRef
-from mme_vla.media import RED, Tile, contact_sheet, film_frame, spread, write_film
+from mme_vla.files.media import RED, Tile, contact_sheet, film_frame, spread, write_film
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -262,7 +262,8 @@ class MMEPolicy(Policy):
         if memory is None:
             with self.autocast():
                 memory = self.encode_memory(self._marked(batch))
-        if self._sampler is not None and not self.training:
+        # A chunk that agrees with promised actions runs the network backwards as well: no graph is made of that.
+        if self._sampler is not None and not self.training and batch.overlap is None:
             return self._sampler(batch, memory, drawn, steps or self.sample_steps)
         return self._sample(batch, memory, drawn, steps)
 

@@ -17,7 +17,7 @@ from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.report import document, html_table, pair, section
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.files import write_atomically
-from mme_vla.media import Tile, contact_sheet
+from mme_vla.files.media import Tile, contact_sheet
 
 if TYPE_CHECKING:
     from PIL.Image import Image

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from mme_vla.files import draft_of
-from mme_vla.media import Film, film_frame
+from mme_vla.files.media import Film, film_frame
 
 KEPT = ("none", "all", "success", "failure")
 BEHIND = 64

@@ -35,7 +35,7 @@ from mme_vla.files import (
     write_atomically,
     write_sums,
 )  # fmt: skip
-from mme_vla.media import png_bytes, write_film
+from mme_vla.files.media import png_bytes, write_film
 from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.finetuning.labels import Labels
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows

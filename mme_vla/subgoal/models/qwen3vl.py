@@ -10,7 +10,7 @@ import torch
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean, missing_extra
-from mme_vla.media import FPS
+from mme_vla.files.media import FPS
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.tiny import make_tiny
 from mme_vla.subgoal.words.prompts import IMAGE, VIDEO, split_media
