@@ -15,20 +15,11 @@ from mme_vla.types import send
 def test_pictures_are_changed_alike_however_an_update_is_divided() -> None:
     policy = small_policy("pi05").train()
     batch = random_batch(policy, 4)
-    changes = policy.loss_draws(4, torch.Generator().manual_seed(3))["changes"]
+    changes = policy.picture_draws(4, torch.Generator().manual_seed(3))["changes"]
     whole = policy._views(batch, changes)
     pieces = [policy._views(batch.rows(torch.tensor(rows)), changes[rows]) for rows in ([0], [1, 2], [3])]
     assert torch.equal(torch.cat(pieces), whole)
     assert not torch.equal(whole, policy._views(batch))
-
-
-def test_the_noise_of_an_update_is_the_same_with_and_without_augmentation() -> None:
-    drawn = [
-        small_policy("pi05", policy={"augment": augment}).train().loss_draws(2, torch.Generator().manual_seed(0))
-        for augment in (True, False)
-    ]
-    assert "changes" in drawn[0] and "changes" not in drawn[1]
-    assert all(torch.equal(drawn[0][name], drawn[1][name]) for name in ("noise", "time"))
 
 
 def test_weights_for_acting_are_rounded_where_they_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -48,7 +48,8 @@ class HostWork(TorchDispatchMode):
 def on_meta(policy: MMEPolicy) -> tuple[Any, dict[str, torch.Tensor]]:
     """A batch and the draws of its loss there, and the policy moved."""
     batch = random_batch(policy, 2)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    generator = torch.Generator().manual_seed(0)
+    draws = policy.loss_draws(2, generator) | policy.picture_draws(2, generator)
     policy.to("meta")
     return batch.to("meta"), {name: value.to("meta") for name, value in draws.items()}
 
@@ -95,6 +96,7 @@ for model in ("framesamp_modul", "rmt_context"):
     policy = small_policy(model).cuda()
     batch = random_batch(policy, 2).to("cuda")
     draws = {k: v.cuda() for k, v in policy.train().loss_draws(2, torch.Generator()).items()}
+    draws["changes"] = policy.picture_draws(2, torch.Generator())["changes"].cuda()
     noise = draws["noise"]
     def update():
         policy(batch, draws)[0].backward()

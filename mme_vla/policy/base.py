@@ -65,6 +65,10 @@ class Policy(Saved):
         """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
         return {}
 
+    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """The random numbers that change the pictures of `count` training samples, if any; beside `loss_draws`'s."""
+        return {}
+
     def forward(self, batch: Any, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of a batch, and metrics to log (detached).
 

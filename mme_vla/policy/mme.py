@@ -137,14 +137,12 @@ class MMEPolicy(Policy):
     # Training
 
     def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n].
+        """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
+        return self.backbone.loss_draws(count, generator)
 
-        While training with augmentation also `changes` [n, …]: what happens to a sample's pictures.
-        """
-        draws = self.backbone.loss_draws(count, generator)
-        if self.training and self.augment:
-            draws = {**draws, "changes": self._draw_changes(count, generator)}
-        return draws
+    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """While training with augmentation `changes` [n, …]: what happens to a sample's pictures."""
+        return {"changes": self._draw_changes(count, generator)} if self.training and self.augment else {}
 
     def forward(
         self,
@@ -169,6 +167,8 @@ class MMEPolicy(Policy):
         given = named_draws(draws, time=time)
         if set(self.loss_draws(0, torch.default_generator)) - set(given):
             given = self.loss_draws(len(batch.actions), torch.default_generator) | given
+        if "changes" not in given:
+            given = given | self.picture_draws(len(batch.actions), torch.default_generator)
         drawn = map_draws(given, lambda value: value.to(self.device))
         views = self._views(batch, drawn.pop("changes", None))
         with self.autocast():

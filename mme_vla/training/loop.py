@@ -167,6 +167,9 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
+        # Of the whole update: the pictures of a sample depend neither on the number of processes nor of pieces.
+        pictures = generator_for(settings.seed, "model", step, 0, 0)
+        draws = {**draws, **self.policy.picture_draws(settings.batch_size, pictures)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():
