@@ -219,6 +219,12 @@ class Backbone(nn.Module):
     """Pattern of linear layers whose weight is read past any adapter that wraps them."""
 
 
+def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:
+    """Draws by name; a bare tensor is a flow's `noise`."""
+    named = {"noise": draws} if isinstance(draws, Tensor) else dict(draws or {})
+    return named | {name: value for name, value in more.items() if value is not None}
+
+
 def stack_draws(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Draws:
     """Single draws (`sample_draws`) as those of a batch."""
     return {name: torch.stack([row[name] for row in rows]).to(device) for name in (rows[0] if rows else {})}

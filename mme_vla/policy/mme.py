@@ -1,6 +1,6 @@
 """`MMEPolicy`: backbone + memory + integration + processing; loss, sampling, episodes, checkpoints."""
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -12,7 +12,7 @@ from torch import Tensor
 
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
-from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, stack_draws
+from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shape import read_backbone
 from mme_vla.backbone.shard_groups import ShardGroup
@@ -22,28 +22,18 @@ from mme_vla.integration.base import Integration, doors_of
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.composing import build_memory, check_positions
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.graphs import CapturedSampling
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.promises import promised_overlap
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.registry import INTEGRATIONS, MEMORIES, POLICIES
+from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens, send
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
-
-
-def build_memory(section: Mapping[str, Any], backbone: Backbone, width: int) -> Memory:
-    """The memory of a configuration for this backbone's vision tokens; its own tokens are `width` wide.
-
-    Raises:
-        UserError: an unknown memory or option, or a grid to which the backbone's cannot be pooled.
-    """
-    memory: Memory = MEMORIES.build(section, d_vision=backbone.vision_width, width=width)
-    memory.check_grid(backbone.grid)
-    return memory
 
 
 @POLICIES.register("mme")
@@ -126,7 +116,7 @@ class MMEPolicy(Policy):
             given = "an integration without a memory" if memory is None else "a memory without an integration"
             raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
         if memory is not None:
-            _check_positions(config, integration, memory, backbone_cls.hosts)
+            check_positions(config, integration, memory, backbone_cls.hosts)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
     def autocast(self) -> torch.autocast:
@@ -401,22 +391,6 @@ class MMEPolicy(Policy):
         return {**parts, "memory": rf"memory\.|integration\.{experts}"}
 
 
-def _check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, hosts: Set[str]) -> None:
-    """Make sure that a memory that shall be placed in time can be: its tokens have one, the backbone a place for it."""
-    if integration.memory_position != "time":
-        return
-    if not memory.timed:
-        raise UserError(
-            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} stand for no one "
-            "moment each. Take memory_position=slot, or a memory that says `timed`."
-        )
-    if "blocks" in doors_of(type(integration)) and "positions" not in hosts:
-        raise UserError(
-            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
-            "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
-        )
-
-
 def mme_of(policy: Policy, what: str) -> MMEPolicy:
     """The policy, where it is made of backbone, memory and integration.
 
@@ -429,9 +403,3 @@ def mme_of(policy: Policy, what: str) -> MMEPolicy:
             f"a {type(policy).__name__}, which has none."
         )
     return policy
-
-
-def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:
-    """Draws by name; a bare tensor is a flow's `noise`."""
-    named = {"noise": draws} if isinstance(draws, Tensor) else dict(draws or {})
-    return named | {name: value for name, value in more.items() if value is not None}
