@@ -79,7 +79,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_two_then_one_then_three_processes_learn_what_one_learns(folder: Path) -> None:
-    """The largest relative difference found is 4e-7."""
     assert len(losses(folder / "run")) == 8
     assert losses(folder / "run") == pytest.approx(losses(folder / "whole"), rel=CLOSE)
     norms = [losses(folder / name, "train/grad_norm") for name in ("run", "whole")]
