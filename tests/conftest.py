@@ -42,6 +42,11 @@ def _imports_left_out_of_collections() -> None:
         _modules_frozen = len(sys.modules)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Files in their order: pytest-xdist would begin with those of many tests, and end with the longest single ones."""
+    config.option.loadscopereorder = False
+
+
 @pytest.fixture(autouse=True)
 def _own_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test imports as a plugin is asked of its own worker processes alone, not of the next test's."""

@@ -4,7 +4,6 @@ imported PyTorch, LeRobot and the simulator once. Seconds of CPU time are saved 
 Tests of what happens while a command is imported, or of process groups, start real processes.
 """
 
-import importlib
 import os
 import runpy
 import subprocess
@@ -68,16 +67,16 @@ def run(
 
 
 def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: Path) -> None:
-    if hidden:
-        assert not set(hidden) & set(sys.modules), "these are imported already"
-        os.environ["HIDDEN_MODULES"] = " ".join(hidden)
-        sys.path.insert(0, str(Path(__file__).parent / "extras"))
-        importlib.import_module("sitecustomize")
     os.chdir(cwd)
-    sys.path.insert(0, str(cwd))
     for path, number in ((out, 1), (err, 2)):
         with path.open("wb") as file:
             os.dup2(file.fileno(), number)
+    if hidden:  # some may be imported here: begin anew, without them
+        extras = str(Path(__file__).parent / "extras")
+        variables = {"HIDDEN_MODULES": " ".join(hidden), "PYTHONPATH": os.pathsep.join([extras, str(REPOSITORY)])}
+        command = [sys.executable, "-W", "ignore", *([] if words[0].endswith(".py") else ["-m"]), *words]
+        os.execve(sys.executable, command, os.environ | variables)
+    sys.path.insert(0, str(cwd))
     sys.argv = list(words)
     if words[0].endswith(".py"):
         runpy.run_path(words[0], run_name="__main__")

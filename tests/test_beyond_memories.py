@@ -220,9 +220,13 @@ def test_past_frames_without_states_are_refused() -> None:
 def test_frames_that_could_not_be_taken_leave_no_motion_behind(monkeypatch: pytest.MonkeyPatch) -> None:
     episode, frames = mover().start_episode("press the button"), moving_frames(4)
     both, states = {"front": frames, "wrist": frames}, np.arange(32, dtype=np.float32).reshape(4, 8) / 32
+
+    def full(*_: object) -> None:
+        raise MemoryError("no room for these frames")
+
     with monkeypatch.context() as patch:
-        patch.setattr(mover(), "encode_frames", lambda frames: torch.zeros(7, 1, 1))
-        with pytest.raises(ValueError, match="append"):
+        patch.setattr(episode.history, "take", full)
+        with pytest.raises(MemoryError, match="no room"):
             episode.observe(both, states)
     episode.observe(both, states)
     assert torch.allclose(episode.required_history().moved(np.arange(4))[:, :8], torch.from_numpy(states), atol=1e-6)

@@ -1,13 +1,11 @@
 """Processes that share the weights: they learn what one process learns, whoever saves, resumes, stops or dies."""
 
 import json
-import os
 import socket
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
+import forked
 import pytest
 import sharded_runs
 import torch
@@ -26,31 +24,25 @@ CLOSE = 2e-6
 """Largest relative difference of losses that are added up in another order."""
 
 
-def start(processes: int, what: str, folder: Path) -> list[subprocess.Popen[str]]:
+def start(processes: int, what: str, folder: Path) -> list[forked.Command]:
     """As torchrun starts them, without its half a minute of patience."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(processes),
               "LOCAL_WORLD_SIZE": str(processes), "OMP_NUM_THREADS": "1"}  # fmt: skip
+    file = str(Path(sharded_runs.__file__))
     return [
-        subprocess.Popen(
-            [sys.executable, str(Path(sharded_runs.__file__)), what, str(folder)],
-            env=os.environ | shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
+        forked.Command(file, what, str(folder), env=shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)})
         for rank in range(processes)
     ]
 
 
 def run(processes: int, what: str, folder: Path, ends: tuple[int, ...] = ()) -> None:
     """Have processes do one thing after the other; each ends with 0, or as it is said in `ends`."""
-    started = start(processes, what, folder)
-    said = [process.communicate(timeout=500)[0] for process in started]
-    codes = tuple(process.returncode for process in started)
-    assert codes == (ends or (0,) * processes), "\n".join(said)[-3000:]
+    ended = [command.finish(500) for command in start(processes, what, folder)]
+    said = "\n".join(done.stdout + done.stderr for done in ended)
+    assert tuple(done.returncode for done in ended) == (ends or (0,) * processes), said[-3000:]
 
 
 def answer(folder: Path, what: str) -> Any:

@@ -1,6 +1,5 @@
 """Episodes as a sequence of choices: which letter was chosen where, with which point."""
 
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.robomme import LETTERS, choice_row
 from mme_vla.errors import UserError, brief
+from mme_vla.files import parse_json
 
 CHOICE_ACTIONS = "choice_actions"
 CHOICE_NUMBERS = [*(f"choice_{letter}" for letter in LETTERS), "point_y", "point_x"]
@@ -22,9 +22,9 @@ def row_of(text: str) -> np.ndarray | None:
         UserError: something else.
     """
     try:
-        found = json.loads(text)
+        found = parse_json(text, "a recorded choice")
         letter, point = found["choice"].strip().lower(), np.asarray(found.get("point") or (), np.float64)
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+    except (UserError, ValueError, TypeError, KeyError, AttributeError):
         letter, point = None, np.zeros(0)
     right = letter == "" or (letter is not None and len(letter) == 1 and letter in LETTERS)
     if not right or point.shape not in ((0,), (2,)) or not np.isfinite(point).all():

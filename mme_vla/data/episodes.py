@@ -49,7 +49,7 @@ class EpisodeSource:
         root: str | Path,
         exec_starts: str | Path | None = None,
         name: str | None = None,
-        max_open_videos: int = 8,
+        max_open_videos: int = 512,
         robot: Embodiment = ROBOMME_JOINT,
     ) -> None:
         """Open a dataset; nothing is downloaded.

@@ -73,6 +73,8 @@ def make_env(
     if seed is None:
         spec = metadata.episode(task, split, episode)
         seed, difficulty = spec.seed, spec.difficulty
+        varied = metadata.check_split(split)
+        variant = {} if varied is None else varied.options
     return _make_own(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
                      recovery=recovery, **variant)  # fmt: skip
 

@@ -13,4 +13,4 @@ def files_to_hold(wanted: int) -> int:
         raised = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, raised), hard))
         soft = max(soft, raised)
-    return wanted if soft == resource.RLIM_INFINITY else max(min(wanted, soft - _OTHERS), 8)
+    return wanted if soft == resource.RLIM_INFINITY else min(wanted, max(soft - _OTHERS, 8))

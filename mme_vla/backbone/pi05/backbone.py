@@ -201,6 +201,8 @@ class Pi05Backbone(Backbone):
         def velocity(x: Tensor, i: int) -> Tensor:
             return self.denoise(x, conditions.at(i, rows), layout, past, injection)
 
+        if batch.overlap is None:
+            return flow.euler(noise, steps, velocity)
         times = flow.euler_times(steps, noise.device)
         return flow.euler(noise, steps, agreeing(velocity, batch.overlap, times))
 
