@@ -34,7 +34,7 @@ from mme_vla.config import plugins
 from mme_vla.config.endings import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
-from mme_vla.config.variant import POLICY, Sections, decisive, variant_name
+from mme_vla.config.variant import POLICY, Sections, decisive, may_remember, variant_name
 from mme_vla.config.words import join_memories, literal, several_memories
 from mme_vla.errors import UserError
 
@@ -152,13 +152,14 @@ def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> st
         found = composed(tuple(words), trees)
         return None if found is None else found[1]
 
-    return variant_name(
-        str(cfg.name),
-        decisive(cfg),
-        mine | theirs,
-        lambda model: composed((f"model={model}",), trees[:1] if model in theirs else trees),
-        parts,
-    )
+    sections = decisive(cfg)
+
+    def reference(model: str) -> tuple[str, Sections] | None:
+        if model in theirs and not may_remember(trees[0] / "model" / f"{model}.yaml", sections.get("memory.name")):
+            return None
+        return composed((f"model={model}",), trees[:1] if model in theirs else trees)
+
+    return variant_name(str(cfg.name), sections, mine | theirs, reference, parts)
 
 
 def _composed_sections(
