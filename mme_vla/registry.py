@@ -119,7 +119,13 @@ PROCESSORS: Registry[Any] = Registry(
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")
 TASKS: Registry[Any] = Registry("task")
-PLAYERS: Registry[Any] = Registry("player")
+PLAYERS: Registry[Any] = Registry(
+    "player",
+    {
+        **dict.fromkeys(("random", "oracle"), "mme_vla.play.players"),
+        **dict.fromkeys(("qwenvl", "gemini", "openai"), "mme_vla.play.vlm_players"),
+    },
+)
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REGISTRIES = {
     "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "policy": POLICIES,

@@ -72,6 +72,8 @@ def _on_the_page(run: PlayRun, participant: str, host: str, port: int) -> None:
     from mme_vla.play.web import serve
 
     serve(Desk(run, participant), host, port)
+    played = len(run.wanted) - len(run.todo)
+    log.info("ended · %d of %d episodes played; the same command goes on with the others", played, len(run.wanted))
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:

@@ -1,11 +1,36 @@
-"""The tasks as questions with a few answers: clips are shown, the next action is chosen, an oracle planner does it."""
+"""The tasks as questions with a few answers: clips are shown, the next action is chosen, an oracle planner does it.
 
-from mme_vla.embodiment.options import Option
-from mme_vla.play.game import ChoiceSession, Decision, EpisodeId, Reveal
-from mme_vla.play.players import PLAYERS, NoChoiceError, OraclePlayer, Player, RandomPlayer, build_player
-from mme_vla.play.vlm_players import GeminiPlayer, OpenAIPlayer, QwenPlayer
+Names are imported when they are used, so that `python -m mme_vla.play` can be stopped from its first moment on.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mme_vla.embodiment.options import Option
+    from mme_vla.play.game import ChoiceSession, Decision, EpisodeId, Reveal
+    from mme_vla.play.players import PLAYERS, NoChoiceError, OraclePlayer, Player, RandomPlayer, build_player
+    from mme_vla.play.vlm_players import GeminiPlayer, OpenAIPlayer, QwenPlayer
 
 __all__ = [
     "PLAYERS", "ChoiceSession", "Decision", "EpisodeId", "GeminiPlayer", "NoChoiceError", "OpenAIPlayer", "Option",
     "OraclePlayer", "Player", "QwenPlayer", "RandomPlayer", "Reveal", "build_player",
 ]  # fmt: skip
+
+_PLAYERS = ("PLAYERS", "NoChoiceError", "OraclePlayer", "Player", "RandomPlayer", "build_player")
+_HOMES = {
+    "Option": "mme_vla.embodiment.options",
+    **dict.fromkeys(("ChoiceSession", "Decision", "EpisodeId", "Reveal"), "mme_vla.play.game"),
+    **dict.fromkeys(("GeminiPlayer", "OpenAIPlayer", "QwenPlayer"), "mme_vla.play.vlm_players"),
+    **dict.fromkeys(_PLAYERS, "mme_vla.play.players"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])
