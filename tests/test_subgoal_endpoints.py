@@ -34,8 +34,8 @@ def policy() -> MMEPolicy:
 
 def heard(policy: MMEPolicy, name: str, *words: str) -> tuple[list[str | None], Any]:
     """Two subgoals of an episode, and the predictor, of `mme-vla evaluate subgoal=<name> <words>`."""
-    prices = ("subgoal.input_price=2", "subgoal.output_price=10", "subgoal.backoff=0", "subgoal.interval=16")
-    config = compose("evaluate", ["checkpoint=x", f"subgoal={name}", *prices, *words])
+    prices, quick = ("input_price=2", "output_price=10"), ("backoff=0", "interval=16", "requests_per_minute=null")
+    config = compose("evaluate", [f"subgoal={name}", *(f"subgoal.{word}" for word in (*prices, *quick)), *words])
     section = OmegaConf.to_container(config.subgoal, resolve=True)
     assert isinstance(section, dict)
     predictor = choose_subgoals(policy, {str(key): value for key, value in section.items()})

@@ -232,7 +232,7 @@ class RecurrentMemory(Memory):
             for size in pieces(count, self.chunk):
                 self._enter([(history, taken, new[at : at + size]) for history, taken, new in group])
                 at += size
-        return self.read(_stack([taken.state for taken in continued if taken.state is not None]))
+        return self.read(_stack([taken.state or self.init_state(1) for taken in continued]))
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Let a chunk of frames enter that the next decision's list has before its newest one.
@@ -256,7 +256,7 @@ class RecurrentMemory(Memory):
 
     def _enter(self, group: Sequence[tuple[History, Taken, np.ndarray]]) -> None:
         """Let equally many new frames enter each of these states."""
-        state = _stack([self.init_state(1) if taken.state is None else taken.state for _, taken, _ in group])
+        state = _stack([taken.state or self.init_state(1) for _, taken, _ in group])
         indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
         features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
         positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
