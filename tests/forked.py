@@ -79,6 +79,7 @@ def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: 
     sys.path.insert(0, str(cwd))
     sys.argv = list(words)
     if words[0].endswith(".py"):
+        sys.path.insert(0, str(Path(words[0]).resolve().parent))
         runpy.run_path(words[0], run_name="__main__")
     else:
         runpy.run_module(words[0], run_name="__main__", alter_sys=True)

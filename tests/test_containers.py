@@ -39,9 +39,13 @@ def test_a_dockerfile_says_nothing_that_cannot_be(file: Path) -> None:
             assert "--no-install-recommends" in rest and rest.endswith("rm -rf /var/lib/apt/lists/*"), rest
         if "pip install" in rest:
             assert "--no-cache-dir" in rest and re.search(r"\w==[\d.]+$", rest), rest
+        assert not re.search(r"\b(sudo|cd) |:latest|\| *(ba)?sh\b", rest), rest
         for script in re.findall(r"bash (\S+\.sh)", rest):
             assert (REPOSITORY / script).is_file()
     assert [rest for word, rest in found if word == "USER"][-1] != "root"
+    words = [word for word, _ in found]
+    assert words.index("WORKDIR") < words.index("COPY"), "a relative place needs a folder"
+    assert words.count("ENTRYPOINT") == words.count("CMD") == 1
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)

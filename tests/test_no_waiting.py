@@ -4,17 +4,12 @@ On the meta device every operation runs without numbers, so that one that needs 
 out. The GPU that does nothing (`../shared/noop_gpu`, where it is at hand) counts what PyTorch's CUDA build really asks.
 """
 
-import os
-import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
-from conftest import REPOSITORY
+from noop_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -22,7 +17,6 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch, small_policy
 
 MODELS = ["tokendrop_expert", "framesamp_modul", "ttt_expert", "rmt_context"]
-NOOP = REPOSITORY.parent / "shared" / "noop_gpu" / "stub.c"
 
 
 class HostWork(TorchDispatchMode):
@@ -113,21 +107,10 @@ for model in ("framesamp_modul", "rmt_context"):
 """
 
 
-@pytest.mark.skipif(not NOOP.exists(), reason=f"no GPU that does nothing: {NOOP} is absent")
-@pytest.mark.skipif(shutil.which("gcc") is None, reason="no gcc to build the GPU that does nothing")
-@pytest.mark.skipif(torch.version.cuda is None or torch.cuda.is_available(), reason="not PyTorch's CUDA build alone")
-def test_a_gpu_that_does_nothing_counts_no_wait_and_one_launch_a_chunk(tmp_path: Path) -> None:
-    site = Path(torch.__file__).parents[1]
-    headers = [site / "nvidia" / "cu13" / "include", site / "triton" / "backends" / "nvidia" / "include"]
-    if not all(folder.is_dir() for folder in headers):
-        pytest.skip("this PyTorch brings no CUDA 13 headers")
-    library = tmp_path / "libcuda.so.1"
-    included = [f"-I{folder}" for folder in headers]
-    subprocess.run(["gcc", "-shared", "-fPIC", "-O1", "-w", *included, "-o", library, NOOP, "-ldl"], check=True)
-    faked = {**os.environ, "LD_PRELOAD": str(library), "LD_LIBRARY_PATH": str(tmp_path), "OMP_NUM_THREADS": "1"}
-    told = subprocess.run([sys.executable, "-c", COUNTING], env=faked, cwd=REPOSITORY, capture_output=True, text=True)
-    assert told.returncode == 0, told.stderr[-2000:]
-    lines = [line.split() for line in told.stdout.splitlines()]
+@needs_noop_gpu
+def test_a_gpu_that_does_nothing_counts_no_wait_and_one_launch_a_chunk(noop_gpu: NoopGpu) -> None:  # noqa: F811
+    told = noop_gpu.run("-c", COUNTING)
+    lines = [line.split() for line in told.splitlines()]
     assert [line[:2] for line in lines] == [
         [m, w] for m in ("framesamp_modul", "rmt_context") for w in ("update", "chunk")
     ]

@@ -33,6 +33,9 @@ class Memory(nn.Module):
     `reporting` is set from outside: True asks `forward` for numbers about its inside, as `MemoryTokens.metrics`. The
     training loop sets it for the updates it logs; where it is False, what only these numbers need is not computed.
 
+    `float32_products`, set from outside too, says how a GPU multiplies what a memory computes in float32: `ieee` or
+    `tf32`.
+
     and implements `select` and `forward`.
     """
 
@@ -44,6 +47,7 @@ class Memory(nn.Module):
     reads_motion: bool = False
     lazy: bool = False
     reporting: bool = False
+    float32_products: str = "ieee"
 
     def check_grid(self, views: int) -> None:
         """Make sure that views of views×views tokens can be pooled to what this memory stores.
@@ -100,6 +104,12 @@ class Memory(nn.Module):
     def compile(self, **options: Any) -> None:
         """Compile in place what many small steps make slow; by default nothing is. `options` are `torch.compile`'s."""
 
+    def choose_products(self, how: str) -> None:
+        """Set `float32_products`, of members too."""
+        for module in self.modules():
+            if isinstance(module, Memory):
+                module.float32_products = how
+
     def make_scorer(self) -> FrameScorer | None:
         """Return a fresh scorer for one episode, or None when frames need no scores."""
         return None
@@ -152,6 +162,19 @@ class Memory(nn.Module):
             histories: one per episode. streams: what `start_stream` gave each of them; updated in place.
         """
         return self(stack_history([self.recall(history, len(history) - 1) for history in histories]))
+
+    def prepare(self, history: History, stream: Any) -> bool:
+        """Do a piece of what the next `encode` of a running episode will need, while nobody waits for it.
+
+        What comes of it may never be needed, and must change no token. By default there is nothing to prepare.
+
+        Args:
+            history, stream: as in `encode`, after it.
+
+        Returns:
+            Whether a piece is left.
+        """
+        return False
 
 
 def every_one(lists: Sequence[np.ndarray]) -> np.ndarray:

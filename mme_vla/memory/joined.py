@@ -114,6 +114,10 @@ class JoinedMemory(Memory):
             for i, member in enumerate(self.memories)
         ])  # fmt: skip
 
+    def prepare(self, history: History, stream: Any) -> bool:
+        members = zip(self.memories, self._views(history), stream, strict=True)
+        return sum(member.prepare(view, own) for member, view, own in members) > 0  # a piece of each
+
     @property
     def memories(self) -> list[Memory]:
         """The members, in their order."""

@@ -6,7 +6,6 @@ Two forms of the same computation: `forward` runs a whole window, for training a
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -15,15 +14,14 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
+from mme_vla.backbone.layers.precision import float32_products
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory, every_one, token_positions, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.sampling import jittered, recurrent_frames
+from mme_vla.memory.streams import RecurrentStream, State, Taken, pieces
 from mme_vla.types import HistoryTokens, MemoryTokens
-
-State = tuple[Tensor, ...]
-"""What is carried from frame to frame; each tensor [b, …]."""
 
 Statistics = dict[str, Tensor]
 """Numbers about each step, [b, t], detached."""
@@ -61,18 +59,6 @@ class RecurrentLayer(nn.Module):
     def summary(self, start: State, end: State) -> dict[str, Tensor]:
         """Numbers about a whole window, from the states around it."""
         return {}
-
-
-@dataclass
-class RecurrentStream:
-    """How far one episode's recurrence has come.
-
-    frames: those the state has taken, in order. updates: frames taken since the episode began, repeated ones included.
-    """
-
-    frames: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
-    state: State | None = None
-    updates: int = 0
 
 
 class RecurrentMemory(Memory):
@@ -167,7 +153,13 @@ class RecurrentMemory(Memory):
         """
         # Statistics are wanted of one update in many: not worth compiling for.
         compiled = None if self.reporting else self._compiled
-        step = self.layer.advance if compiled is None else partial(compiled, self.layer)
+        advance = self.layer.advance if compiled is None else partial(compiled, self.layer)
+        how = self.float32_products
+
+        def step(*inputs: Any) -> tuple[State, Statistics]:
+            with float32_products(how):  # here, where the backward pass computes the chunk again
+                return advance(*inputs)
+
         window = self.layer.window
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.
@@ -204,7 +196,8 @@ class RecurrentMemory(Memory):
             features: [b, n, d_vision], n a multiple of a frame's tokens. positions: [b, n, 3]. mask: [b, n].
         """
         x = self.encoder(features, positions, mask)
-        return self.layer.advance(state, self._by_frame(x), self._by_frame(mask).all(-1))[0]
+        with float32_products(self.float32_products):
+            return self.layer.advance(state, self._by_frame(x), self._by_frame(mask).all(-1))[0]
 
     def read(self, state: State) -> MemoryTokens:
         """The memory tokens of a state."""
@@ -219,29 +212,59 @@ class RecurrentMemory(Memory):
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         """Memory tokens of running episodes.
 
-        While an episode's frame list extends the one its stream has taken, only the new frames enter; where it does
-        not (a replan off the stride, or a list that lost its first frames), the stream starts again. Episodes with
-        equally many new frames go through the layer together.
+        While an episode's frame list extends one that its stream has taken, only the new frames enter. Where it does
+        not (replans at an uneven pace, or a list that lost its first frames and was not prepared), a fresh state takes
+        the whole list. Episodes with equally many new frames go through the layer together.
         """
-        pending: dict[int, list[tuple[History, RecurrentStream, np.ndarray]]] = defaultdict(list)
+        pending: dict[int, list[tuple[History, Taken, np.ndarray]]] = defaultdict(list)
+        continued = []
         for history, stream in zip(histories, streams, strict=True):
-            frames = self.frames(history, len(history) - 1)
-            if not np.array_equal(frames[: len(stream.frames)], stream.frames):
-                stream.frames, stream.state = frames[:0], None
-            new = frames[len(stream.frames) :]
-            if len(new):
-                pending[len(new)].append((history, stream, new))
-        for group in pending.values():
-            state = _stack([self.init_state(1) if stream.state is None else stream.state for _, stream, _ in group])
-            indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
-            features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
-            positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
-            everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
-            state = self.update(state, features, torch.from_numpy(positions).to(features.device), everywhere)
-            for i, (_, stream, new) in enumerate(group):
-                stream.state = tuple(tensor[i : i + 1] for tensor in state)
-                stream.frames, stream.updates = np.append(stream.frames, new), stream.updates + len(new)
-        return self.read(_stack([stream.state for stream in streams]))
+            step = len(history) - 1
+            stream.decides(step)
+            frames = self.frames(history, step)
+            taken = stream.continued(frames)
+            new = frames[len(taken.frames) :]
+            pending[len(new)].append((history, taken, new))
+            stream.updates += len(new)
+            continued.append(taken)
+        for count, group in pending.items():
+            at = 0
+            for size in pieces(count, self.chunk):
+                self._enter([(history, taken, new[at : at + size]) for history, taken, new in group])
+                at += size
+        return self.read(_stack([taken.state or self.init_state(1) for taken in continued]))
+
+    def prepare(self, history: History, stream: Any) -> bool:
+        """Let a chunk of frames enter that the next decision's list has before its newest one.
+
+        The next decision is expected as long after the last one as that came after the one before. There is something
+        to do where its list does not extend one that was taken: once a list is full its first frames go, and the
+        released computation begins anew behind them at every decision.
+        """
+        if stream.asked is None:
+            return False
+        expected = self.frames(history, stream.asked + (stream.pace or self.stride))[:-1]
+        expected = expected[expected < len(history)]
+        if not len(expected):
+            return False
+        taken = stream.continued(expected)
+        new = expected[len(taken.frames) :][: self.chunk]
+        if len(new):
+            self._enter([(history, taken, new)])
+            stream.updates += len(new)
+        return len(taken.frames) < len(expected)
+
+    def _enter(self, group: Sequence[tuple[History, Taken, np.ndarray]]) -> None:
+        """Let equally many new frames enter each of these states."""
+        state = _stack([taken.state or self.init_state(1) for _, taken, _ in group])
+        indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
+        features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
+        positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
+        everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)
+        state = self.update(state, features, torch.from_numpy(positions).to(features.device), everywhere)
+        for i, (_, taken, new) in enumerate(group):
+            taken.state = tuple(tensor[i : i + 1] for tensor in state)
+            taken.frames = np.append(taken.frames, new)
 
     def _by_frame(self, x: Tensor) -> Tensor:
         return x.unflatten(1, (-1, self.storage.grid**2))

@@ -155,6 +155,17 @@ class Policy(Saved):
             episode.acted(chosen)
         return actions
 
+    def prepare(self, episode: Episode) -> bool:
+        """Do a piece of what an episode's next chunk will need, in time in which nobody waits; no action changes.
+
+        Server and rollouts call it while robots move: a recurrent memory whose list of frames is full would otherwise
+        take all of them anew when the next chunk is asked for.
+
+        Returns:
+            Whether a piece is left.
+        """
+        return False
+
     def observation(self, episodes: Sequence[Episode]) -> Any:
         """What running episodes see now, as a batch of the processor's kind on the policy's device."""
         raise NotImplementedError

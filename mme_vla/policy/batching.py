@@ -3,7 +3,8 @@
 Episodes bring frames, which are read in pieces, and then wait for actions, chosen for many at once. A turn is: the new
 frames of everyone who has only a piece left, then one batch of whoever waits for actions, then pieces of long videos
 for as long as the rest of the turn took, at least one. So whoever replans at the same time travels together, and those
-with a thousand frames and those with few each get half of the machine while there are both.
+with a thousand frames and those with few each get half of the machine while there are both. Where nobody waits, a piece
+is done of what a later batch will need.
 """
 
 import time
@@ -11,6 +12,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Protocol
+from weakref import WeakKeyDictionary
 
 
 class Reading(Protocol):
@@ -36,7 +38,14 @@ class Act[A]:
     batch: list[A]
 
 
-class Turns[R: Reading, A]:
+@dataclass(frozen=True)
+class Prepare[L]:
+    """Do a piece of what this will need when it acts next; whoever does it says where more is left (`Turns.later`)."""
+
+    work: L
+
+
+class Turns[R: Reading, A, L]:
     """Collects who waits; `turn` says what is to be done next, and the caller does it before asking on.
 
     Args:
@@ -47,12 +56,14 @@ class Turns[R: Reading, A]:
         self.max_batch = max_batch
         self.reading: deque[R] = deque()
         self.acting: deque[A] = deque()
+        self.later: WeakKeyDictionary[L, None] = WeakKeyDictionary()
+        """Who has acted and will again, each once; whoever is gone is not kept for it."""
 
     def __bool__(self) -> bool:
-        """Whether anybody waits."""
-        return bool(self.reading or self.acting)
+        """Whether there is anything to do."""
+        return bool(self.reading or self.acting or self.later)
 
-    def turn(self) -> Iterator[Read[R] | Act[A]]:
+    def turn(self) -> Iterator[Read[R] | Act[A] | Prepare[L]]:
         """The steps of one turn. Who comes in the meantime may be in its batch already."""
         begun = time.perf_counter()
         for short in [work for work in self.reading if work.pieces <= 1]:
@@ -65,6 +76,9 @@ class Turns[R: Reading, A]:
             yield from self._piece(long)
             if time.perf_counter() > until:
                 break
+        if not (self.reading or self.acting) and (work := next(iter(self.later), None)) is not None:
+            del self.later[work]
+            yield Prepare(work)
 
     def _piece(self, work: R) -> Iterator[Read[R]]:
         self.reading.remove(work)

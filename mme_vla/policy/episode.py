@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
-from mme_vla.memory.history import OnlineHistory
+from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.policy.promises import Promise, checked_promise
 from mme_vla.processing.limits import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
@@ -58,6 +58,8 @@ class Episode:
             self.history.motion = lambda frames: torch.stack([self._moved[int(frame)] for frame in frames])
         self.stream = None if memory is None else memory.start_stream()
         """What the memory carries from one `act` to the next, where it has something to carry."""
+        self.read: History | None = None
+        """The history as the last `act` read it, where a backbone marks what is stored."""
         self.frames_seen = 0
         self._moved: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
         self._chunk: np.ndarray | None = None

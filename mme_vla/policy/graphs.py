@@ -37,6 +37,7 @@ class GraphSampler:
         self._run = run
         self._captured: dict[tuple[object, ...], _Captured] = {}
         self._pool: Any = None
+        self._stream: Any = None
 
     def __len__(self) -> int:
         """Sizes captured so far."""
@@ -62,17 +63,17 @@ class GraphSampler:
         return captured.chunks[:rows].clone()
 
     def _capture(self, inputs: Inputs) -> _Captured:
-        # Libraries choose their kernels and take their workspaces in a first run, which no graph may hold.
-        beside = torch.cuda.Stream()
-        beside.wait_stream(torch.cuda.current_stream())
-        with torch.cuda.stream(beside):
-            self._run(inputs)
-        torch.cuda.current_stream().wait_stream(beside)
         if self._pool is None:
-            self._pool = torch.cuda.graph_pool_handle()
+            self._pool, self._stream = torch.cuda.graph_pool_handle(), torch.cuda.Stream()
+        # Libraries choose their kernels and take their workspaces (cuBLAS 32 MiB a stream) in a first run, which no
+        # graph may hold: on the stream that all graphs are captured on, so that they are there.
+        self._stream.wait_stream(torch.cuda.current_stream())
+        with torch.cuda.stream(self._stream):
+            self._run(inputs)
+        torch.cuda.current_stream().wait_stream(self._stream)
         graph = torch.cuda.CUDAGraph()
         # Other threads may use the GPU meanwhile: a subgoal predictor does.
-        with torch.cuda.graph(graph, pool=self._pool, capture_error_mode="thread_local"):
+        with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
             chunks = self._run(inputs)
         return _Captured(graph, inputs, chunks)
 

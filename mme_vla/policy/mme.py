@@ -13,6 +13,7 @@ from torch import Tensor
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
+from mme_vla.backbone.layers.precision import checked_products
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shape import read_backbone
 from mme_vla.backbone.shard_groups import ShardGroup
@@ -58,6 +59,7 @@ class MMEPolicy(Policy):
         history_dtype: str = "bfloat16",
         augment: bool = True,
         attention: str = "auto",
+        float32_products: str = "ieee",
     ) -> None:
         """Put the parts together.
 
@@ -68,6 +70,7 @@ class MMEPolicy(Policy):
             history_dtype: dtype of stored vision tokens; bfloat16 as released.
             augment: augment the current views while training (memory features never are).
             attention: what computes it: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
+            float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
         """
         super().__init__()
         self.backbone, self.memory, self.integration = backbone, memory, integration
@@ -77,6 +80,8 @@ class MMEPolicy(Policy):
         self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
         backbone.choose_attention(attention)
+        if memory is not None:
+            memory.choose_products(checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         self.sample_steps = backbone.sample_steps
         self.agrees = backbone.agrees
@@ -326,7 +331,16 @@ class MMEPolicy(Policy):
                 MarkedHistory(e.required_history(), partial(self._mark_one, batch.prompt[i], batch.prompt_mask[i]))
                 for i, e in enumerate(episodes)
             ]
+            for episode, history in zip(episodes, histories, strict=True):
+                episode.read = history
             return self.memory.encode(histories, [e.stream for e in episodes])
+
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        if self.memory is None or episode.read is None:
+            return False
+        with self.autocast():
+            return self.memory.prepare(episode.read, episode.stream)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray:
         """What the memory reads; nothing without one."""

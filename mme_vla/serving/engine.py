@@ -1,6 +1,7 @@
 """The one thread that runs the policy: waiting requests travel in one batch, long videos in pieces between batches."""
 
 import asyncio
+import logging
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -11,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mme_vla.policy.base import Policy
-from mme_vla.policy.batching import Read, Turns
+from mme_vla.policy.batching import Act, Read, Turns
 from mme_vla.policy.episode import Episode
 from mme_vla.serving.counters import ServerStats
+
+logger = logging.getLogger("mme_vla.serving")
 
 
 @dataclass(eq=False)
@@ -45,7 +48,7 @@ class Engine:
         self.policy = policy
         self.flow_steps = flow_steps
         self.stats = stats or ServerStats()
-        self.turns: Turns[_Waiting[Iterator[None]], _Waiting[Episode]] = Turns(max_batch)
+        self.turns: Turns[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Turns(max_batch)
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
         self._readers = ThreadPoolExecutor(2, "decode")
@@ -101,8 +104,10 @@ class Engine:
             if isinstance(step, Read):
                 await self._piece(step.work)
                 await asyncio.sleep(0)  # those whose frames are in now ask for actions
-            else:
+            elif isinstance(step, Act):
                 await self._batch([waiting for waiting in step.batch if not waiting.future.done()])
+            else:
+                await self._prepare(step.work)
 
     async def _batch(self, batch: list[_Waiting[Episode]]) -> None:
         if not batch:
@@ -116,6 +121,17 @@ class Engine:
                 _fail(waiting.future, chunk)
             elif not waiting.future.done():
                 waiting.future.set_result(chunk)
+                self.turns.later[waiting.work] = None
+
+    async def _prepare(self, episode: Episode) -> None:
+        """A piece of what a client's next request will need, while its robot moves."""
+        try:
+            left = await self.call(lambda: self.policy.prepare(episode))
+        except Exception:
+            logger.exception("preparing an episode's next chunk failed; it will be computed when it is asked for")
+            return
+        if left:
+            self.turns.later[episode] = None
 
     def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
         """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that none fails another."""

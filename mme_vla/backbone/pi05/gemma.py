@@ -64,7 +64,9 @@ class GatedMLP(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         gate, up = self.gate_up(x).chunk(2, dim=-1)
-        return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
+        if torch.is_grad_enabled():
+            return self.down(nn.functional.gelu(gate, approximate="tanh") * up)
+        return self.down(torch.ops.aten.gelu_(gate, approximate="tanh").mul_(up))  # in place: a chunk's largest tensors
 
 
 class ExpertLayer(nn.Module):
@@ -297,7 +299,9 @@ class JointTransformer(nn.Module):
             args = (segments, layout.turn, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
             segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
             if keep:
-                cached.append(_after(past.layers[i] if past else None, *kv))
+                # Copies where they are views: a view would keep all queries of its layer alive.
+                k, v = _after(past.layers[i] if past else None, *kv)
+                cached.append((k.contiguous(), v.contiguous()))
         answer = None
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition

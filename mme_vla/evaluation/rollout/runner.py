@@ -26,7 +26,7 @@ from mme_vla.evaluation.rollout.subgoal_score import EXTRA
 from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
 from mme_vla.evaluation.rollout.waiting import Waiting
 from mme_vla.policy.base import Policy
-from mme_vla.policy.batching import Act, Turns
+from mme_vla.policy.batching import Act, Prepare, Turns
 from mme_vla.subgoal import SubgoalPredictor
 
 GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
@@ -101,7 +101,7 @@ class Rollout:
     _stillborn: int = 0
 
     def __post_init__(self) -> None:
-        self._turns: Turns[RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
+        self._turns: Turns[RunningEpisode, RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
         self._pictures = Pictures(self.policy, self.subgoals, self.settings)
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
@@ -139,6 +139,7 @@ class Rollout:
     def _take(self, reply: Reply) -> None:
         """Deal with what came back from a worker."""
         running = self._running[reply.worker]
+        self._turns.later.pop(running, None)
         running.tick(reply.info)
         if reply.info.get("exception_type") == "UserError" and reply.crashed:
             raise UserError(str(reply.info.get("error_message")))
@@ -181,6 +182,9 @@ class Rollout:
         for step in self._turns.turn():
             if isinstance(step, Act):
                 self._act(step.batch)
+            elif isinstance(step, Prepare):
+                if self.policy.prepare(step.work.episode):
+                    self._turns.later[step.work] = None
             else:
                 step.work.read()
                 if not step.work.pieces:
@@ -207,6 +211,7 @@ class Rollout:
             running.chosen(actions)
             draw = self._pictures.of_chunk(running.episode.frames_seen, len(actions), running.video_frames)
             self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
+            self._turns.later[running] = None
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         """Record an episode and let its worker begin another."""

@@ -243,6 +243,13 @@ class DiffusionPolicy(Policy):
                 memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
         return self.sample_actions(batch, draws, steps, memory)
 
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        if self.memory is None or not episode.frames_seen:
+            return False
+        with self.autocast():
+            return self.memory.prepare(episode.required_history(), episode.stream)
+
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
         processor = self.require_processor()

@@ -24,7 +24,7 @@ class MMEVLAConfig(PreTrainedConfig):
     composition: the whole configuration as JSON; saving writes it, so that a checkpoint needs no other file for it.
     exec_starts: side file of first execution frames, for datasets that do not mark their conditioning video.
     cache_root: folder of the vision caches that a memory trains on. max_build_frames: larger datasets have theirs built
-        beforehand (`python -m mme_vla.data.cache`).
+        beforehand (`python -m mme_vla.data.cache`). cache_local: every machine has a `cache_root` of its own.
     freeze_vision: leave the vision tower as it is; a memory needs that.
     n_action_steps: actions of a chunk that are executed; by default the embodiment's. flow_steps: of the sampler.
     seed: of fresh weights, and of every episode's noise.
@@ -36,6 +36,7 @@ class MMEVLAConfig(PreTrainedConfig):
     composition: str | None = None
     exec_starts: str | None = None
     cache_root: str | None = None
+    cache_local: bool = False
     max_build_frames: int = 5000
     freeze_vision: bool = True
     n_action_steps: int | None = None

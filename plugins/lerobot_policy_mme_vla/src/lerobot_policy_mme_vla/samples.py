@@ -5,9 +5,12 @@ So a step is looked up by its `index` in the dataset as mme-vla opens it: histor
 chunks as in mme-vla's own training.
 """
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from torch import Tensor
+from torch import Tensor, distributed
 
 from mme_vla import Policy
 from mme_vla.data.dataset import TrainingDataset
@@ -45,10 +48,26 @@ class Samples:
         if self._steps is None:
             processor = self._model.require_processor()
             known = processor.stats
-            self._steps = _steps(self._model, self._config, self._entry)
+            with _one_first(self._config.cache_local):
+                self._steps = _steps(self._model, self._config, self._entry)
             if known is not None:
                 processor.stats = known  # those that the weights were trained with
         return self._steps
+
+
+@contextmanager
+def _one_first(of_machine: bool) -> Iterator[None]:
+    """Of processes that train together the first (of each machine) goes ahead, so that caches are built once."""
+    together = distributed.is_available() and distributed.is_initialized() and distributed.get_world_size() > 1
+    rank = int(os.environ.get("LOCAL_RANK", "0")) if of_machine or not together else distributed.get_rank()
+    first = rank == 0
+    if together and not first:
+        distributed.barrier()
+    try:
+        yield
+    finally:  # also where it failed: the others then fail alike, and do not wait
+        if together and first:
+            distributed.barrier()
 
 
 def _steps(model: Policy, config: "MMEVLAConfig", entry: dict[str, Any]) -> TrainingDataset:
