@@ -25,6 +25,12 @@ def pose_at(number: int) -> np.ndarray:
     return np.array([0.1 * number, 0.2, 0.3, np.pi, 0.0, 0.01 * number, 1.0 if number % 2 else -1.0])
 
 
+def tool_at(number: int) -> np.ndarray:
+    """Where the tool is: short of the pose that is commanded, and on the other side of a half turn."""
+    lag = np.array([0.01, -0.02, 0.001 * number, 0.05, 0.1, -0.1])
+    return (pose_at(number)[:6] - lag + [0, 0, 0, -2 * np.pi, 0, 0]).astype(np.float32)
+
+
 OPTIONS = [
     {"label": "a", "action": "pick up the cube", "need_parameter": True},
     {"label": "b", "action": "press the button", "need_parameter": False},
@@ -79,6 +85,7 @@ def write_file(
                     _add_choice(episode, step, t, t < length - 2)
                 if poses:
                     since = t - video if t >= video else t
+                    step["obs/eef_state"] = tool_at(t)
                     step["action/eef_action"] = pose_at(t)
                     step["action/waypoint_action"] = pose_at(100 + t // 4) if since >= 3 else np.full(7, np.nan)
                 done = t >= length - 2

@@ -1,6 +1,7 @@
 """Short runs of the training command in this process, at sizes below the tiny ones."""
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,9 @@ SHORT = [
 ]  # fmt: skip
 
 
-def run(model: str, folder: Path, *overrides: str) -> Path:
-    """Train a model on the sample; the last checkpoint."""
-    cfg = compose("train", [f"model={model}", *SHORT, f"data.cache.root={folder.parent / 'caches'}", *overrides])
+def run(model: str, folder: Path, *overrides: str, short: Sequence[str] = SHORT) -> Path:
+    """Train a model, by default on the sample; the last checkpoint."""
+    cfg = compose("train", [f"model={model}", *short, f"data.cache.root={folder.parent / 'caches'}", *overrides])
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     return train(cfg, config, folder, begun=time.perf_counter())
 

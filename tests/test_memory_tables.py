@@ -35,7 +35,7 @@ def sizes() -> ModuleType:
 @pytest.mark.parametrize("model", ["pi05", "tokendrop_expert", "framesamp_modul", "ttt_context", "rmt_expert"])
 def test_sizes_are_those_of_the_page(sizes: ModuleType, model: str) -> None:
     written = (DOCS / "performance.md").read_text()
-    assert sizes.row(model) in written.splitlines()
+    assert sizes.of_model(model) in written.splitlines()
 
 
 def test_the_page_has_every_model() -> None:

@@ -84,6 +84,26 @@ def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
 
 
 @torch.no_grad()
+def test_pictures_are_changed_by_given_draws_alone_whatever_stands_beside_them() -> None:
+    policy = tiny().train()
+    batch = batch_of(policy)
+    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    drawn = [draws | policy.picture_draws(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    assert drawn[0]["changes"].shape == (2, 4, 6)
+    first, again, other = (policy(batch, each)[0] for each in drawn)
+    assert torch.equal(first, again) and not torch.equal(first, other)
+    halves = [
+        policy(
+            GroupBatch(**{k: v[i : i + 1] for k, v in vars(batch).items()}),
+            {k: v[i : i + 1] for k, v in drawn[0].items()},
+        )
+        for i in range(2)
+    ]
+    torch.testing.assert_close(sum(loss for loss, _ in halves) / 2, first)
+    assert policy.eval().picture_draws(2, torch.Generator()) == {}
+
+
+@torch.no_grad()
 def test_groups_of_a_batch_and_their_padding_do_not_meet() -> None:
     policy = tiny()
     data, collate = groups(policy), policy.require_processor().collate
@@ -170,6 +190,12 @@ def test_a_prompt_ends_in_the_opening_piece_and_the_end_of_the_text() -> None:
         cut = processor.prompt("press " * 200)
     for ids, mask in (processor.prompt("press the button"), cut):
         assert ids[mask][-2:].tolist() == [processor.tokenizer.piece("▁"), processor.tokenizer.end]
+
+
+def test_it_counts_on_meta_without_anything_to_show() -> None:
+    policy = build_policy("memoryvla", device="meta")
+    batch = policy.full_batch("meta")
+    assert policy(batch)[0].is_meta and policy.sample_actions(batch).shape == (1, 16, 8)
 
 
 def test_what_it_has_no_place_for_is_refused_in_words() -> None:

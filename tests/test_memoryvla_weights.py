@@ -4,9 +4,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from mme_vla import UserError, build_policy
-from mme_vla.weights.load import load_weights
+from mme_vla.policy.base import Policy
+from mme_vla.weights.load import load_weights, transfer
+from mme_vla.weights.memoryvla import memoryvla_adapter
+from mme_vla.weights.names.openvla import VLA
+from mme_vla.weights.openvla import openvla_adapter
 from mme_vla.weights.source import detect_format
 from mme_vla.weights.writers import WRITERS, check_target
 
@@ -24,6 +29,41 @@ def test_a_checkpoint_is_written_by_parts_and_read_again(tmp_path: Path) -> None
     load_weights(other, file)
     for name, tensor in policy.state_dict().items():
         assert torch.equal(tensor, other.state_dict()[name]), name
+
+
+def of_vlm(policy: Policy) -> dict[str, torch.Tensor]:
+    return {name: tensor for name, tensor in policy.state_dict().items() if name.startswith("vlm.")}
+
+
+def test_openvla_is_a_start_that_has_nothing_of_banks_and_head(tmp_path: Path) -> None:
+    """Small files in the layout of `openvla/openvla-7b`, and in that of its Prismatic original."""
+    openvla = build_policy("openvla_oft", seed=1, backbone={"vision": {"image_size": 56}})  # as large as memoryvla_tiny
+    theirs = openvla_adapter(openvla).export(openvla.state_dict())
+    base = {name.removeprefix(VLA): tensor.contiguous() for name, tensor in theirs.items() if name.startswith(VLA)}
+    save_file(base, tmp_path / "model.safetensors")
+    expected = {
+        n.removeprefix("backbone."): t for n, t in openvla.state_dict().items() if n.startswith("backbone.vlm.")
+    }
+    policy = build_policy("memoryvla", seed=2)
+    fresh = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
+    took = transfer(policy, tmp_path)
+    assert set(took.taken) == set(expected) and not took.left
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in of_vlm(policy).items())
+    assert all(torch.equal(policy.state_dict()[name], fresh[name]) for name in took.new)
+    with pytest.raises(UserError, match="missing"):
+        load_weights(policy, tmp_path)
+
+    whole = memoryvla_adapter(policy).export(policy.state_dict())
+    model: dict[str, dict[str, torch.Tensor]] = {}
+    for name, tensor in whole.items():
+        part, _, own = name.partition(".")
+        if part in ("vision_backbone", "projector", "llm_backbone"):
+            model.setdefault(part, {})[own] = tensor
+    torch.save({"model": model}, tmp_path / "prismatic.pt")
+    other = build_policy("memoryvla", seed=3)
+    took = transfer(other, tmp_path / "prismatic.pt")
+    assert set(took.taken) == set(expected) and of_vlm(other).keys() == of_vlm(policy).keys()
+    assert all(torch.equal(tensor, expected[name]) for name, tensor in of_vlm(other).items())
 
 
 def test_another_policy_has_no_place_in_it() -> None:

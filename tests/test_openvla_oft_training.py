@@ -8,11 +8,13 @@ import pytest
 import torch
 from prior_vla_runs import losses, run
 
+from mme_vla.config.composition import compose
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
+from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.openvla import OpenVlaPolicy
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import random_batch
@@ -75,3 +77,28 @@ def test_only_steps_with_a_full_chunk_are_learned_from_and_quantiles_are_exact()
     np.testing.assert_allclose(processor.stats.actions.max, actions.max(0))
     item = dataset[0]
     assert item["proprio"].abs().max() <= 1 and item["actions"].abs().max() <= 1
+
+
+def test_the_frozen_base_is_held_in_bfloat16_and_what_learns_in_float32() -> None:
+    policy = build_policy(
+        "openvla_oft", policy={"compute_dtype": "bfloat16"}, backbone={"vision": {"image_size": 32, "patch_size": 2}}
+    )
+    assert isinstance(policy, OpenVlaPolicy)
+    batch = replace(random_batch(policy), proprio=torch.zeros(2, policy.embodiment.state.width))
+    before = policy.eval()(batch)[0].item()
+    apply_finetuning(
+        policy, "lora", freeze_vision=False, rank=2, train=["state_token", "head"], frozen_dtype="bfloat16"
+    )
+    dtypes = {learns: {p.dtype for p in policy.parameters() if p.requires_grad is learns} for learns in (True, False)}
+    assert dtypes == {True: {torch.float32}, False: {torch.bfloat16}}
+    loss, _ = policy(batch)
+    assert loss.item() == pytest.approx(before, rel=0.03), "adapters begin at nothing, and the base is what it was"
+    loss.backward()
+    learned = [p.grad for p in policy.parameters() if p.grad is not None]
+    assert all(grad.dtype == torch.float32 and torch.isfinite(grad).all() for grad in learned)
+    assert any(grad.abs().sum() > 0 for grad in learned)
+
+
+def test_the_recipe_holds_the_base_so() -> None:
+    cfg = compose("train", ["experiment=openvla_oft"])
+    assert (cfg.finetune.mode, cfg.finetune.frozen_dtype, cfg.policy.compute_dtype) == ("lora", "bfloat16", "bfloat16")

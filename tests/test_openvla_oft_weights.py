@@ -1,16 +1,18 @@
 """OpenVLA's and OpenVLA-OFT's files: written, read, and started from."""
 
+import json
 from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy.base import Policy
-from mme_vla.policy.finetune import apply_finetuning
+from mme_vla.policy.finetune import apply_finetuning, merge_adapters
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.load import load_weights, transfer
+from mme_vla.weights.names.openvla import VLA, openvla_name
 from mme_vla.weights.source import detect_format
 from mme_vla.weights.writers import WRITERS, check_target
 
@@ -57,6 +59,38 @@ def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_pa
         assert not took.left
     with pytest.raises(UserError, match="action_head/model"):
         load_weights(built(seed=2), folder)
+
+
+def test_a_run_that_holds_its_adapters_alone_is_read_beside_its_base(tmp_path: Path) -> None:
+    policy, run = built(), tmp_path / "run"
+    base = written(policy, tmp_path / "base")
+    (run / "lora_adapter").mkdir(parents=True)
+    for file in base.glob("*.pt"):
+        file.rename(run / file.name)
+    apply_finetuning(policy, "lora", freeze_vision=False, rank=2, alpha=3.0)
+    generator = torch.Generator().manual_seed(0)
+    adapters = {}
+    for name, parameter in policy.named_parameters():
+        if ".lora_" in name:
+            torch.nn.init.normal_(parameter, generator=generator)
+            theirs = str(openvla_name(name)).removeprefix(VLA).replace(".default.", ".")
+            adapters[f"base_model.model.{theirs}"] = parameter.detach().clone()
+    save_file(adapters, run / "lora_adapter" / "adapter_model.safetensors")
+    said = {"r": 2, "lora_alpha": 3.0, "base_model_name_or_path": "openvla/openvla-7b"}
+    (run / "lora_adapter" / "adapter_config.json").write_text(json.dumps(said))
+    merge_adapters(policy)
+    read = load_weights(built(seed=2), run, base=base)
+    for name, tensor in policy.state_dict().items():
+        torch.testing.assert_close(read.state_dict()[name], tensor, msg=name)
+    assert sum(not torch.equal(t, built().state_dict()[n]) for n, t in read.state_dict().items()) == len(adapters) // 2
+    with pytest.raises(UserError, match=r"adapters apart .*openvla/openvla-7b.*base="):
+        load_weights(built(seed=2), run)
+    with pytest.raises(UserError, match="leave it out"):
+        load_weights(built(seed=2), base, base=base)
+    adapters.pop(next(name for name in adapters if name.endswith("lora_B.weight")))
+    save_file(adapters, run / "lora_adapter" / "adapter_model.safetensors")
+    with pytest.raises(UserError, match="fits no matrix of the base model"):
+        load_weights(built(seed=2), run, base=base)
 
 
 def test_what_the_format_has_no_name_for_is_refused(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Keyframes with depth beside a dataset, the chains they form, and the clouds they become."""
 
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -9,11 +11,12 @@ import torch
 from h5_files import pose_at, write_file
 
 from mme_vla.backbone.sam2act.geometry import Cube
+from mme_vla.data import keyframe_dataset
 from mme_vla.data.conversion import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.data.keyframe_dataset import KeyframeDataset, KeyframeSample
-from mme_vla.data.keyframes import EpisodeKeyframes, file_of, motions_of, write_keyframes
+from mme_vla.data.keyframes import EpisodeKeyframes, Link, file_of, motions_of, write_keyframes
 from mme_vla.errors import UserError
 from mme_vla.policy.sam2act.scene import Shot, cloud_of, cloud_pictures
 
@@ -105,7 +108,7 @@ def source_of(folder: Path) -> EpisodeSource:
 
 def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> None:
     source = source_of(folder)
-    data = KeyframeDataset([source], Plain(), 1)
+    data = KeyframeDataset([source], Plain(), 1, drawn=False)
     chains = [chain for e in range(len(LENGTHS)) for chain in EpisodeKeyframes(file_of(source.root, e)).chains]
     assert len(data) == sum(map(len, chains))
     assert data.total_frames == sum(LENGTHS)
@@ -116,8 +119,7 @@ def test_transitions_are_one_for_every_keyframe_of_every_chain(folder: Path) -> 
 
 
 def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(folder: Path) -> None:
-    data = KeyframeDataset([source_of(folder)], Plain(), 3, seed=5)
-    again = KeyframeDataset([source_of(folder)], Plain(), 3, seed=5)
+    data, again = (KeyframeDataset([source_of(folder)], Plain(), 3, seed=5, drawn=False) for _ in range(2))
     begins: dict[int, set[int]] = {}
     for epoch in range(12):
         data.set_epoch(epoch)
@@ -130,6 +132,61 @@ def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(fol
     for index, found in begins.items():
         length = len(data._items[index][3])
         assert found == set(range(max(length - 3, 1)))
+
+
+class ManyTasks:
+    """Episodes of tasks with unlike numbers of episodes, chains and keyframes; an episode is its chains' lengths."""
+
+    def __init__(self, episodes: dict[str, list[list[int]]]) -> None:
+        self.tasks = [task for task, of_task in episodes.items() for _ in of_task]
+        self.chains = [lengths for of_task in episodes.values() for lengths in of_task]
+        self.lengths, self.root = np.full(len(self.tasks), 10), Path("nowhere")
+
+    def __len__(self) -> int:
+        return len(self.tasks)
+
+    def task(self, episode: int) -> str:
+        return self.tasks[episode]
+
+
+def drawn_shares(
+    episodes: dict[str, list[list[int]]], length: int, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[str, float], dict[tuple[int, int], float]]:
+    """How often tasks, and places (episode, links of the chain) are drawn."""
+    source: Any = ManyTasks(episodes)
+
+    def kept(path: Path) -> Any:
+        number = int(path.stem.split("_")[1])
+        chains = [[Link(place, place, place) for place in range(count)] for count in source.chains[number]]
+        return SimpleNamespace(chains=chains)
+
+    monkeypatch.setattr(keyframe_dataset, "EpisodeKeyframes", kept)
+    data = KeyframeDataset([source], Plain(), length)
+    found: Counter[str] = Counter()
+    places: Counter[tuple[int, int]] = Counter()
+    for epoch in range(-(-6000 // len(data))):
+        data.set_epoch(epoch)
+        for index in range(len(data)):
+            _, episode, chains, links = data.window(index)
+            found[source.task(episode)] += 1
+            places[episode, links[0].frame if length == 1 else len(chains.chains)] += 1
+    total = found.total()
+    return {k: n / total for k, n in found.items()}, {k: n / total for k, n in places.items()}
+
+
+def test_the_first_stage_draws_a_task_and_then_one_of_its_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
+    shares, places = drawn_shares({"few": [[2]], "many": [[4, 4, 4], [8]]}, 1, monkeypatch)
+    assert shares == pytest.approx({"few": 0.5, "many": 0.5}, abs=0.03)
+    assert places[0, 0] == pytest.approx(0.25, abs=0.03) and places[2, 7] == pytest.approx(0.5 / 20, abs=0.01)
+
+
+def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_short(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of `half` every second draw is thrown away, and then a task is drawn anew: it is seen half as often."""
+    shares, places = drawn_shares({"half": [[5, 1]], "whole": [[5], [5, 5, 5]], "never": [[2]]}, 3, monkeypatch)
+    assert shares == pytest.approx({"half": 1 / 3, "whole": 2 / 3}, abs=0.03)
+    assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(1 / 3, abs=0.03)
 
 
 def test_chains_that_are_too_short_for_any_sample_are_said(folder: Path) -> None:

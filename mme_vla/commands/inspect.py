@@ -80,7 +80,8 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     stats = policy.require_processor().stats
     if stats is not None:
         numbers = _table("normalisation", "", *(str(i + 1) for i in range(max(len(stats.state), len(stats.actions)))))
-        action = "action delta" if policy.embodiment.action.relative else "action"
+        space = policy.embodiment.action
+        action = "action delta" if space.relative or space.of_pose else "action"
         for name, of in (("state", stats.state), (action, stats.actions)):
             for bound in ("min", "q01", "q99", "max"):
                 if getattr(of, bound) is not None:  # extremes are kept where a policy normalises by them

@@ -42,6 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--dtype", default="float32", choices=list(DTYPES), help="what weights are stored in")
     parser.add_argument("--asset", help="which dataset's statistics, where the source has several")
     parser.add_argument("--revision", help="branch, tag or commit of a hub repository")
+    parser.add_argument("--base", help="what a run of OpenVLA-OFT was trained on, where it holds its adapters alone")
     parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
     parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
     given = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
@@ -50,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with print_user_errors():
         convert(
             given.source, given.destination, given.overrides, to=given.to, dtype=given.dtype, asset=given.asset,
-            revision=given.revision, dry_run=given.dry_run, trust_plugins=given.trust_plugins,
+            revision=given.revision, base=given.base, dry_run=given.dry_run, trust_plugins=given.trust_plugins,
         )  # fmt: skip
 
 
@@ -63,6 +64,7 @@ def convert(
     dtype: str = "float32",
     asset: str | None = None,
     revision: str | None = None,
+    base: str | Path | None = None,
     dry_run: bool = False,
     trust_plugins: bool = False,
 ) -> None:
@@ -77,7 +79,7 @@ def convert(
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
     if not dry_run and target.exists():
         raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
-    found = open_source(source, revision)
+    found = open_source(source, revision, base=base)
     policy = _policy(found, overrides, trust_plugins)
     check_target(policy, to)
     tensors = read_as(policy, found)

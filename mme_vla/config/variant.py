@@ -16,8 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 
 DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget")
 """Sections that make one variant another; the backbone's size and the training do not."""
-FREE = ("memory.budget", "processor.tokenizer", "processor.text")
-"""Keys in them that do not: a budget has a field of its own in records, what reads words goes with the backbone."""
+FREE = ("memory.budget", "processor.tokenizer", "processor.text", "processor.side")
+"""Keys in them that do not: a budget has a field of its own in records; pixels and words go with the backbone."""
 POLICY, USUAL_POLICY = "policy.name", "mme"
 LONGEST = 32
 """Letters that differences may take in a name; more are a digest."""

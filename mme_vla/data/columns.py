@@ -7,6 +7,7 @@ from typing import Any
 
 from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.embodiment import Camera, Embodiment
+from mme_vla.embodiment.actions import POSE_WIDTH
 from mme_vla.errors import UserError, brief, listed
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
@@ -29,12 +30,14 @@ _USUAL = {"state": ("observation.state",), "action": ("action", "actions")}
 class Columns:
     """Where things are: a column for every camera, and those whose numbers, joined, are the state and the action.
 
+    pose: the same of the tool's pose, where actions are differences to it.
     tables: the columns that are read from the tables; pictures are among them only where they are stored there.
     """
 
     cameras: Mapping[str, str]
     state: tuple[str, ...]
     action: tuple[str, ...]
+    pose: tuple[str, ...]
     tables: tuple[str, ...]
 
 
@@ -48,6 +51,7 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
         **{camera.name: _first(_spellings_of(camera), features) for camera in robot.cameras},
         **{key: _first((key, f"observation.{key}"), features) for key in robot.state.key},
         **{key: _first((key, *_also(key)), features) for key in robot.action.key},
+        **{key: _first((key, f"observation.{key}"), features) for key in robot.action.pose_key},
     }
     if not robot.state.key:
         found["state"] = _first(("observation.state", "state"), features)
@@ -74,10 +78,13 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     action = tuple(columns[key] for key in robot.action.key or ("action",))
     _check_width(root, "state", state, features, robot.state.width, robot)
     _check_width(root, "action", action, features, robot.action.width, robot)
-    tables = ["episode_index", *state, *action, *(name for name in OPTIONAL if name in features)]
+    pose = tuple(columns[key] for key in robot.action.pose_key)
+    if pose:
+        _check_width(root, "tool's pose", pose, features, POSE_WIDTH, robot)
+    tables = ["episode_index", *state, *action, *pose, *(name for name in OPTIONAL if name in features)]
     tables += [f"{name}{DRAWN}" for name in cameras if f"{name}{DRAWN}" in features]
     tables += [column for column in cameras.values() if features[column]["dtype"] == "image"]
-    return Columns(cameras, state, action, tuple(dict.fromkeys(tables)))
+    return Columns(cameras, state, action, pose, tuple(dict.fromkeys(tables)))
 
 
 def width_of(feature: Mapping[str, Any]) -> int:

@@ -17,8 +17,8 @@ import numpy as np
 
 from mme_vla.data.choice_rows import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.data.columns import DRAWN, NAMES
-from mme_vla.data.hdf5 import all_have_choices, any_chosen_frames, open_episode, pose_columns
-from mme_vla.data.hdf5_episode import SUBGOALS, RawEpisode
+from mme_vla.data.hdf5 import all_have_choices, all_have_poses, any_chosen_frames, open_episode, pose_columns
+from mme_vla.data.hdf5_episode import POSE_STATE, SUBGOALS, RawEpisode
 from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.progress import progress
@@ -42,6 +42,7 @@ class ConvertOptions:
     codec, crf, pix_fmt, gop: of the videos. The default (H.264 at crf 0, full chroma) is lossless but for the rounding
         between RGB and YUV, so a patch in which nothing moves stays exactly the same: TokenDrop relies on that.
     poses: columns of the tool's poses (`hdf5.POSE_ACTIONS`); `convert` takes those that all episodes have.
+    tool_pose: a column of where the tool was; `convert` keeps it where all episodes have it.
     choices: a column of what was chosen among a task's options, and these options beside the tables; `convert` keeps
         them where all episodes have them.
     keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
@@ -56,6 +57,7 @@ class ConvertOptions:
     pix_fmt: str = "yuv444p"
     gop: int = 8
     poses: tuple[str, ...] = ()
+    tool_pose: bool = False
     choices: bool = False
     keyframes: bool = False
     partly: bool = False
@@ -83,6 +85,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "state": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
+        **({POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}} if options.tool_pose else {}),
         **{name: {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS} for name in chosen},
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
@@ -111,6 +114,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     if not episodes:
         raise UserError("There is no episode to convert.")
     kept: dict[str, Any] = {"poses": pose_columns(episodes), "choices": all_have_choices(episodes)}
+    kept["tool_pose"] = all_have_poses(episodes)
     options = replace(options or ConvertOptions(), partly=any_chosen_frames(episodes), **kept)
     plan = _plan(episodes, options)
     partial = _work_folder(output)
@@ -141,7 +145,14 @@ def _work_folder(output: Path) -> Path:
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
     """The options as a plan holds them; what plans from before had none of stands beside them, or where it is said."""
-    beside = ("poses", "choices", "partly", "keyframes", *(["names"] if options.names == "robomme" else []))
+    beside = (
+        "poses",
+        "tool_pose",
+        "choices",
+        "partly",
+        "keyframes",
+        *(["names"] if options.names == "robomme" else []),
+    )
     return {key: value for key, value in asdict(options).items() if key not in beside}
 
 
@@ -160,6 +171,7 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
     return (
         {"options": planned_options(options), "episodes": origins}
         | ({"poses": list(options.poses)} if options.poses else {})
+        | ({"tool_pose": True} if options.tool_pose else {})
         | ({"choices": True} if options.choices else {})
         | ({"keyframes": True} if options.keyframes else {})
     )
@@ -246,6 +258,8 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
     dataset = None
     goal = episode.goals[0]
     tool = {name: episode.pose_actions(name) for name in options.poses}
+    if options.tool_pose:
+        tool[POSE_STATE] = episode.tool_poses()
     if options.choices:
         tool[CHOICE_ACTIONS] = episode.choice_actions()
     for step, frame in enumerate(episode):

@@ -78,7 +78,7 @@ class EpisodeSource:
             log.warning("%s has %g frames per second; the robot %s has %g.", self.name, self.fps, robot.name, robot.fps)
         self._vectors_of = {
             kind: {name: width_of(features[name]) for name in names}
-            for kind, names in (("state", found.state), ("action", found.action))
+            for kind, names in (("state", found.state), ("action", found.action), ("pose", found.pose))
         }
         self._motions: dict[int, Motions] = {}
         videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
@@ -191,8 +191,11 @@ class EpisodeSource:
         return self._vectors("state", episode, start, stop)
 
     def actions(self, episode: int, start: int = 0, stop: int | None = None) -> np.ndarray:
-        """The action recorded with each frame, absolute, [stop − start, w] float32."""
-        return self._vectors("action", episode, start, stop)
+        """The action recorded with each frame, [stop − start, w] float32: absolute, or a difference to its own pose."""
+        recorded = self._vectors("action", episode, start, stop)
+        if not self.robot.action.of_pose:
+            return recorded
+        return self.robot.action.from_poses(recorded, self._vectors("pose", episode, start, stop))
 
     def decisions(self, episode: int) -> Sequence[int] | np.ndarray:
         """The frames at which the robot decides on actions: all of the execution, or those before a motion begins.
@@ -220,7 +223,7 @@ class EpisodeSource:
         return self._drawn[camera][start : start + length]
 
     def action_chunk(self, episode: int, start: int, horizon: int, offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """The chunk decided at frame `start`, the last action repeated past the episode's end.
+        """The chunk decided at frame `start`, the last action repeated past the episode's end (differences are 0).
 
         Where an action takes a frame these are actions start + offset … start + offset + horizon − 1.
 
@@ -234,7 +237,9 @@ class EpisodeSource:
         steps = np.arange(start, start + horizon)
         first = min(start, length - 1)
         recorded = self.actions(episode, first, min(start + horizon, length) if start < length else length)
-        return recorded[np.minimum(steps, length - 1) - first], steps < length
+        chunk, known = recorded[np.minimum(steps, length - 1) - first], steps < length
+        chunk[np.ix_(~known, list(self.robot.action.of_pose))] = 0
+        return chunk, known
 
     def past_actions(self, episode: int, start: int, most: int, offset: int = 0) -> np.ndarray:
         """The robot's own actions right before the chunk of `start`, oldest first, [n, w]; as many as there are."""

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.hdf5_episode import CHOICES, FRAMES, POSE_ACTIONS, RawEpisode
+from mme_vla.data.hdf5_episode import CHOICES, FRAMES, POSE_ACTIONS, POSE_STATE, RawEpisode
 from mme_vla.data.hdf5_values import REMEDY, EpisodeRef
 from mme_vla.errors import UserError
 from mme_vla.files import decoding, require_file
@@ -52,6 +52,15 @@ def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
         with _open(file) as handle:
             found = {n for n in found if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
     return tuple(name for name in POSE_ACTIONS if name in found)
+
+
+def all_have_poses(refs: Sequence[EpisodeRef]) -> bool:
+    """Whether the tool's poses were recorded with every one of these episodes."""
+    for file in dict.fromkeys(ref.file for ref in refs):
+        with _open(file) as handle:
+            if not all(f"{ref.group}/timestep_0/obs/{POSE_STATE}" in handle for ref in refs if ref.file == file):
+                return False
+    return True
 
 
 def all_have_choices(refs: Sequence[EpisodeRef]) -> bool:

@@ -11,12 +11,15 @@ import numpy as np
 from mme_vla.data.choice_rows import CHOICE_NUMBERS, row_of
 from mme_vla.data.hdf5_values import REMEDY, EpisodeRef, StoredValues
 from mme_vla.data.waypoints import known_poses
+from mme_vla.embodiment.actions import POSE_WIDTH
 from mme_vla.embodiment.options import read_options
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.errors import UserError, brief
 from mme_vla.files import decoding, parse_json
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal", "simple_subgoal_online", "grounded_subgoal_online")
+POSE_STATE = "eef_state"
+"""The dataset's column of the tool's pose [6], and the file's name of it among a step's observations."""
 POSE_ACTIONS = {"ee_pose_actions": "action/eef_action", "waypoint_actions": "action/waypoint_action"}
 """Columns of the tool's poses (x, y, z, roll, pitch, yaw, gripper) and where they stand in a file."""
 CHOICES = ("setup/available_multi_choices", "timestep_0/action/choice_action", "timestep_0/info/is_subgoal_boundary")
@@ -162,6 +165,15 @@ class RawEpisode(StoredValues):
         return known_poses(
             np.stack(steps), self.exec_start, lambda k: self._numbers(k, POSE_ACTIONS["ee_pose_actions"], 7)[:7]
         )
+
+    def tool_poses(self) -> np.ndarray:
+        """Where the tool was at every step: position and roll, pitch, yaw, [t, 6] float32.
+
+        Raises:
+            UserError: a step has no 6 finite numbers.
+        """
+        steps = [self._numbers(k, f"obs/{POSE_STATE}", POSE_WIDTH)[:POSE_WIDTH] for k in range(self.length)]
+        return np.stack(steps).astype(np.float32)
 
     def choice_actions(self) -> np.ndarray:
         """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at all others.

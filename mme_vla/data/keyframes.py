@@ -14,6 +14,7 @@ import numpy as np
 
 from mme_vla.data.hdf5_episode import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
+from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError
 from mme_vla.files import require_file, write_atomically
@@ -126,6 +127,26 @@ class EpisodeKeyframes:
             ]
             for at in places
         ]
+
+    @cached_property
+    def frames(self) -> np.ndarray:
+        """The kept frames, int64 [n], ascending."""
+        found: np.ndarray = self._read("frames")["frames"].astype(np.int64)
+        return found
+
+    def views(self, frames: np.ndarray, robot: Embodiment) -> dict[str, np.ndarray]:
+        """Kept frames [n] as an environment delivers them to a robot that reads depth; see `KeyframeEpisode.observe`.
+
+        Returns:
+            Of every camera pictures [n, s, s, 3] uint8, depths [n, s, s, 1] float32 in millimetres, poses [n, 3, 4].
+        """
+        kept = self._read("frames", "colours", "depth", "extrinsic")
+        at, found = np.searchsorted(kept["frames"], frames), {}
+        for camera in robot.cameras:
+            c = CAMERAS.index(camera.name)
+            beside = (kept["depth"][at, c][..., None].astype(np.float32), kept["extrinsic"][at, c].astype(np.float32))
+            found |= {camera.name: kept["colours"][at, c], **dict(zip(camera.readings, beside, strict=False))}
+        return found
 
     def commanded_open(self, frames: list[int]) -> np.ndarray:
         """Whether the gripper's command was to be open at these frames, [n] bool."""

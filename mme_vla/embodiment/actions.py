@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
 from mme_vla.config.sections import section_keys
 from mme_vla.embodiment import fields
 from mme_vla.embodiment.options import Option, in_words
@@ -14,9 +16,14 @@ from mme_vla.errors import UserError, brief
 if TYPE_CHECKING:
     from torch import Tensor  # `--help` reads robots without PyTorch
 
+POSE_WIDTH = 6
+"""Of a pose: position, then three angles."""
+ANGLES = (3, 4, 5)
+"""The angles' places in it."""
+DELTA = "ee_delta"
 _KEYS = (
     "key", "space", "width", "names", "units", "relative", "angles", "binary", "horizon", "execute", "frames",
-    "choice", "point", "options_length",
+    "choice", "point", "options_length", "of_pose", "pose_key",
 )  # fmt: skip
 
 
@@ -35,6 +42,10 @@ class ActionSpace:
     choice: numbers of which one is 1 and the others 0, the letters a, b, … of the options that an episode offers; what
         is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1], never by statistics.
     point: the two numbers that say where in the memory camera's picture: y and x as shares of its height and width.
+    of_pose: numbers that are differences to the tool's pose at their own step, i. e. to the pose's number at the same
+        place, angles (from the fourth on) by the shorter way: recorded, predicted and sent as such. Who executes an
+        action adds the pose of that moment (`beside_pose`). Past a recording's end they are 0.
+    pose_key: columns of the dataset that hold that pose.
     options_length: tokens that the prompt has for the options, beside the processor's `prompt_length`.
     """
 
@@ -52,6 +63,8 @@ class ActionSpace:
     choice: tuple[int, ...] = ()
     point: tuple[int, ...] = ()
     options_length: int = 0
+    of_pose: tuple[int, ...] = ()
+    pose_key: tuple[str, ...] = ()
 
     @classmethod
     def from_dict(cls, given: Any, state_width: int) -> Self:
@@ -86,6 +99,8 @@ class ActionSpace:
             choice=choice,
             point=point,
             options_length=length,
+            of_pose=_of_pose(found, where, width),
+            pose_key=fields.columns(found.get("pose_key"), f"{where}.pose_key"),
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -93,12 +108,34 @@ class ActionSpace:
         listed = {name: list(getattr(self, name)) for name in ("key", "names", "units", "relative", "binary")}
         plain = {name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")}
         chosen = {"choice": list(self.choice), "point": list(self.point), "options_length": self.options_length}
+        posed = {"of_pose": list(self.of_pose), "pose_key": list(self.pose_key)}
         return {
             **plain,
             **listed,
             "angles": {str(place): centre for place, centre in self.angles.items()},
             **(chosen if self.choice else {}),  # which robots of earlier versions did not say
+            **(posed if self.of_pose else {}),  # likewise
         }
+
+    @property
+    def answers(self) -> str | None:
+        """What clients call this action space: the benchmark's name, or `ee_delta` for differences to poses."""
+        return DELTA if self.of_pose else self.space
+
+    def from_poses(self, actions: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Recorded actions [t, w] as differences to the poses [t, 6] of their own steps, where they are such."""
+        out = np.array(actions, np.float64)
+        for place in self.of_pose:
+            out[:, place] -= poses[:, place]
+            if place in ANGLES:
+                out[:, place] = math.pi - (math.pi - out[:, place]) % (2 * math.pi)  # into (−π, π]
+        return out.astype(np.float32)
+
+    def beside_pose(self, action: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """The command [w] that an action [w] is where the tool stands at a pose [6] now."""
+        out = np.array(action, np.float64)
+        out[list(self.of_pose)] += np.asarray(pose, np.float64)[list(self.of_pose)]
+        return out
 
     def to_relative(self, actions: "Tensor", state: "Tensor") -> "Tensor":
         """Express a chunk as it is predicted: relative to one state, the same reference for all its steps.
@@ -169,6 +206,17 @@ def _require(options: Sequence[Option]) -> None:
             "This policy chooses among options, and the episode offers none: set episode.options. The "
             "benchmark's are info['available_multi_choices'] of the action space multi_choice."
         )
+
+
+def _of_pose(found: Mapping[str, Any], where: str, width: int) -> tuple[int, ...]:
+    """`of_pose`, which needs poses to differ from, and steps that have one."""
+    places = fields.places(found.get("of_pose"), f"{where}.of_pose", min(width, POSE_WIDTH))
+    if places and (not found.get("pose_key") or found.get("frames", 1) is None or found.get("relative")):
+        raise UserError(
+            f"{where}.of_pose={list(places)}: name the columns of the tool's pose (pose_key), one action a frame "
+            "(frames=1), and nothing relative to the state besides (relative=[])."
+        )
+    return places
 
 
 def _choices(found: Mapping[str, Any], where: str, width: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:

@@ -57,15 +57,20 @@ def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
     return found
 
 
-def benchmark_action(space: ActionSpace, action: np.ndarray, stick: bool = False) -> np.ndarray | dict[str, Any]:
+def benchmark_action(
+    space: ActionSpace, action: np.ndarray, stick: bool = False, pose: np.ndarray | None = None
+) -> np.ndarray | dict[str, Any]:
     """What an environment of the benchmark takes for an action [w] of a policy.
 
     Args:
         stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
+        pose: of the tool now [6], for actions that are differences to it.
 
     Returns:
         The numbers; or `{"choice": "A", "point": [y, x]}`, in pixels of the front picture.
     """
+    if space.of_pose and pose is not None:
+        action = space.beside_pose(action, pose)
     if not space.choice:
         return action[: space.width - stick]
     letter = ascii_uppercase[int(np.argmax(action[list(space.choice)]))]

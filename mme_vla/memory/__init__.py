@@ -4,6 +4,7 @@ Importing this room registers the memories it ships.
 """
 
 from mme_vla.memory import (
+    banked,
     framesamp,
     gist,
     joined,
@@ -17,5 +18,6 @@ from mme_vla.memory import (
 )
 
 __all__ = [
-    "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "tokendrop", "ttt",
+    "banked", "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "tokendrop",
+    "ttt",
 ]  # fmt: skip

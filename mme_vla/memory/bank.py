@@ -121,22 +121,34 @@ class MemoryBank(nn.Module):
 
     def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
         """What the banks of b episodes answer to their current tokens [b, n, d]; an empty one answers with these."""
-        longest = max(len(state) for state in states)
+        lengths = [len(state) for state in states]
+        longest = max(lengths)
         if not longest:
             return tokens
         entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)  # b t n d
-        full = torch.tensor([len(state) for state in states], device=tokens.device)
+        times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
+        held = torch.arange(longest, device=tokens.device) < torch.tensor(lengths, device=tokens.device)[:, None]
+        return self.ask(tokens, entries, times, None if min(lengths) == longest else held)
+
+    def ask(self, tokens: Tensor, entries: Tensor, times: Tensor, held: Tensor | None = None) -> Tensor:
+        """What entries [b, t, n, d] at times [b, t] answer to tokens [b, n, d].
+
+        Args:
+            held: [b, t] bool, False where there is no entry; a row without any answers with its tokens.
+        """
         keys = entries
         if self.time is not None:
-            times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
             keys = entries + self.time(times.flatten()).to(tokens).unflatten(0, times.shape)[:, :, None]
-        held = torch.arange(longest, device=tokens.device) < full[:, None]
-        held[:, 0] |= full == 0  # a row of nothing at all has no softmax; its answer is replaced below
-        mask = None if bool(held.all()) else held.repeat_interleave(entries.shape[2], 1)[:, None]
+        empty = mask = None
+        if held is not None:
+            empty = ~held.any(1)
+            # A row of nothing at all has no softmax; its answer is replaced below.
+            shown = torch.cat([held[:, :1] | empty[:, None], held[:, 1:]], 1)
+            mask = shown.repeat_interleave(entries.shape[2], 1)[:, None]
         answer = tokens
         for block in self.blocks:
             answer = block(answer, keys.flatten(1, 2), entries.flatten(1, 2), mask)
-        return torch.where((full == 0)[:, None, None], tokens, answer)
+        return answer if empty is None else torch.where(empty[:, None, None], tokens, answer)
 
     def fuse(self, tokens: Tensor, retrieved: Tensor) -> Tensor:
         """Current and retrieved tokens [b, n, d] as one."""
@@ -160,6 +172,35 @@ class MemoryBank(nn.Module):
             return BankState(entries[1:], times[1:])
         return _merge(entries, times)
 
+    def held(self, moments: Tensor, times: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What banks hold after b sequences of moments, written at once: as `update` one by one, with fixed shapes.
+
+        Args:
+            moments: [b, t, n, d]. times: [b, t] int64. valid: [b, t] bool, False on padding, which goes in front.
+
+        Returns:
+            Entries [b, k, n, d] without gradients, times [b, k] and whether there is such an entry [b, k], k ≤ length,
+            the empty places in front.
+        """
+        moments = moments.detach()
+        entries, at, there = (x[:, : self.length] for x in (moments, times, valid))
+        for step in range(self.length, moments.shape[1]):
+            now = slice(step, step + 1)
+            entries, at, there = (torch.cat(x, 1) for x in ((entries, moments[:, now]), (at, times[:, now]),
+                                                            (there, valid[:, now])))  # fmt: skip
+            # Where the first place is empty it goes; else the oldest does, or two neighbours become one.
+            pair = torch.full_like(at[:, :1], -1)
+            if self.consolidation == "tome":
+                alike = functional.cosine_similarity(entries[:, :-1], entries[:, 1:], dim=-1).mean(-1)
+                pair = torch.where(there[:, :1], alike.argmax(1, keepdim=True), pair)
+            places = torch.arange(self.length, device=at.device)[None]
+            rows = places + (places > pair).long()
+            follows = (places == pair)[..., None, None]
+            kept = entries.gather(1, rows[..., None, None].expand(-1, -1, *entries.shape[2:]))
+            entries = torch.where(follows, (entries[:, :-1] + entries[:, 1:]) / 2, kept)
+            at, there = at.gather(1, rows), there.gather(1, rows)
+        return entries, at, there
+
     def run(
         self, tokens: Tensor, times: Tensor, sequences: Sequence[Tensor], states: Sequence[BankState] | None = None
     ) -> tuple[Tensor, list[BankState]]:
@@ -174,6 +215,7 @@ class MemoryBank(nn.Module):
             Fused tokens [m, n, d], and the bank after each sequence.
         """
         banks = list(states) if states is not None else [self.init_state(tokens.shape[1]) for _ in sequences]
+        when = times.tolist()
         fused: list[Tensor] = []
         places: list[Tensor] = []
         for step in range(max(len(sequence) for sequence in sequences)):
@@ -181,7 +223,8 @@ class MemoryBank(nn.Module):
             here = torch.stack([sequences[i][step] for i in going]).to(tokens.device)
             answer = self.read([banks[i] for i in going], tokens[here])
             for row, i in enumerate(going):
-                banks[i] = self.update(banks[i], tokens[here[row]], answer[row], int(times[here[row]]))
+                place = int(sequences[i][step])
+                banks[i] = self.update(banks[i], tokens[place], answer[row], when[place])
             fused.append(answer)
             places.append(here)
         order = torch.cat(places).argsort()

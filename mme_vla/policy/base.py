@@ -47,6 +47,8 @@ class Policy(Saved):
     """Steps of its sampler unless told otherwise."""
     agrees: bool = False
     """Whether its chunks can agree with actions that are already promised (`Episode.promise`)."""
+    most_actions: int | None = None
+    """Actions after which a rollout ends an episode as timed out, beside its limit of frames; None: that one alone."""
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
 

@@ -94,6 +94,8 @@ def centre_crop(images: Tensor) -> Tensor:
 
 def centre_cut(images: Tensor) -> Tensor:
     """As `centre_crop`, but of whole pixels and resized back with Lanczos-3: how MemoryVLA shows pictures."""
+    if images.is_meta:  # shapes alone: there is nothing to resize
+        return images
     size = images.shape[-1]
     side = int(SIDE * size)
     start = (size - side) // 2

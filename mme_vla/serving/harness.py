@@ -75,6 +75,16 @@ class MMEVLAModelServer(PredictModelServer):
         self.policy = checkpoint.eval()
         robot = self.policy.embodiment
         check_benchmark(robot, SPACES)
+        if robot.readings:
+            raise UserError(
+                f"This policy reads {', '.join(robot.readings)}, which the harness does not send: it cannot be served "
+                "to it. Evaluate it with python -m mme_vla.evaluate."
+            )
+        if robot.action.of_pose:
+            raise UserError(
+                f"This policy answers with differences to poses ({robot.action.answers}), which the harness does not "
+                "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
+            )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
         settings.check_robot(robot, self.policy.require_processor().past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)

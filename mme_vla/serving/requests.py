@@ -14,6 +14,7 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
 from mme_vla.embodiment.options import read_options
 from mme_vla.embodiment.robomme import ARM_JOINTS, benchmark_state
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.serving.readings import read_beside
 
 SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 OPTIONS = "available_multi_choices"  # beside an observation, for policies that choose; the benchmark's name
@@ -51,6 +52,8 @@ class Infer:
     first: whether the message begins an episode; None where the schema does not say.
     options: what can be chosen, for a policy that chooses; none where they stay as they were.
     states: what the robot felt at `frames`, [t, s].
+    seen: for a robot that reads more than pictures, everything its cameras delivered at the frames of this message, in
+        the form of `Episode.observe`: pictures by camera, depth and poses; `states` goes with it.
     """
 
     pictures: Mapping[str, np.ndarray]
@@ -61,6 +64,7 @@ class Infer:
     first: bool | None = None
     options: tuple[Option, ...] = ()
     states: np.ndarray | None = None
+    seen: Mapping[str, np.ndarray] | None = None
 
 
 Request = Reset | AddBuffer | Infer
@@ -77,13 +81,19 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     """
     if not isinstance(message, dict):
         raise UserError(f"A request is a map, got {type(message).__name__}.")
-    space = message.get("action_space", robot.action.space)
-    if space != robot.action.space:
-        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with {robot.action.space} only.")
+    answers = robot.action.answers
+    space = message.get("action_space", answers)
+    if space != answers:
+        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with {answers} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
+    if robot.action.of_pose and "action_space" not in message:
+        raise UserError(
+            f"This policy answers with differences to the tool's pose at each step, which whoever executes them adds "
+            f"to where the tool is then: say action_space={answers!r} in the request to show that you do."
+        )
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames, robot)
     if any(isinstance(key, str) and key.startswith("observation/") for key in message):
@@ -104,6 +114,11 @@ def _flag(message: dict[Any, Any], key: str) -> bool:
 
 
 def _add_buffer(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> AddBuffer:
+    if robot.readings:
+        raise UserError(
+            f"This policy reads {', '.join(robot.readings)} at every frame, and add_buffer has no place for them: send "
+            "past frames in the challenge's lists, and the current one in either schema."
+        )
     images = _array(message, "images")
     if images.ndim != 5 or images.shape[1] != 1:
         raise UserError(f"images must be uint8 [frames, 1, height, width, 3], got {images.dtype} {list(images.shape)}.")
@@ -128,7 +143,12 @@ def _observation(message: dict[Any, Any], robot: Embodiment) -> Infer:
     if state.shape != (robot.state.width,):
         raise UserError(f"observation/state must be [{robot.state.width}], got {list(state.shape)}.")
     goal, options = _text("prompt", _get(message, "prompt")), _options(message, robot)
-    return Infer(pictures, state, goal, _subgoals(message), options=options)
+    if not robot.readings:
+        return Infer(pictures, state, goal, _subgoals(message), options=options)
+    given = {f"observation/{name}": [_get(message, f"observation/{name}")] for name in robot.readings}
+    seen = {name: picture[None] for name, picture in pictures.items()}
+    seen |= read_beside(robot, seen, given, "observation/{}")
+    return Infer(pictures, state, goal, _subgoals(message), options=options, states=state[None], seen=seen)
 
 
 def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> Infer:
@@ -150,7 +170,11 @@ def _challenge(message: dict[Any, Any], most_frames: int, robot: Embodiment) -> 
     states = np.stack([benchmark_state(*felt) for felt in zip(joints, grippers, strict=True)])
     pictures = {name: view[-1] for name, view in views.items()}
     frames, options = views[robot.memory_camera], _options(message, robot)
-    return Infer(pictures, states[-1], goal, _subgoals(message), frames, bool(first), options, states)
+    seen = None
+    if robot.readings:
+        seen = {name: np.stack(view) for name, view in views.items()}
+        seen |= read_beside(robot, seen, message, "{}_list")
+    return Infer(pictures, states[-1], goal, _subgoals(message), frames, bool(first), options, states, seen)
 
 
 def _subgoals(message: dict[Any, Any]) -> dict[str, str]:

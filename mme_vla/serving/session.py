@@ -1,7 +1,7 @@
 """One client: its episode, and what its requests do to it. Dropping the session frees all the client's memory."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -96,6 +96,8 @@ class Session:
             )
         if request.frames is None and self.episode.frames_seen == 0 and policy.memory is not None:
             raise UserError("This policy remembers past frames: send them with add_buffer, the current one included.")
+        if request.frames is None and request.seen is not None:
+            self._check_room(1)
         if request.frames is not None:
             self._check_room(len(request.frames))
             if request.first:
@@ -117,9 +119,12 @@ class Session:
         return chunk if request.frames is None else chunk[: self._settings.executed(policy.embodiment)]
 
     def _observe(self, request: Infer) -> Iterator[None]:
-        if request.frames is not None:
-            yield from self._remember(request.frames, request.states)
-        self.episode.look(request.pictures, request.state)
+        if request.seen is not None and request.states is not None:
+            yield from self._watch(request.seen, request.states)
+        else:
+            if request.frames is not None:
+                yield from self._remember(request.frames, request.states)
+            self.episode.look(request.pictures, request.state)
         _ = self.episode.prompt  # a goal that cannot be read fails here, and not in a batch with others
 
     def _remember(self, frames: Sequence[np.ndarray], states: np.ndarray | None) -> Iterator[None]:
@@ -132,6 +137,16 @@ class Session:
             demo = episode.frames_seen + np.arange(len(taken)) < self._exec_start
             felt = None if states is None else states[start : start + piece]
             episode.remember(taken, demo, states=felt)
+
+    def _watch(self, seen: Mapping[str, np.ndarray], states: np.ndarray) -> Iterator[None]:
+        """Take frames with what all cameras delivered, for a policy that reads more than pictures."""
+        episode, piece = self.episode, self._piece
+        for start in range(0, len(states), piece):
+            if start:
+                yield
+            part = slice(start, start + piece)
+            demo = episode.frames_seen + np.arange(len(states[part])) < self._exec_start
+            episode.observe({name: values[part] for name, values in seen.items()}, states[part], demo)
 
     @property
     def _piece(self) -> int:

@@ -6,10 +6,11 @@ from typing import Any, Self
 
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment import Embodiment
+from mme_vla.embodiment.actions import DELTA
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.serving.listen import is_local
 
-ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint")
+ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", DELTA)
 
 
 @dataclass(frozen=True)
@@ -89,14 +90,9 @@ class ServeSettings:
                 f"This policy reads which motions were executed, and the frames that a client sends do not tell how "
                 f"many motions of {robot.name!r} they took: it cannot be served."
             )
-        if robot.readings:
+        if self.action_space not in (None, robot.action.answers):
             raise UserError(
-                f"This policy reads {', '.join(robot.readings)}, which no request holds: it cannot be served. "
-                "Evaluate it with python -m mme_vla.evaluate."
-            )
-        if self.action_space not in (None, robot.action.space):
-            raise UserError(
-                f"action_space={self.action_space}: this policy answers with {robot.action.space}, "
+                f"action_space={self.action_space}: this policy answers with {robot.action.answers}, "
                 f"{robot.action.width} numbers an action, and nothing is converted. Ask the client for that."
             )
 

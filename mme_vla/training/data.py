@@ -84,17 +84,19 @@ def prepare_data(
             for source in sources
         ]
 
-    def side(episodes: list[Any], jitter: bool) -> TrainingDataset | KeyframeDataset:
+    def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
         if processor.samples == "keyframes":
-            return KeyframeDataset(sources, processor, policy.keyframes, episodes=episodes, seed=seed)
+            return KeyframeDataset(
+                sources, processor, policy.keyframes, episodes=episodes, seed=seed, drawn=not held_out
+            )
         kind = GroupDataset if processor.group_size > 1 else TrainingDataset
         return kind(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
-            mask_padding=data["mask_padding"], jitter=jitter, subgoal=subgoal, seed=seed,
+            mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal, seed=seed,
         )  # fmt: skip
 
     held_out = sum(map(len, split.val))
-    prepared = SplitData(side(split.train, data["jitter"]), side(split.val, False) if held_out else None,
+    prepared = SplitData(side(split.train), side(split.val, held_out=True) if held_out else None,
                          [source.fingerprint for source in sources])  # fmt: skip
     say(
         f"data {data['name']}: {len(prepared.train)} training steps in {sum(map(len, split.train))} episodes, "

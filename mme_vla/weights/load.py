@@ -47,6 +47,7 @@ def load_weights(
     dtype: str = "float32",
     revision: str | None = None,
     token: str | None = None,
+    base: str | Path | None = None,
 ) -> Policy:
     """Fill a policy with a checkpoint of the same variant, in any format this library knows.
 
@@ -57,13 +58,14 @@ def load_weights(
     Args:
         source: a folder, a safetensors file, an Orbax run or step, or `owner/name` on the hub.
         dtype: what the weights become, whatever they are stored in. revision, token: of a hub repository.
+        base: what a run of OpenVLA-OFT was trained on, where it holds its adapters alone.
 
     Raises:
         UserError: no such checkpoint, a damaged one, or one that does not fit; every tensor that is missing, left over
             or misshapen is listed, and nothing is changed.
     """
     kind = dtype_of(dtype)
-    found = open_source(source, revision, token)
+    found = open_source(source, revision, token, base)
     if found.format in ("lerobot", "openpi") and policy.memory is not None:
         raise UserError(
             f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "

@@ -15,13 +15,15 @@ from mme_vla.weights.adapter import Adapter
 from mme_vla.weights.names.memoryvla import memoryvla_table
 
 WEIGHTS = "model.pt"
+_OWN = ("memory", "action")
+"""Parts that Prismatic's checkpoints have nothing of."""
 _DROPPED = "action_model.net.history_embedder."  # CogACT's, which nothing reads
 
 
 def is_memoryvla(names: Iterable[str]) -> bool:
-    """Whether tensors are named as in the authors' checkpoints."""
+    """Whether tensors are named as in the authors' checkpoints, or in those of Prismatic that they start from."""
     found = set(names)
-    return "per_compr.reduce.weight" in found and "action_model.net.positional_embedding" in found
+    return "vision_backbone.dino_featurizer.cls_token" in found and "llm_backbone.llm.model.norm.weight" in found
 
 
 def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
@@ -30,7 +32,7 @@ def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
 
 
 def memoryvla_adapter(policy: Policy) -> Adapter:
-    """The authors' names of this policy's tensors.
+    """The authors' names of this policy's tensors; what they start from lacks banks and head.
 
     Raises:
         UserError: it is another kind of policy.
@@ -40,7 +42,8 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
             f"This format holds MemoryVLA; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
             "Set model=memoryvla."
         )
-    return Adapter(memoryvla_table(policy.state_dict()))
+    names = policy.state_dict()
+    return Adapter(memoryvla_table(names), fresh=frozenset(n for n in names if policy.part_of(n) in _OWN))
 
 
 def write_memoryvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from mme_vla.errors import UserError
 from mme_vla.files import inside, read_json
 from mme_vla.policy.base import Policy
+from mme_vla.policy.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.openvla import OpenVlaPolicy
 from mme_vla.policy.tensor_files import WEIGHTS, cast
 from mme_vla.processing.normalisers import NormStats, QuantileStats
@@ -35,13 +36,16 @@ def is_openvla(names: Iterable[str]) -> bool:
 def openvla_adapter(policy: Policy) -> Adapter:
     """OpenVLA's names of this policy's tensors; a memory has none, and OpenVLA itself no head and no state token.
 
+    Of MemoryVLA the VLM alone has names: banks and head are new where it starts from OpenVLA.
+
     Raises:
         UserError: it is another kind of policy.
     """
-    if not isinstance(policy, OpenVlaPolicy):
+    if not isinstance(policy, OpenVlaPolicy | MemoryVlaPolicy):
         raise UserError(
             f"This format holds OpenVLA and OpenVLA-OFT; {policy.config.get('name', 'this')} is a "
-            f"{type(policy).__name__}. Set model=openvla_oft."
+            f"{type(policy).__name__}. Set model=openvla_oft, or "
+            "start model=memoryvla from it (init_from=…)."
         )
     names = [name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name]
     return Adapter(openvla_table(names), fresh=frozenset(name for name in names if policy.part_of(name) == "action"))

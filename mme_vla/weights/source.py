@@ -13,6 +13,7 @@ from mme_vla.policy.saving import CONFIG, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.weights.archive import SUFFIX, find_archive, open_archive
 from mme_vla.weights.diffusion_policy import is_diffusion_policy, plain_names
+from mme_vla.weights.lora_runs import FOLDER, has_adapters, merged, named_base
 from mme_vla.weights.memoryvla import is_memoryvla, read_names
 from mme_vla.weights.openvla import is_openvla, with_heads
 from mme_vla.weights.orbax import Zipped, find_params, read_orbax, variant_of
@@ -27,7 +28,7 @@ FORMATS = {
     "released": "openpi's and MME-VLA's JAX parameter trees (Orbax)",
     "diffusion_policy": "Diffusion Policy as RoboMME's authors train it (.pth)",
     "sam2act_plus": "SAM2Act and SAM2Act+ as their authors train them (.pth)",
-    "openvla": "OpenVLA, or a merged run of OpenVLA-OFT (safetensors, with .pt files beside)",
+    "openvla": "OpenVLA, or a run of OpenVLA-OFT, merged or beside its base (safetensors, with .pt files)",
     "memoryvla": "MemoryVLA as its authors train it (.pt)",
 }
 
@@ -70,12 +71,14 @@ class Source:
     format: a key of `FORMATS`. folder: what belongs to it lies here: configuration, statistics.
     files: its safetensors files; empty for an Orbax checkpoint.
     params: the Orbax arrays' folder, or their place in an archive.
+    base: of a run that holds adapters alone, what they were trained on.
     """
 
     format: str
     folder: Path
     files: tuple[Path, ...] = ()
     params: Path | Zipped | None = None
+    base: "Source | None" = None
 
     def tensors(self, fits: Callable[[Mapping[str, Tensor]], None] | None = None) -> dict[str, Tensor]:
         """Read all tensors, under the one spelling that the format's name table knows.
@@ -91,6 +94,9 @@ class Source:
             return read_orbax(self.params, fits)
         if self.format in OWN_NAMES:
             return OWN_NAMES[self.format].plain(read_torch_file(self.files[0]), str(self.files[0]))
+        if self.base is not None:
+            own = with_heads({}, self.folder)
+            return merged(self.base.tensors(), self.folder) | own
         tensors = read_files(self.folder, self.files)
         if self.format == "openvla":
             return with_heads(tensors, self.folder)
@@ -138,17 +144,32 @@ def detect_format(source: str | Path) -> str:
     return open_source(source).format
 
 
-def open_source(source: str | Path, revision: str | None = None, token: str | None = None) -> Source:
+def open_source(
+    source: str | Path, revision: str | None = None, token: str | None = None, base: str | Path | None = None
+) -> Source:
     """Find a checkpoint: a folder, a safetensors file, an Orbax run or step, an archive of one, or a place on the hub.
 
     On the hub: `owner/name`, or `owner/name/folder/in/it`.
 
+    Args:
+        base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for it is not followed.
+
     Raises:
-        UserError: nothing there, or nothing this library knows.
+        UserError: nothing there, or nothing this library knows; adapters without a base, or a base without adapters.
     """
     path = local_folder(source, revision, token)
     if not path.exists():
         raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
+    whole = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
+    if base is not None:
+        if whole or not has_adapters(path):
+            raise UserError(
+                f"base={str(base)!r} is for a run that holds {FOLDER} alone; {path} does not: leave it out."
+            )
+        found = open_source(base)
+        if found.format != "openvla":
+            raise UserError(f"base={str(base)!r} is {FORMATS[found.format]}; the adapters in {path} are OpenVLA's.")
+        return Source("openvla", path, base=found)
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
     if path.is_file() and path.suffix == SUFFIX:
@@ -162,6 +183,11 @@ def open_source(source: str | Path, revision: str | None = None, token: str | No
         return Source("released", params.parent if params.name == "params" else params, params=params)
     if (zipped := find_archive(path)) is not None:
         return _of_archive(zipped)
+    if has_adapters(path):
+        raise UserError(
+            f"{path} holds adapters apart from what they were trained on ({brief(named_base(path))}): name it, "
+            "load_weights(policy, run, base=…), or python -m mme_vla.weights.convert <run> <new folder> --base …"
+        )
     if len(files := find_torch_files(path)) == 1:
         return _of_torch_file(files[0])
     if files:

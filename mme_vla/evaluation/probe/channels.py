@@ -3,26 +3,20 @@
 Nothing here touches a network: a channel hands the policy other entries through the door that its own come through.
 """
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from mme_vla.evaluation.probe.altered_history import Exchanged, OnlyFrames
 from mme_vla.evaluation.probe.remembered import Entry, Remembered
-from mme_vla.memory.bank import BankState
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import History
-from mme_vla.memory.sam2act.keyframe_bank import BankState as KeyframeState
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.memoryvla.episode import MemoryVlaEpisode
-from mme_vla.policy.sam2act.keyframe_episode import KeyframeEpisode
-from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
+from mme_vla.policy.written import Writes
 from mme_vla.types import HistoryTokens
 
 
@@ -102,31 +96,26 @@ class SelectionChannel(Channel):
         return self._policy.sample_actions(batch, draws, steps)
 
 
-class BankChannel(Channel):
-    """MemoryVLA: two banks of moments, each with times of its own. Its clock counts moments."""
+class WrittenChannel(Channel):
+    """Episodes that write a memory of their own (`policy/written.py`), where chunks are chosen."""
 
-    clock, sees_pauses, chooses = "moments", False, False
+    sees_pauses, chooses = False, False
 
-    def __init__(self, policy: Policy) -> None:
-        self._policy = policy
+    def __init__(self, policy: Policy, clock: str | None) -> None:
+        self._policy, self.clock = policy, clock
 
     def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> Recollection:
-        assert isinstance(episode, MemoryVlaEpisode)
-        banks = episode.banks
+        assert isinstance(episode, Writes)
         stores = [
-            Remembered(tuple(Entry(int(t), e) for t, e in zip(bank.times, bank.entries, strict=True)), banks.count, n)
-            for n, bank in (("cognition", banks.cognition), ("perceptual", banks.perceptual))
+            Remembered(tuple(Entry(time, content) for time, content in store.entries), store.now, store.name)
+            for store in episode.written()
         ]
-        return Recollection(tuple(stores), banks)
+        return Recollection(tuple(stores))
 
-    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> Episode:
-        assert isinstance(episode, MemoryVlaEpisode)
-        banks = recollection.source
-        twin = copy.copy(episode)
-        twin.banks = replace(
-            banks, cognition=_bank(stores[0], banks.cognition), perceptual=_bank(stores[1], banks.perceptual)
-        )
-        return twin
+    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> Any:
+        assert isinstance(episode, Writes)
+        held = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
+        return episode.as_if_written(held)
 
     def answer(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
@@ -134,45 +123,8 @@ class BankChannel(Channel):
         return self._policy.answer(batch, remembering, draws, steps)
 
     def chosen(self, episode: Episode, remembering: Any) -> None:
-        assert isinstance(episode, MemoryVlaEpisode)
-        episode.asked = remembering.asked
-
-
-def _bank(store: Remembered, empty: BankState) -> BankState:
-    held = [entry for entry in store.entries if entry is not None]
-    entries = torch.stack([entry.content for entry in held]) if held else empty.entries[:0]
-    return BankState(entries, empty.times.new_tensor([entry.time for entry in held]))
-
-
-class KeyframeChannel(Channel):
-    """SAM2Act+: maps of its latest keyframes, in an order and without times. An entry's age counts keyframes."""
-
-    clock, sees_pauses, chooses = None, False, False
-
-    def __init__(self, policy: Policy) -> None:
-        assert isinstance(policy, SAM2ActPolicy)
-        self._policy, self._most = policy, policy.backbone.sizes.remembered
-
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> Recollection:
-        assert isinstance(episode, KeyframeEpisode)
-        maps = episode.remembered.maps
-        return Recollection((Remembered(tuple(Entry(i, m) for i, m in enumerate(maps)), len(maps)),))
-
-    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> Episode:
-        assert isinstance(episode, KeyframeEpisode)
-        twin = copy.copy(episode)
-        twin.remembered = KeyframeState(tuple(entry.content for entry in stores[0].entries if entry is not None))
-        return twin
-
-    def answer(
-        self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
-    ) -> Tensor:
-        return self._policy.answer(batch, remembering, draws, steps)
-
-    def chosen(self, episode: Episode, remembering: Any) -> None:
-        assert isinstance(episode, KeyframeEpisode)
-        newest = remembering.awaiting.maps[-1]  # the others were put there by the probe, and are not kept
-        episode.decided(KeyframeState((*episode.remembered.maps, newest)[-self._most :]))
+        assert isinstance(episode, Writes)
+        episode.go_on_from(remembering)
 
 
 class NoChannel(Channel):
@@ -195,18 +147,9 @@ class NoChannel(Channel):
         return self._policy.answer(batch, remembering, draws, steps)
 
 
-_BANKS: tuple[tuple[type[Episode], type[Channel]], ...] = (
-    (MemoryVlaEpisode, BankChannel),
-    (KeyframeEpisode, KeyframeChannel),
-)
-
-
 def channel_of(policy: Policy) -> Channel:
     """The way to what this policy remembers."""
     if policy.memory is not None:
         return SelectionChannel(policy)
     episode = policy.start_episode("")
-    for kind, channel in _BANKS:
-        if isinstance(episode, kind):
-            return channel(policy)  # type: ignore[call-arg]
-    return NoChannel(policy)
+    return WrittenChannel(policy, episode.written_clock) if isinstance(episode, Writes) else NoChannel(policy)

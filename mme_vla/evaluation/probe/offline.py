@@ -22,7 +22,7 @@ from mme_vla.evaluation.probe.lines import EntryLine, Line, MomentLine
 from mme_vla.evaluation.probe.measure import compare_chunks
 from mme_vla.evaluation.probe.probed import ProbedPolicy
 from mme_vla.evaluation.probe.probed_episode import ProbedEpisode
-from mme_vla.evaluation.probe.recordings import Recording, check_robot, others
+from mme_vla.evaluation.probe.recordings import Recording, others
 from mme_vla.evaluation.rollout.running_episode import episode_seed
 from mme_vla.policy.base import Policy
 from mme_vla.processing.subgoal_text import subgoal_kind
@@ -73,9 +73,8 @@ def probe_offline(
         after: told of each episode that is done.
 
     Raises:
-        UserError: the policy cannot be shown recorded episodes.
+        UserError: the policy reads depth, and the data keep none.
     """
-    check_robot(policy)
     _, done = lines.read(path)
     lenders = Lenders(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
     for recording in recordings:

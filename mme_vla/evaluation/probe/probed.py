@@ -39,6 +39,7 @@ class ProbedPolicy(Policy):
         self.config = {**inner.config, **({"probe": [arm.name, options_of(arm)]} if arm.parts else {})}
         self.history_dtype, self.horizon, self.skipped = inner.history_dtype, inner.horizon, inner.skipped
         self.sample_steps, self.action_dim = inner.sample_steps, inner.action_dim
+        self.most_actions = inner.most_actions
         self.sessions, self.lenders = list(sessions)[: arm.feed.sessions], lenders
 
     @property

@@ -17,7 +17,7 @@ from mme_vla.evaluation.probe.findings import Findings
 from mme_vla.evaluation.probe.offline import OfflineSettings, probe_offline
 from mme_vla.evaluation.probe.online import online_records, paired, probe_online
 from mme_vla.evaluation.probe.probe_page import write_page, write_pictures
-from mme_vla.evaluation.probe.recordings import Recording, check_robot
+from mme_vla.evaluation.probe.recordings import Recording
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.rollout.plan import Shard
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -94,7 +94,6 @@ def run_probe(
 
 
 def _on_recordings(policy: Policy, wanted: Wanted, folder: Path, facts: RunFacts, shown: bool) -> list[str]:
-    check_robot(policy)
     policy.require_processor().require_stats()
     told = all(recording.tells_subtasks for recording in wanted.recordings)
     arms, notes = choose_arms(wanted.given, policy, channel_of(policy), _to_take_from(wanted), boundaries=told)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.errors import UserError
+from mme_vla.data.keyframes import EpisodeKeyframes, file_of
 from mme_vla.policy.base import Policy
 
 SUBGOAL = "simple_subgoal"
@@ -76,9 +76,18 @@ class Recording:
         """Pictures of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
         Args:
-            wanted: frames that the memory camera shows beside the last, which all cameras do; None for every frame.
+            wanted: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
+                robot that reads depth is shown the frames that the dataset keeps depth of.
+
+        Raises:
+            UserError: it reads depth, and the dataset keeps none.
         """
         robot = self.source.robot
+        if robot.readings:
+            kept = EpisodeKeyframes(file_of(self.source.root, self.episode))
+            here = kept.frames[(kept.frames >= start) & (kept.frames < stop)]
+            seen = kept.views(here, robot)
+            return seen, dict.fromkeys(seen, here - start)
         if wanted is None:
             whole = np.arange(start, stop)
             return {name: self.source.frames(self.episode, whole, name) for name in robot.camera_names}, None
@@ -131,16 +140,3 @@ def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
         return None
     memory = policy.memory
     return np.union1d(memory.storage.kept_frames(length), memory.frames_scored(length))
-
-
-def check_robot(policy: Policy) -> None:
-    """Make sure that recorded episodes can be shown to a policy.
-
-    Raises:
-        UserError: its cameras read more than pictures, which datasets do not hold.
-    """
-    if policy.embodiment.readings:
-        raise UserError(
-            f"{policy.config.get('name', 'This policy')} reads {', '.join(policy.embodiment.readings)} beside its "
-            "pictures, which recorded datasets do not hold: probe it in closed loop, with offline=false."
-        )

@@ -75,6 +75,7 @@ class ChunkEnv:
             than this is executed, as in the benchmark.
         video: draws the episode as it goes.
         robot: says which cameras are read and how wide an action is.
+        most_actions: actions that are executed at most, whatever frames they took; then the outcome is `timeout`.
     """
 
     def __init__(
@@ -84,12 +85,15 @@ class ChunkEnv:
         max_steps: int = 1300,
         video: EpisodeVideo | None = None,
         robot: Embodiment = ROBOMME_JOINT,
+        most_actions: int | None = None,
     ) -> None:
         self._robot, self._stick = robot, stick
+        self._most_actions, self._executed = most_actions, 0
         self._max_steps, self._video = max_steps, video
         self._clock = RenderClock()
         self._simulating = self._rendered = 0.0
         self._steps = self._returned = 0
+        self._pose: np.ndarray | None = None
         with self._simulation():
             self._env = make()
         self._clock.watch(self._env)
@@ -105,6 +109,7 @@ class ChunkEnv:
             observation, info = self._env.reset()
         frames = _Frames(self._robot)
         count = frames.add(observation)
+        self._note_pose(observation)
         self._draw(frames, count, demo=count - 1)
         self._returned = frames.leave(draw, 0)
         return frames.observation(), self._report(info)
@@ -129,7 +134,7 @@ class ChunkEnv:
             self._ask(draw if draw is None or number == len(actions) else replace(draw, now=()))
             with self._simulation():
                 observation, _, ended, cut, info = self._env.step(
-                    benchmark_action(self._robot.action, action, self._stick)
+                    benchmark_action(self._robot.action, action, self._stick, self._pose)
                 )
             terminated, truncated = bool(ended), bool(cut)
             if info.get("status") == "error":
@@ -138,11 +143,14 @@ class ChunkEnv:
                     info = {**info, "status": "fail"}
                 break
             executed += 1
+            self._executed += 1
             count = frames.add(observation)
+            self._note_pose(observation)
             seen += count
             self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could go on for ever
             self._draw(frames, count, caption=command.get("subgoal"))
-            if not (terminated or truncated) and self._steps > self._max_steps:
+            spent = self._executed == self._most_actions
+            if not (terminated or truncated) and (spent or self._steps > self._max_steps):
                 truncated, info = True, {**info, "status": "timeout"}
             if terminated or truncated:
                 break
@@ -157,6 +165,16 @@ class ChunkEnv:
         if self._video is not None:
             self._video.discard()
         self._env.close()
+
+    def _note_pose(self, observation: dict[str, list[Any]]) -> None:
+        if not self._robot.action.of_pose:
+            return
+        if "eef_state_list" not in observation:
+            given = ", ".join(sorted(observation))
+            raise UserError(f"The policy's actions are differences to 'eef_state', which this environment does not "
+                            f"deliver: only {given}.")  # fmt: skip
+        if poses := observation["eef_state_list"]:
+            self._pose = np.asarray(poses[-1], np.float64)
 
     def _ask(self, drawing: Drawing | None) -> None:
         # A film shows everything; and not every environment can leave pictures out.
@@ -254,6 +272,7 @@ def make_rollout_env(
     max_steps: int = 1300,
     videos: tuple[str, str] | None = None,
     robot: Embodiment = ROBOMME_JOINT,
+    most_actions: int | None = None,
     **options: Any,
 ) -> ChunkEnv:
     """What every worker builds for an episode.
@@ -261,7 +280,7 @@ def make_rollout_env(
     Args:
         base: makes the environment itself from `task`, `split`, `episode`, `max_steps` and `options`.
         videos: folder, and which outcomes are kept: `all`, `success` or `failure`.
-        robot: the policy's.
+        robot, most_actions: the policy's.
     """
     video = None
     if videos is not None:
@@ -273,4 +292,5 @@ def make_rollout_env(
         max_steps=max_steps,
         video=video,
         robot=robot,
+        most_actions=most_actions,
     )

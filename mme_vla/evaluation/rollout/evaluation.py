@@ -112,6 +112,7 @@ def _environments(
 ) -> VecEnv:
     robot = policy.embodiment
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
+    options["most_actions"] = policy.most_actions
     if base is make_env:
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
         options |= {f"include_{name}": True for name in robot.readings}

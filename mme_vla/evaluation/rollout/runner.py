@@ -222,7 +222,7 @@ class Rollout:
         spec = metadata.episode(job.task, job.split, job.episode)
         robot = self.policy.embodiment
         record = EpisodeRecord(
-            **vars(self.facts), action_space=robot.action.space or robot.name, task=job.task, episode=job.episode,
+            **vars(self.facts), action_space=robot.action.answers or robot.name, task=job.task, episode=job.episode,
             seed=spec.seed, difficulty=spec.difficulty,
             outcome=outcome, steps=running.steps, seconds=running.seconds, error=error if outcome == "error" else None,
             extra={

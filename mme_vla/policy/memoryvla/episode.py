@@ -1,14 +1,19 @@
 """An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter them."""
 
-from typing import Protocol
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla.memory.bank import BankState
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.policy.memoryvla.core import BankStates, MemoryVlaCore
 from mme_vla.policy.memoryvla.processing import MemoryVlaProcessor
+from mme_vla.policy.written import Written
 
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
 
@@ -62,10 +67,41 @@ class MemoryVlaEpisode(Episode):
         if moments:
             self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
 
+    # What was written, for those who look at it (`policy/written.py`)
+
+    written_clock = "moments"
+
+    def written(self) -> tuple[Written, ...]:
+        """The entries of both banks, each with its times."""
+        named = (("cognition", self.banks.cognition), ("perceptual", self.banks.perceptual))
+        return tuple(
+            Written(name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count)
+            for name, bank in named
+        )
+
+    def as_if_written(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+        """See `Writes`."""
+        twin, banks = copy.copy(self), self.banks
+        cognition, perceptual = stores
+        twin.banks = replace(
+            banks, cognition=_bank(cognition, banks.cognition), perceptual=_bank(perceptual, banks.perceptual)
+        )
+        return twin
+
+    def go_on_from(self, twin: Episode) -> None:
+        """See `Writes`."""
+        assert isinstance(twin, MemoryVlaEpisode)
+        self.asked = twin.asked
+
     @property
     def moment(self) -> Tensor:
         """The current picture [3, s, s] uint8 of the camera that the policy looks through."""
         return self._writer.require_processor().seen(self.images)
+
+
+def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:
+    contents = torch.stack([content for _, content in entries]) if entries else like.entries[:0]
+    return BankState(contents, like.times.new_tensor([time for time, _ in entries]))
 
 
 def words(prompts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:

@@ -131,13 +131,17 @@ class MemoryVlaPolicy(Policy):
         hidden = self.vlm.read(tokens, mask, places)
         return cognition_token(hidden, features.shape[1], prompt_mask.sum(1)), features
 
-    def _of_batch(self, batch: GroupBatch) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Moments of a batch without its padding, and the places of each group among them."""
+    def _of_batch(self, batch: GroupBatch, changes: Tensor | None = None) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Moments of a batch without its padding, and the places of each group among them.
+
+        Args:
+            changes: [g, m', 6] of the pictures, m' ≥ m; by default the middle is cut out.
+        """
         pictures = batch.images[batch.valid]
-        if self.training and self.augment:
-            shown = augment(pictures, draw_changes(len(pictures), device=pictures.device))
-        else:
+        if changes is None:
             shown = centre_cut(pictures)
+        else:
+            shown = augment(pictures, changes[:, : batch.valid.shape[1]][batch.valid])
         with self.autocast():
             told = (batch.prompt[batch.valid], batch.prompt_mask[batch.valid])
             cognition, features = self.moments(to_unit_range(shown), *told)
@@ -146,32 +150,46 @@ class MemoryVlaPolicy(Policy):
 
     # Training
 
+    @property
+    def group_size(self) -> int:
+        """Moments of a training sample: its processor's, else its configuration's."""
+        return self.config["processor"]["group_size"] if self.processor is None else self.processor.group_size
+
     def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
         """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of m moments."""
-        size = self.require_processor().group_size
-        shape = (count, self.sizes.repeats, size)
+        shape = (count, self.sizes.repeats, self.group_size)
         return {
             "noise": torch.randn(*shape, self.horizon, self.action_dim, generator=generator),
             "steps": torch.randint(len(self.core.schedule), shape, generator=generator),
             "drop": torch.rand(shape, generator=generator),
         }
 
+    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """While training with augmentation `changes` [n, m, 6]: what happens to the pictures of `count` groups."""
+        if not (self.training and self.augment):
+            return {}
+        size = self.group_size
+        return {"changes": draw_changes(count * size, generator).unflatten(0, (count, size))}
+
     def forward(self, batch: GroupBatch, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` makes them.
+            batch: with `actions`. draws: as `loss_draws` and `picture_draws` make them; fresh ones by default.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
-        given = draws or self.loss_draws(len(batch.images), torch.default_generator)
+        given = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
+        if "changes" not in given:
+            given |= self.picture_draws(len(batch.images), torch.default_generator)
+        changes = given.pop("changes", None)
         copies = batch.valid.shape[1]
 
         def whole_batch_over(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
             return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
 
         drawn = map_draws(given, lambda value: whole_batch_over(value.to(self.device)))
-        cognition, features, groups = self._of_batch(batch)
+        cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
             actions, times = batch.actions[batch.valid], batch.times[batch.valid]
             losses = self.core.loss(cognition, features, actions, times, groups, drawn)
@@ -279,15 +297,16 @@ class MemoryVlaPolicy(Policy):
     # Costs and parts
 
     def full_batch(self, device: torch.device | str = "cpu") -> GroupBatch:
-        """A group of one moment without content, with the longest prompt."""
+        """A group of one moment without content, with the longest prompt; where it is, is known on meta too."""
         size, length = self.sizes.vision.image_size, int(self.config["processor"]["prompt_length"])
         length += self.embodiment.action.options_length
+        known = "cpu" if torch.device(device).type == "meta" else device
         return GroupBatch(
             images=torch.zeros(1, 1, 3, size, size, dtype=torch.uint8, device=device),
             prompt=torch.full((1, 1, length), 5, device=device),
             prompt_mask=torch.ones(1, 1, length, dtype=torch.bool, device=device),
-            times=torch.zeros(1, 1, dtype=torch.int64, device=device),
-            valid=torch.ones(1, 1, dtype=torch.bool, device=device),
+            times=torch.zeros(1, 1, dtype=torch.int64, device=known),
+            valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
         )
 

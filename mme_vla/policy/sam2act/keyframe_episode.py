@@ -1,9 +1,11 @@
 """A running episode of SAM2Act+: a bank of keyframes, and the cloud that is seen now."""
 
-from collections.abc import Mapping
-from typing import Protocol
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Protocol, Self
 
 import numpy as np
+from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.memory.sam2act.keyframe_bank import BankState
@@ -11,10 +13,14 @@ from mme_vla.policy.episode import Episode, Host
 from mme_vla.policy.sam2act.cloud_processing import SAM2ActProcessor
 from mme_vla.policy.sam2act.deciding import Seen
 from mme_vla.policy.sam2act.scene import Shot
+from mme_vla.policy.written import Written
 
 
 class Watcher(Host, Protocol):
     """What this episode asks of its policy besides."""
+
+    @property
+    def most_remembered(self) -> int: ...
 
     def require_processor(self) -> SAM2ActProcessor: ...
 
@@ -53,31 +59,33 @@ class KeyframeEpisode(Episode):
         Args:
             frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and `<name>_camera_extrinsic`
                 [t, 3, 4], from the world to the camera.
-            drawn: of no use here: every frame comes with its picture.
+            drawn: the same frames for every camera; depth and poses are given for these alone.
 
         Raises:
             UserError: also where depth or poses are missing or of another form.
         """
-        if drawn is not None:
-            raise UserError("observe() of this policy needs a picture of every frame: leave `drawn` out.")
         self._check_readings(frames)
-        super().observe(frames, states, is_demo, actions)
+        if drawn is not None and any(not np.array_equal(drawn[n], places) for places in drawn.values() for n in drawn):
+            raise UserError("This policy sees through all of its cameras at once: draw the same frames of each.")
+        super().observe(frames, states, is_demo, actions, drawn)
         demo = np.broadcast_to(np.asarray(is_demo, bool), (len(states),))
+        places = range(len(demo)) if drawn is None else next(iter(drawn.values())).tolist()
         processor = self._policy.require_processor()
         fingers = np.asarray(states, np.float32)[:, -1]
-        self._video += [(processor.shots(frames, i), float(fingers[i])) for i in np.flatnonzero(demo)]
+        self._video += [(processor.shots(frames, i), float(fingers[at])) for i, at in enumerate(places) if demo[at]]
         if len(demo) and not demo[-1]:
             self._remember_video()
             if self._after is not None:
                 self.remembered, self._after = self._after, None
                 self.waypoints += 1
-            self._now = (processor.shots(frames, len(demo) - 1), float(fingers[-1]))
+            shown = len(places) > 0 and places[-1] == len(demo) - 1
+            self._now = (processor.shots(frames, len(places) - 1), float(fingers[-1])) if shown else None
 
     def seen(self) -> Seen:
         """What the network is shown now.
 
         Raises:
-            UserError: no execution frame was seen yet.
+            UserError: no execution frame was seen yet, or the current one was not drawn.
         """
         if self._now is None:
             raise UserError("The episode has seen no execution frame yet: call observe() with the current one first.")
@@ -92,6 +100,27 @@ class KeyframeEpisode(Episode):
     def awaiting(self) -> BankState | None:
         """What `decided` noted last, until the next frames are observed."""
         return self._after
+
+    # What was written, for those who look at it (`policy/written.py`)
+
+    written_clock = None
+
+    def written(self) -> tuple[Written, ...]:
+        """The maps of the latest keyframes; their times are their order."""
+        maps = self.remembered.maps
+        return (Written("memory", tuple(enumerate(maps)), len(maps)),)
+
+    def as_if_written(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+        """See `Writes`."""
+        twin = copy.copy(self)
+        twin.remembered = BankState(tuple(content for _, content in stores[0]))
+        return twin
+
+    def go_on_from(self, twin: Episode) -> None:
+        """See `Writes`."""
+        assert isinstance(twin, KeyframeEpisode) and twin.awaiting is not None
+        newest = twin.awaiting.maps[-1]  # the others are not what this episode saw
+        self.decided(BankState((*self.remembered.maps, newest)[-self._policy.most_remembered :]))
 
     def _remember_video(self) -> None:
         most = self._policy.require_processor().video_frames

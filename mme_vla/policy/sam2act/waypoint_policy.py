@@ -113,6 +113,16 @@ class SAM2ActPolicy(Policy):
         heads.compute_rates(self.device)
 
     @property
+    def most_actions(self) -> int | None:  # type: ignore[override]
+        """Waypoints of an episode, which its clock counts to."""
+        return None if self.processor is None else self.processor.waypoints
+
+    @property
+    def most_remembered(self) -> int:
+        """Keyframes that are read, and kept."""
+        return self.backbone.sizes.remembered
+
+    @property
     def cube(self) -> Cube:
         """The part of the world that is looked at: its processor's, else its configuration's."""
         return Cube.of(self.config["processor"]["bounds"]) if self.processor is None else self.processor.cube

@@ -31,7 +31,11 @@ _RULES = tuple(
 
 
 def openvla_name(ours: str) -> str | None:
-    """What a tensor of ours is called there, adapters included; None where it has no name."""
+    """What a tensor of ours is called there, adapters included; None where it has no name.
+
+    The same model under another policy of ours (MemoryVLA's `vlm.…`) has the same names.
+    """
+    ours = f"backbone.{ours}" if ours.startswith("vlm.") else ours
     for pattern, theirs in _RULES:
         if pattern.match(ours):
             return pattern.sub(theirs, ours)
