@@ -12,10 +12,12 @@ from mme_vla.memory import (
     own_actions,
     retrieval,
     rmt,
+    spacetime,
     tokendrop,
     ttt,
 )
 
 __all__ = [
-    "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "tokendrop", "ttt",
+    "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "spacetime",
+    "tokendrop", "ttt",
 ]  # fmt: skip
