@@ -8,8 +8,8 @@ from torch import Tensor, nn
 
 from mme_vla.backbone.layers.attention import our_kernels
 from mme_vla.backbone.layers.precision import compute_dtype
-from mme_vla.backbone.pi05.clips import through_time
 from mme_vla.backbone.pi05.sizes import VisionConfig
+from mme_vla.backbone.pi05.through_time import through_time
 from mme_vla.errors import UserError
 
 
