@@ -15,7 +15,8 @@ every slot alike, and slots begin at random: with many slots and few tokens the 
 takes in, and what all slots have in common is learned late.
 
 The memories beyond the paper can be named too (`retrieval_modul`); what they change stands in `OF_KIND`. In the video
-the arm leans aside, for each colour its own way: that is all that the memory `actions` is told.
+the arm leans aside, for each colour its own way: that is all that the memory `actions` is told, and `spacetime` beside
+its pictures.
 """
 
 import argparse
@@ -23,7 +24,7 @@ import json
 import multiprocessing
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +36,9 @@ from mme_vla.config.composition import compose, print_user_errors
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.past_views import past_views, stack_past
 from mme_vla.testing.small import ALL_BEYOND, NEURAL, cached_history
-from mme_vla.types import Batch
+from mme_vla.types import Batch, PastViews
 
 COLOURS = np.array([[220, 40, 40], [40, 200, 60], [50, 70, 230], [230, 210, 40]], np.uint8)
 ANSWERS = np.array([[1, 1, 1, 1, -1, -1, -1, -1], [1, -1, 1, -1, 1, -1, 1, -1],
@@ -55,6 +57,7 @@ OF_KIND: dict[str, dict[str, Any]] = {
     "gist": {"stride": 2, "anchors": 1, "recent": 1},
     "learned_topk": {"pool": LENGTH},
     "actions": {"stride": 1, "max_steps": LENGTH, "max_video": VIDEO, "chunk": 4, "budget": 4, "grid": None},
+    "spacetime": {"frames": 6, "stride": 2, "every": 1, "budget": None, "grid": None},
 }
 
 
@@ -101,7 +104,7 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
     if policy.memory is not None:
         for stream in streams:
             stream.history = cached_history(policy, stream.frames, exec_start=VIDEO)
-            stream.history.motion = stream.motion.__getitem__
+            stream.history.motion, stream.history.state_width = stream.motion.__getitem__, 8
     return streams
 
 
@@ -126,7 +129,22 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
         prompt_mask=prompt_mask.expand(size, -1),
         history=history,
         actions=actions,
+        past=past_of(policy, chosen, steps),
     ).without_prompt_padding()
+
+
+def past_of(policy: MMEPolicy, chosen: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
+    """Past views of the one camera, where the memory gives the vision tower any."""
+    look = None if policy.memory is None else policy.memory.looks_back
+    if look is None:
+        return None
+    prepare = policy.require_processor().images
+    past = stack_past([
+        past_views(look, int(t), lambda at, stream=stream: [stream.frames[at]] * 2, prepare)
+        for stream, t in zip(chosen, steps, strict=True)
+    ])  # fmt: skip
+    assert past is not None
+    return replace(past, images=past.images[:, :, :1])
 
 
 def open_loop_error(policy: MMEPolicy, streams: list[Stream], chunks: int = 48) -> float:

@@ -112,6 +112,20 @@ class Overlap(TensorStruct):
 
 
 @dataclass
+class PastViews(TensorStruct):
+    """Views of past frames, for a vision tower that looks at them along with the current ones.
+
+    images: [b, k, v, 3, s, s] uint8, oldest first, the current frame not among them; float in [−1, 1] once they are as
+        the tower takes them. mask: [b, k] bool; False on frames before the episode's first.
+    every: each so-many-th layer of the tower looks through time, and at least its last.
+    """
+
+    images: Tensor
+    mask: Tensor
+    every: int
+
+
+@dataclass
 class Batch(TensorStruct):
     """What the network reads, and for training what it should answer.
 
@@ -125,6 +139,7 @@ class Batch(TensorStruct):
     proprio: [b, s]; normalised state, for the networks that read it.
     view_tokens: [b, v, n, d]; a frozen tower's tokens of `images`, where they were made beforehand.
     overlap: what a sampled chunk is to agree with; None where it is free.
+    past: past views that a memory gives along with the current ones; None for all others.
     """
 
     images: Tensor
@@ -138,6 +153,7 @@ class Batch(TensorStruct):
     proprio: Tensor | None = None
     view_tokens: Tensor | None = None
     overlap: Overlap | None = None
+    past: PastViews | None = None
 
     def without_prompt_padding(self, multiple: int = 16) -> "Batch":
         """Drop the columns on the right that no prompt of the batch uses, keeping a multiple of `multiple`.

@@ -38,6 +38,7 @@ SHORT_MEMORY = {
     "gist": ["memory.budget=48", "memory.anchors=1", "memory.recent=1"],
     "actions": ["memory.max_steps=8", "memory.max_video=4"],
     "learned_topk": ["memory.budget=48", "memory.pool=4"],
+    "spacetime": ["memory.frames=3", "memory.stride=4", "memory.state_dim=8"],
 }
 
 

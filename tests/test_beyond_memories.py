@@ -237,6 +237,7 @@ def test_frames_that_could_not_be_taken_leave_no_motion_behind(monkeypatch: pyte
 SMALLER: dict[str, dict[str, Any]] = {
     "retrieval": {"budget": 64, "every": 4}, "moment": {"budget": 32}, "gist": {"budget": 160, "stride": 8},
     "actions": {"max_steps": 32, "max_video": 8}, "learned_topk": {"budget": 48, "pool": 8},
+    "spacetime": {"frames": 3, "stride": 5},
 }  # fmt: skip
 
 
@@ -326,3 +327,18 @@ def test_an_episode_feels_and_does_what_a_dataset_says_it_did() -> None:
         episode.observe({"front": pictures, "wrist": pictures}, states[part], frames[part] < start, own)
     assert torch.equal(torch.stack(episode._moved), recorded)
     assert recorded[:, -1].tolist() == [0.0] * (start + 1) + [1.0] * (length - start - 1)
+
+
+def test_what_the_robot_did_is_no_vision_token_and_is_not_marked_beside_a_prompt() -> None:
+    """An episode's is not either: the memory has to be told the same in training."""
+    members: list[Any] = [{"name": "framesamp", "budget": 64}, {"name": "actions", **SMALLER["actions"]}]
+    for name, memory in (("actions_modul", SMALLER["actions"]), ("framesamp_ttt_modul", {"members": members})):
+        policy = small_policy(name, memory=memory)
+        policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
+        batch = random_batch(policy, valid=96)
+        found = policy._marked(batch)
+        assert batch.history is not None and found is not None
+        # The actions' rows come first, for they are padded on the left.
+        given, own = batch.history.features, batch.history.mask.shape[1] - (64 if "members" in memory else 0)
+        assert given[:, :own].abs().sum() > 0 and torch.equal(found.features[:, :own], given[:, :own])
+        assert torch.equal(found.features[:, own:], -given[:, own:])

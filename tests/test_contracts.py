@@ -24,6 +24,7 @@ SIZES: dict[str, dict[str, Any]] = {
     "retrieval": {"budget": 64, "every": 2, "longest": 3}, "moment": {"budget": 16, "moments": 2, "grid": 2},
     "gist": {"budget": 48, "anchors": 1, "recent": 1, "gists": 4, "stride": 8},
     "actions": {"budget": 4, "max_steps": 12, "max_video": 6}, "learned_topk": {"budget": 32, "pool": 6},
+    "spacetime": {"stride": 4},
 }  # fmt: skip
 
 

@@ -78,7 +78,8 @@ class Backbone(nn.Module):
         agrees: whether its samples can agree with actions that are already promised (`Batch.overlap`).
         compiles_sampling: whether `sample` runs without waiting for the GPU, so that `compile_sampling` is for it.
         hosts: what an integration may use, of `blocks`, `expert`, `hook`, `condition`, `beside` and
-            `positions` (blocks that stand at rotary positions of their own).
+            `positions` (blocks that stand at rotary positions of their own); and a memory, `past` (`Batch.past`: a
+            tower that looks at past views along with the current ones).
 
     and implements the methods below. Losses and samples are its own affair (a flow, a regression, a diffusion): whoever
     trains or evaluates hands back the numbers it asked for in `loss_draws` and `sample_draws`.

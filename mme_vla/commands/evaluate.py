@@ -37,8 +37,11 @@ def main(cfg: DictConfig) -> None:
     Raises:
         UserError: anything in the settings, the checkpoint or the machine that cannot work.
     """
+    from mme_vla.data.sources import open_sources
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
+    from mme_vla.evaluation.probe.before import with_sessions
+    from mme_vla.evaluation.probe.recordings import all_recordings
     from mme_vla.evaluation.results.submission import policy_facts
     from mme_vla.evaluation.rollout.evaluation import (
         RunFacts,
@@ -65,6 +68,8 @@ def main(cfg: DictConfig) -> None:
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
     prepare_sampling(policy, cfg.sampling, logger)
+    sessions = plain["recordings"]
+    recordings = [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
     subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]), device)
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
@@ -82,7 +87,8 @@ def main(cfg: DictConfig) -> None:
     _spawn_as_usual()
     try:
         done = evaluate(
-            policy, jobs, output, facts, settings, subgoals=subgoals, shard=shard, source=source, notes=notes,
+            with_sessions(policy, settings.split, recordings), jobs, output, facts, settings,
+            subgoals=subgoals, shard=shard, source=source, notes=notes,
             times_from=None if cfg.times_from is None else Path(str(cfg.times_from)).expanduser(),
         )  # fmt: skip
     finally:

@@ -16,6 +16,7 @@ from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.processing.base import PolicyProcessor, Sample
 from mme_vla.processing.collating import collate as collate
+from mme_vla.processing.past_views import past_views
 from mme_vla.processing.subgoal_text import SubgoalText
 
 
@@ -201,8 +202,15 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             history = self.caches[step.source].history(step.episode)
             if self.memory.reads_motion:
                 history.motion = partial(self._motion, step.source, step.episode)
+                history.state_width = self.processor.embodiment.state.width
             item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
+            if self.memory.looks_back is not None:
+                read = partial(self._pictures, step.source, step.episode)
+                item["past"] = past_views(self.memory.looks_back, step.index, read, self.processor.images)
         return item
+
+    def _pictures(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:
+        return [self.sources[source].frames(episode, frames, name) for name in self.processor.cameras]
 
     def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
         return self.processor.motion(*self.sources[source].own_motion(episode, frames, self.action_offset))

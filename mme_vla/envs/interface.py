@@ -59,6 +59,9 @@ class _Run:
     options: dict[str, Any] = field(default_factory=dict)
     actions: list[Any] = field(default_factory=list)
     """Of the reset, and all since: what the episode can be played again from."""
+    told: str = ""
+    began: list[int] = field(default_factory=list)
+    """Frames at which another sub-task was told."""
     terminated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
     truncated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
 
@@ -235,6 +238,11 @@ class RoboMMEEnv(gymnasium.Env):
         return self._open_task().difficulty
 
     @property
+    def began(self) -> list[int]:
+        """Frames, counted from the reset and the video's first, at which another sub-task's text began."""
+        return [] if self._run is None else list(self._run.began)
+
+    @property
     def steps_counted(self) -> int:
         """Control steps that count towards the limit."""
         return 0 if self._run is None else self._run.count
@@ -252,6 +260,9 @@ class RoboMMEEnv(gymnasium.Env):
         if self.drawing is not None:
             cameras = self.drawing.cameras(run.returned, newest=not run.in_video and not run.control.demonstrator.left)
         frame = run.newest = self._observer.frame(info, cameras)
+        if run.shown.text != run.told:
+            run.began.append(run.returned)
+            run.told = run.shown.text
         run.returned += 1
         run.info = self._info(run, info)
         run.frames.append(frame)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mme_vla.envs import metadata
 from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.variants import read_variant
 from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.registry import TASKS
 
@@ -31,6 +32,7 @@ def make_env(
     render: bool = True,
     reward: str = "none",
     env: str = "mme_vla",
+    sessions: int = 0,
     **include: bool,
 ) -> "RoboMMEEnv | OfficialEnv":
     """Make the environment of one episode.
@@ -49,6 +51,8 @@ def make_env(
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
             share for each sub-task of the execution as it is done, 1 in all.
         env: `mme_vla`, or `official` for the installed package `robomme`.
+        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` asks for; an
+            environment alone has no memory to show them to.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
             `include_available_multi_choices`, `include_maniskill_obs`.
@@ -60,6 +64,7 @@ def make_env(
         UserError: an unknown name, episode or option, a missing package, or no Vulkan driver.
     """
     check_names(task, env, action_space, difficulty, seed)
+    check_sessions(split, sessions)
     if env == "official":
         from mme_vla.envs.official import make_official_env
 
@@ -77,6 +82,22 @@ def make_env(
         variant = {} if varied is None else varied.options
     return _make_own(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
                      recovery=recovery, **variant)  # fmt: skip
+
+
+def check_sessions(split: str, shown: int) -> None:
+    """Refuse a split with sessions before each episode where nobody shows them.
+
+    Raises:
+        UserError: fewer or more are shown than the split asks for.
+    """
+    variant = read_variant(split)
+    wanted = 0 if variant is None else variant.sessions
+    if wanted != shown:
+        raise UserError(
+            f"split={split}: {wanted} unrelated episodes come before each, and {shown} are shown. `python -m "
+            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; whoever shows them "
+            "otherwise says so: make_env(…, sessions=2)."
+        )
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:

@@ -1,6 +1,7 @@
 """Splits that are the test split's scenes turned a little: harder by a dial, or with what is to be remembered in view.
 
-`stress:count=2` is every test episode with two repetitions more, `stress:count=0` the test episodes themselves; `twin`
+`stress:count=2` is every test episode with two repetitions more, `stress:count=0` the test episodes themselves,
+`stress:sessions=2` these after two unrelated episodes in the same memory; `twin`
 is every test episode with the needed fact in view, so that failures of memory and of control can be told apart.
 Importing this needs no simulator.
 """
@@ -27,14 +28,18 @@ DIALS: dict[str, tuple[str, ...]] = {
 count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps more between
 what is shown and the execution. path: discs more on the way. distractors: more objects that are not asked for.
 """
+SESSIONS = "sessions"
+"""The dial that turns no scene: so many unrelated episodes come before one's own, in the same memory. All tasks have
+it; an evaluation shows them."""
 TWINS = (
     "VideoUnmask", "ButtonUnmask", "VideoUnmaskSwap", "ButtonUnmaskSwap", "PickHighlight", "VideoRepick",
     "VideoPlaceButton", "VideoPlaceOrder", "MoveCube", "InsertPeg", "PatternLock",
 )  # fmt: skip
-"""Tasks of which there is a twin. Of VideoRepick the cube is in view, and how often it was picked up is not.
+"""Tasks of which there is a twin. Of VideoRepick the cube is in view, and how often it was picked up so far is not.
 
-Of the others none would be honest: BinFill, PickXtimes, SwingXtimes and StopCube ask for a count that only the past
-holds, and RouteStick's way comes over the same places again, so that words do not say where on it one is.
+The others have none: BinFill, PickXtimes, SwingXtimes and StopCube ask for a count of what was done, and a tally in
+view would also tell when a step is over; RouteStick's way comes over the same places again, so that neither a disc nor
+words say where on it one is.
 """
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 
@@ -52,7 +57,12 @@ class Variant:
         """What a task is built with."""
         if self.twin:
             return {"in_view": True}
-        return {"stress": {self.dial: self.turned}} if self.turned else {}
+        return {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
+
+    @property
+    def sessions(self) -> int:
+        """Unrelated episodes that come before each."""
+        return self.turned if self.dial == SESSIONS else 0
 
     def check(self, task: str) -> None:
         """Make sure that a task of the benchmark can be varied so.
@@ -64,7 +74,7 @@ class Variant:
             raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
         if self.twin and task not in TWINS:
             raise UserError(f"{task} has no twin with the needed fact in view; these have: {', '.join(TWINS)}.")
-        if self.dial and task not in DIALS[self.dial]:
+        if self.dial and self.dial != SESSIONS and task not in DIALS[self.dial]:
             own = [dial for dial, tasks in DIALS.items() if task in tasks]
             raise UserError(
                 f"{task} has no dial {self.dial!r}; it has {', '.join(own) or 'none'}. {self.dial} is for "
@@ -82,11 +92,11 @@ def read_variant(split: str) -> Variant | None:
         return Variant(twin=True)
     if not str(split).startswith(STRESS):
         return None
-    found = _STRESS.fullmatch(split)
+    found, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
     if found is None:
         raise UserError(
-            f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(DIALS)}."
+            f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(known)}."
         )
-    if found[1] not in DIALS:
-        raise UserError(f"split={split!r}: there is no dial {found[1]!r}. {did_you_mean(found[1], DIALS)}")
+    if found[1] not in known:
+        raise UserError(f"split={split!r}: there is no dial {found[1]!r}. {did_you_mean(found[1], known)}")
     return Variant(dial=found[1], turned=int(found[2]))

@@ -5,8 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from mme_vla.data.sources import open_sources
 from mme_vla.envs.make import make_env, require_simulator
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.probe.before import with_sessions
+from mme_vla.evaluation.probe.recordings import all_recordings
 from mme_vla.evaluation.rollout.evaluation import Evaluation, checkpoint_label, default_output, memory_budget
 from mme_vla.evaluation.rollout.evaluation import evaluate as evaluate_run
 from mme_vla.evaluation.rollout.plan import choose_episodes
@@ -27,6 +30,7 @@ def evaluate(
     name: str | None = None,
     base: Callable[..., Any] = make_env,
     shown: bool = True,
+    recordings: Any = None,
     **settings: Any,
 ) -> Evaluation:
     """Run a policy on episodes of the benchmark; what `output` holds already is not run again.
@@ -43,6 +47,7 @@ def evaluate(
         subgoal: a predictor, or the name of one, for policies that read subgoals.
         name: what records call the policy; its own name by default.
         base: makes an environment with the benchmark's interface, importable by name.
+        recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
         shown: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=4` or `render=False`.
 
     Returns:
@@ -70,8 +75,10 @@ def evaluate(
         chosen.max_steps, said, memory_budget(loaded),
     )  # fmt: skip
     folder = default_output(facts) if output is None else Path(output).expanduser()
+    lent = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    shown_first = with_sessions(loaded.eval(), chosen.split, lent)
     return evaluate_run(
-        loaded.eval(), jobs, folder, facts, chosen, subgoals=predictor, source=source, base=base, shown=shown
+        shown_first, jobs, folder, facts, chosen, subgoals=predictor, source=source, base=base, shown=shown
     )
 
 

@@ -2,12 +2,25 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.layers.blocks import Block
+from mme_vla.backbone.layers.blocks import Block, Visibility
 from mme_vla.backbone.pi05.sizes import BackboneConfig
 from mme_vla.errors import UserError
-from mme_vla.integration.base import Integration, checked_position, memory_visibility, own_positions, required
+from mme_vla.integration.base import (
+    MEMORY_VISIBILITY,
+    Integration,
+    checked_position,
+    memory_visibility,
+    own_positions,
+    required,
+)
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens
+
+MUTUAL: Visibility = {
+    **dict.fromkeys(("memory", "images", "prompt"), frozenset({"memory", "images", "prompt"})),
+    "action": MEMORY_VISIBILITY["action"],
+}
+"""Memory as one of the things that are seen: no block of the prefix is hidden from another."""
 
 
 @INTEGRATIONS.register("context")
@@ -15,7 +28,11 @@ class Context(Integration):
     """[memory | images | prompt] in the VLM expert, then actions."""
 
     def __init__(
-        self, backbone: BackboneConfig, prompt_sees_memory: bool = True, memory_position: str = "slot"
+        self,
+        backbone: BackboneConfig,
+        prompt_sees_memory: bool = True,
+        memory_position: str = "slot",
+        mutual: bool = False,
     ) -> None:
         """Take the VLM expert's width.
 
@@ -23,6 +40,8 @@ class Context(Integration):
             prompt_sees_memory: as released; False as the paper's text.
             memory_position: `slot` numbers memory tokens one after the other, as released; `time` places them as many
                 positions before the images as their frames lie in the past.
+            mutual: memory stands between images and prompt, and all three see each other, as LeRobot's tokens of past
+                states do.
 
         Raises:
             UserError: a choice that there is not, or that this backbone does not have.
@@ -34,9 +53,17 @@ class Context(Integration):
                 "sees every other: leave it true."
             )
         self.memory_width, self.memory_position = backbone.vlm.width, checked_position(memory_position)
-        self.visibility = memory_visibility(prompt_sees_memory)
+        if mutual and (memory_position == "time" or not prompt_sees_memory):
+            raise UserError(
+                "integration.mutual=true puts memory between images and prompt, where all see each other: that goes "
+                "with memory_position=slot and prompt_sees_memory=true alone."
+            )
+        self.mutual = mutual
+        self.visibility = MUTUAL if mutual else memory_visibility(prompt_sees_memory)
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         memory = required(memory)
         positions = own_positions(memory, self.memory_position)
-        return [Block("memory", memory.tokens, memory.mask, "vlm", positions), *observation]
+        block = Block("memory", memory.tokens, memory.mask, "vlm", positions)
+        before = 1 + [seen.name for seen in observation].index("images") if self.mutual else 0
+        return [*observation[:before], block, *observation[before:]]

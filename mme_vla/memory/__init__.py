@@ -13,11 +13,12 @@ from mme_vla.memory import (
     own_actions,
     retrieval,
     rmt,
+    spacetime,
     tokendrop,
     ttt,
 )
 
 __all__ = [
-    "banked", "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "tokendrop",
-    "ttt",
+    "banked", "framesamp", "gist", "joined", "learned_topk", "moment", "own_actions", "retrieval", "rmt", "spacetime",
+    "tokendrop", "ttt",
 ]  # fmt: skip

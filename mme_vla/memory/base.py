@@ -1,6 +1,7 @@
 """`Memory`: choose stored tokens, then encode them into at most `budget` memory tokens."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,11 +17,33 @@ LINES = 16
 """Rows and columns of token positions count in so many parts of a view's side, as released, whatever its token grid."""
 
 
+@dataclass(frozen=True)
+class LooksBack:
+    """Past views that a memory gives the backbone along with the current ones, of every camera.
+
+    frames: how many, the current one among them. stride: frames between two of them.
+    every: see `PastViews`.
+    """
+
+    frames: int
+    stride: int
+    every: int
+
+    def at(self, step: int) -> np.ndarray:
+        """The past frames seen at a step, oldest first; negative ones lie before the episode. int64 [frames − 1]."""
+        return step - self.stride * np.arange(self.frames - 1, 0, -1)
+
+    @property
+    def reach(self) -> int:
+        """How many frames before the current one the oldest lies."""
+        return (self.frames - 1) * self.stride
+
+
 class Memory(nn.Module):
     """The interface of every neural memory.
 
     A subclass sets, before use:
-        budget: most memory tokens it may hand over.
+        budget: most memory tokens it may hand over; 0 for a memory that speaks through past views alone.
         capacity: most stored tokens it may select (`budget` unless the encoder reads more than it writes); selections
             are padded to it unless `padded_length` says otherwise.
         storage: what has to be stored of each frame.
@@ -29,6 +52,7 @@ class Memory(nn.Module):
         timed: whether each memory token speaks of one moment, which `MemoryTokens.ages` tells: what
             `integration.memory_position=time` reads.
         reads_motion: whether it reads what the robot felt and did (`History.moved`) instead of stored tokens.
+        looks_back: past views that it gives the backbone along with the current ones; None gives none.
 
     `reporting` is set from outside: True asks `forward` for numbers about its inside, as `MemoryTokens.metrics`. The
     training loop sets it for the updates it logs; where it is False, what only these numbers need is not computed.
@@ -45,6 +69,7 @@ class Memory(nn.Module):
     pad_left: bool = False
     timed: bool = False
     reads_motion: bool = False
+    looks_back: LooksBack | None = None
     lazy: bool = False
     reporting: bool = False
     float32_products: str = "ieee"
@@ -77,9 +102,10 @@ class Memory(nn.Module):
         raise NotImplementedError
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        """Say which frames `select` may choose from, or the scorer look at, when it is asked at these steps.
+        """Say which frames `select` may choose from, or the scorer or the backbone look at, at these steps.
 
-        What is not among them need not be drawn in a simulation, nor encoded. By default all that is stored or scored.
+        What is not among them need not be drawn in a simulation, nor encoded. By default all that is stored or scored;
+        a memory that looks back names the frames it looks at, which then show every camera.
 
         Args:
             steps: current frames, video included. exec_start: as in `History`.
@@ -93,6 +119,10 @@ class Memory(nn.Module):
     def frames_scored(self, length: int) -> np.ndarray:
         """Say which of the first `length` frames the scorer has to be shown: by default all, where there is one."""
         return np.arange(0 if self.make_scorer() is None else length)
+
+    def marked(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        """A selection as the backbone reads it beside a prompt: `mark` [b, n, d_vision] on what are vision tokens."""
+        return history if self.reads_motion else replace(history, features=mark(history.features))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         """Encode the selection [b, n, d_vision] into memory tokens [b, budget, d].

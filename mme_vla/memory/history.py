@@ -80,11 +80,12 @@ class FrameScores:
 class History:
     """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video).
 
-    `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised; it is there for memories that
-    say `reads_motion`.
+    `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first `state_width` of
+    them its state; both are there for memories that say `reads_motion`.
     """
 
     motion: Callable[[np.ndarray], Tensor] | None = None
+    state_width: int = 0
 
     def __init__(self, spec: StorageSpec, exec_start: int = 0) -> None:
         self.spec = spec
@@ -122,6 +123,14 @@ class History:
                 "with the frames (`Episode.observe`)."
             )
         return self.motion(frames)
+
+    def felt(self, frames: np.ndarray) -> Tensor:
+        """The robot's states at frames [n], normalised: [n, s] float32.
+
+        Raises:
+            UserError: nobody noted them.
+        """
+        return self.moved(frames)[:, : self.state_width]
 
     def _row_of(self, frames: np.ndarray, kept: np.ndarray) -> np.ndarray:
         rows = np.minimum(np.searchsorted(kept, frames), max(len(kept) - 1, 0))
@@ -277,7 +286,8 @@ class MarkedHistory(History):
 
     def __init__(self, whole: History, mark: Callable[[Tensor], Tensor]) -> None:
         super().__init__(whole.spec, whole.exec_start)
-        self._whole, self._mark, self.motion = whole, mark, whole.motion
+        self._whole, self._mark = whole, mark
+        self.motion, self.state_width = whole.motion, whole.state_width
 
     def __len__(self) -> int:
         return len(self._whole)

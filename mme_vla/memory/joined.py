@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import Memory, every_one
+from mme_vla.memory.base import LooksBack, Memory, every_one
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -51,6 +52,7 @@ class JoinedMemory(Memory):
         self.timed = all(member.timed for member in built)
         self.reads_motion = any(member.reads_motion for member in built)
         self.lazy = all(member.lazy for member in built)
+        self.looks_back = one_look_back({n: m.looks_back for n, m in zip(self.names, built, strict=True)})
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
@@ -92,17 +94,24 @@ class JoinedMemory(Memory):
         features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
         return HistoryTokens(features, positions, mask, parts[0].step)
 
+    def marked(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        parts = [self.memories[i].marked(piece, mark) for i, piece in self._pieces(history)]
+        return replace(history, features=torch.cat([part.features for part in parts], 1))
+
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
-        fixed = [memories[i].capacity for i in self._order[1:]]
+        found: dict[int, MemoryTokens] = {}
+        for i, piece in self._pieces(history):
+            memories[i].reporting = self.reporting
+            found[i] = memories[i](piece)
+        return self._joined([found[i] for i in range(len(memories))])
+
+    def _pieces(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
+        """Each member's number and selection, in the order in which they lie."""
+        fixed = [self.memories[i].capacity for i in self._order[1:]]
         lengths = [history.mask.shape[1] - sum(fixed), *fixed]
         pieces = zip(*(getattr(history, name).split(lengths, 1) for name in _FIELDS), strict=True)
-        found: dict[int, MemoryTokens] = {}
-        for i, piece in zip(self._order, pieces, strict=True):
-            memories[i].reporting = self.reporting
-            features, positions, mask = piece
-            found[i] = memories[i](HistoryTokens(features, positions, mask, history.step))
-        return self._joined([found[i] for i in range(len(memories))])
+        return [(i, HistoryTokens(*piece, history.step)) for i, piece in zip(self._order, pieces, strict=True)]
 
     def start_stream(self) -> tuple[Any, ...]:
         return tuple(member.start_stream() for member in self.memories)
@@ -146,7 +155,7 @@ class CoarserHistory(History):
 
     def __init__(self, stored: History, spec: StorageSpec) -> None:
         super().__init__(spec, stored.exec_start)
-        self._stored, self.motion = stored, stored.motion
+        self._stored, self.motion, self.state_width = stored, stored.motion, stored.state_width
 
     def __len__(self) -> int:
         return len(self._stored)
@@ -241,6 +250,18 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
     grid = math.lcm(*(spec.grid for spec in specs.values()))
     every = math.gcd(*(spec.keep_every for spec in specs.values()))
     return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
+
+
+def one_look_back(looks: Mapping[str, LooksBack | None]) -> LooksBack | None:
+    """What the one member gives that looks back; None where none does.
+
+    Raises:
+        UserError: several do, and a tower looks back in one way.
+    """
+    found = {name: look for name, look in looks.items() if look is not None}
+    if len(found) > 1:
+        raise UserError(f"{' and '.join(found)} each give the vision tower past views: join only one of them.")
+    return next(iter(found.values()), None)
 
 
 def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:

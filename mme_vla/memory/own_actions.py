@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError
 from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.own_rows import NEVER, OwnRows
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
     RecurrentMemory,
@@ -32,9 +33,6 @@ from mme_vla.memory.recurrent import (
 )
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
-
-NEVER = 1_000_000
-"""Frames between two whose pictures are kept: the first alone."""
 
 
 class LSTMLayer(RecurrentLayer):
@@ -81,26 +79,6 @@ class LSTMLayer(RecurrentLayer):
         return tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device)
 
 
-class OwnMotion(History):
-    """A history as this memory sees it: its tokens are rows of motion, padded with zeros to the width of a token."""
-
-    def __init__(self, whole: History, width: int) -> None:
-        super().__init__(whole.spec, whole.exec_start)
-        self._whole, self._width = whole, width
-
-    def __len__(self) -> int:
-        return len(self._whole)
-
-    def gather(self, indices: np.ndarray) -> Tensor:
-        rows = self._whole.moved(indices[:, 0])
-        if rows.shape[1] > self._width:
-            raise UserError(
-                f"The memory `actions` reads {rows.shape[1]} numbers a frame of this robot, and this backbone's vision "
-                f"tokens, whose place they take, are {self._width} wide."
-            )
-        return nn.functional.pad(rows, (0, self._width - rows.shape[1]))
-
-
 @MEMORIES.register("actions")
 class OwnActions(RecurrentMemory):
     """`budget` tokens of what an LSTM makes of the robot's own states and actions."""
@@ -141,7 +119,9 @@ class OwnActions(RecurrentMemory):
         return np.zeros(0, np.int64)
 
     def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(OwnMotion(history, self.d_vision), step, rng)
+        return super().recall(OwnRows(history, history.moved, self.d_vision, "actions"), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
-        return super().encode([OwnMotion(history, self.d_vision) for history in histories], streams)
+        device = self.output.weight.device
+        own = [OwnRows(history, history.moved, self.d_vision, "actions", device) for history in histories]
+        return super().encode(own, streams)

@@ -43,6 +43,8 @@ class Policy(Saved):
     """Steps of a chunk."""
     skipped: int = 0
     """Steps at a chunk's beginning that lie in the past and are never executed."""
+    sessions_before: int = 0
+    """Unrelated episodes that it is shown before each of its own, as a stress split asks for them."""
     sample_steps: int = 1
     """Steps of its sampler unless told otherwise."""
     agrees: bool = False

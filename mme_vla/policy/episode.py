@@ -12,8 +12,9 @@ from mme_vla.errors import UserError
 from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.policy.promises import Promise, checked_promise
 from mme_vla.processing.limits import check_reach, finite_array
+from mme_vla.processing.past_views import PastPictures
 from mme_vla.processing.prompt import checked_text
-from mme_vla.types import HistoryTokens
+from mme_vla.types import HistoryTokens, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
@@ -56,10 +57,13 @@ class Episode:
         self.history = None if memory is None else memory.start_history(policy.encode_frames)
         if self.history is not None and memory is not None and memory.reads_motion:
             self.history.motion = lambda frames: torch.stack([self._moved[int(frame)] for frame in frames])
+            self.history.state_width = policy.embodiment.state.width
         self.stream = None if memory is None else memory.start_stream()
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.read: History | None = None
         """The history as the last `act` read it, where a backbone marks what is stored."""
+        look = None if memory is None else memory.looks_back
+        self._past = None if look is None else PastPictures(look)
         self.frames_seen = 0
         self._moved: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
         self._chunk: np.ndarray | None = None
@@ -119,6 +123,8 @@ class Episode:
         camera = self._robot.memory_camera
         seen_at = None if drawn is None else np.asarray(drawn[camera], np.int64)
         self._take(views[camera], demo, executed, seen_at, states)
+        if self._past is not None:
+            self._past.take(views, count, drawn)
         self._see(seen)
 
     def remember(
@@ -137,8 +143,10 @@ class Episode:
             is_demo, actions: as for `observe`. states: [t, s]; only a memory of the robot's own motion needs them.
 
         Raises:
-            UserError: a wrong dtype or shape, a video frame after execution has begun, or a memory that needs states.
+            UserError: a wrong dtype or shape, a video frame after execution has begun, a memory that needs states, or
+                one that looks back at pictures of every camera.
         """
+        self._check_apart()
         camera = self._robot.memory_camera
         frames = self._checked_view({camera: frames}, camera)
         demo = np.asarray(is_demo, bool)
@@ -158,8 +166,9 @@ class Episode:
             state: [s].
 
         Raises:
-            UserError: pictures or a state of another form.
+            UserError: pictures or a state of another form, or a memory that looks back at pictures of every camera.
         """
+        self._check_apart()
         state = finite_array(state, "the state")
         width, names = self._robot.state.width, self._robot.camera_names
         if state.shape != (width,):
@@ -170,6 +179,13 @@ class Episode:
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
         images = processor.images([pictures[name] for name in names])
         self._see([(images, torch.from_numpy(state.copy()))])
+
+    def _check_apart(self) -> None:
+        if self._past is not None:
+            raise UserError(
+                "This policy's vision tower looks back at past pictures of every camera: give whole observations "
+                "(`Episode.observe`), not past frames of one camera and the current view apart."
+            )
 
     def _checked_course(
         self, count: int, demo: np.ndarray, actions: np.ndarray | None
@@ -268,6 +284,17 @@ class Episode:
         return torch.stack([self._drawn(images) for images, _ in seen]), torch.stack([state for _, state in seen])
 
     @property
+    def past(self) -> PastViews | None:
+        """Views of earlier frames that the policy's memory gives along with the current ones, unbatched.
+
+        Raises:
+            UserError: one of them was not drawn.
+        """
+        if self._past is None:
+            return None
+        return self._past.at(self.frames_seen - 1, self._policy.require_processor().images)
+
+    @property
     def prompt(self) -> Any:
         """What the policy reads of the goal, and of the subgoal where it reads one."""
         processor, state = self._policy.require_processor(), self._seen[-1][1] if self._seen else None
@@ -287,6 +314,9 @@ class Episode:
         """
         space = self._robot.action
         self.promised = checked_promise(actions, delay, space.horizon, space.width)
+
+    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+        """Hear at which frames sub-tasks began, where an environment tells; only what probes a policy listens."""
 
     def acted(self, chunk: np.ndarray) -> None:
         """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""

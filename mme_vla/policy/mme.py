@@ -23,13 +23,14 @@ from mme_vla.integration.base import Integration, doors_of
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.composing import build_memory, check_positions
+from mme_vla.policy.composing import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.graphs import CapturedSampling
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.promises import promised_overlap
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
+from mme_vla.processing.past_views import full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens, send
 
@@ -117,11 +118,7 @@ class MMEPolicy(Policy):
         memory: Memory | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], backbone, integration.memory_width)
-        if (memory is None) != (integration.memory_width == 0):
-            given = "an integration without a memory" if memory is None else "a memory without an integration"
-            raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
-        if memory is not None:
-            check_positions(config, integration, memory, backbone_cls.hosts)
+        check_integrated(config, integration, memory, backbone_cls.hosts)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
     def autocast(self) -> torch.autocast:
@@ -165,7 +162,7 @@ class MMEPolicy(Policy):
         if "changes" not in given:
             given = given | self.picture_draws(len(batch.actions), torch.default_generator)
         drawn = map_draws(given, lambda value: value.to(self.device))
-        views = self._views(batch, drawn.pop("changes", None))
+        batch, views = self._seen(batch, drawn.pop("changes", None))
         with self.autocast():
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             losses = self.backbone.loss(batch, views, self._inject(memory), drawn)  # b h
@@ -182,7 +179,7 @@ class MMEPolicy(Policy):
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
         with self.autocast():
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            return self.backbone.velocity(batch, self._views(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
+            return self.backbone.velocity(*self._seen(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
 
     def recompute(self, wanted: Recompute) -> None:
         """Compute activations again in the backward pass instead of keeping them, or keep them."""
@@ -209,16 +206,26 @@ class MMEPolicy(Policy):
 
     def _marked(self, batch: Batch) -> HistoryTokens | None:
         """The batch's selection as the backbone reads it beside the prompt."""
-        if batch.history is None:
+        if self.memory is None or batch.history is None:
             return None
-        features = self.backbone.mark(batch.history.features, batch.prompt, batch.prompt_mask)
-        return replace(batch.history, features=features)
+        mark = partial(self.backbone.mark, prompt=batch.prompt, prompt_mask=batch.prompt_mask)
+        return self.memory.marked(batch.history, mark)
 
     def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
         """The random numbers that change the pictures of `count` training samples, [count, …] on the CPU."""
         from mme_vla.processing.augment import augmentation_draws
 
         return augmentation_draws(count, generator)
+
+    def _seen(self, batch: Batch, changes: Tensor | None = None) -> tuple[Batch, Tensor]:
+        """The batch and its current views as the backbone takes them; past ones are changed as the current ones are."""
+        views = self._views(batch, changes)
+        if batch.past is None:
+            return batch, views
+        count = batch.past.images.shape[1]
+        each = replace(batch, images=batch.past.images.flatten(0, 1), past=None)
+        past = self._views(each, None if changes is None else changes.repeat_interleave(count, 0))
+        return replace(batch, past=replace(batch.past, images=past.unflatten(0, (-1, count)))), views
 
     def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
         """The current views in [−1, 1], changed where random numbers say how (`_draw_changes`)."""
@@ -266,7 +273,7 @@ class MMEPolicy(Policy):
         self, batch: Batch, memory: MemoryTokens | None, drawn: Mapping[str, Tensor], steps: int | None
     ) -> Tensor:
         with self.autocast():
-            return self.backbone.sample(batch, self._views(batch), self._inject(memory), drawn, steps)
+            return self.backbone.sample(*self._seen(batch), self._inject(memory), drawn, steps)
 
     @property
     def compiles_sampling(self) -> bool:
@@ -312,6 +319,7 @@ class MMEPolicy(Policy):
             prompt_mask=torch.stack(masks),
             state=states,
             overlap=promised_overlap(promises, states, self.require_processor(), self.action_dim),
+            past=stack_past([e.past for e in episodes]),
         )
         return batch.without_prompt_padding().sent(self.device)
 
@@ -376,6 +384,7 @@ class MMEPolicy(Policy):
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
             history=None if self.memory is None else self.memory.full_history(self.backbone.vision_width, device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
+            past=None if self.memory is None else full_past(self.memory.looks_back, views, size, device),
         )
 
     def _prompt_length(self) -> int:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.memory.base import stack_history
+from mme_vla.processing.past_views import stack_past
 from mme_vla.types import Batch
 
 
@@ -26,5 +27,6 @@ def collate(items: Sequence[dict[str, Any]]) -> Batch:
         actions=stack("actions"),
         action_mask=stack("action_mask") if "action_mask" in items[0] else None,
         state=stack("state"),
+        past=stack_past([item.get("past") for item in items]),
     )
     return batch.without_prompt_padding()

@@ -14,7 +14,7 @@ from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
 from mme_vla.types import HistoryTokens, MemoryTokens
 
-D_VISION, WIDTH, MOTION = 32, 48, 17
+D_VISION, WIDTH, MOTION, STATE = 32, 48, 17, 8
 TOLERANCE = 1e-4
 _Kind = TypeVar("_Kind", bound=History)
 
@@ -65,7 +65,7 @@ class Episode:
 
     def _moving(self, history: _Kind) -> _Kind:
         """The history with what the robot felt and did, where its memory reads that."""
-        history.motion = self.motion.__getitem__ if self.memory.reads_motion else None
+        history.motion, history.state_width = self.motion.__getitem__ if self.memory.reads_motion else None, STATE
         return history
 
     def online(self, piece: int, until: int | None = None) -> OnlineHistory:

@@ -13,15 +13,19 @@ from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.normalisers import NormStats, QuantileStats
-from mme_vla.types import Batch, HistoryTokens
+from mme_vla.processing.past_views import full_past
+from mme_vla.types import Batch, HistoryTokens, PastViews
 
 PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]
 RECURRENT = [f"{m}_{i}" for m in ("ttt", "rmt") for i in ("context", "modul", "expert")]
 NEURAL = [*PERCEPTUAL, *RECURRENT]
 """The paper's."""
 BEYOND_MEMORIES = ("retrieval", "moment", "gist", "actions", "learned_topk")
-ALL_BEYOND = [f"{m}_{i}" for m in BEYOND_MEMORIES for i in ("context", "modul", "expert")]
-BEYOND = ["retrieval_modul", "moment_context", "gist_expert", "actions_expert", "learned_topk_context"]
+"""On every backbone with a place for tokens; `spacetime` needs one whose tower looks back."""
+ALL_BEYOND = [f"{m}_{i}" for m in (*BEYOND_MEMORIES, "spacetime") for i in ("context", "modul", "expert")]
+BEYOND = [
+    "retrieval_modul", "moment_context", "gist_expert", "actions_expert", "learned_topk_context", "spacetime_context",
+]  # fmt: skip
 """Of each memory beyond the paper one composition, for tests that go through all models."""
 MODELS = ["pi05", *NEURAL]
 # The first four are one network; hybrid is framesamp_modul with a subgoal in its prompt.
@@ -101,7 +105,23 @@ def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int 
         prompt_mask=prompt_mask,
         history=random_history(policy, batch, valid, seed),
         actions=torch.randn(batch, policy.horizon, policy.action_dim, generator=generator),
+        past=random_past(policy, batch, seed),
     )
+
+
+def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | None:
+    """Past views of noise, where the memory gives any; the first sample's oldest lies before its episode."""
+    if policy.memory is None:
+        return None
+    views = len(policy.embodiment.cameras)
+    past = full_past(policy.memory.looks_back, views, policy.backbone.image_size, "cpu")
+    if past is None:
+        return None
+    generator = torch.Generator().manual_seed(seed + 1)
+    shape = (batch, *past.images.shape[1:])
+    mask = past.mask.repeat(batch, 1)
+    mask[0, 0] = False
+    return PastViews(torch.randint(0, 256, shape, generator=generator, dtype=torch.uint8), mask, past.every)
 
 
 def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:

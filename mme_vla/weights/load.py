@@ -66,7 +66,7 @@ def load_weights(
     """
     kind = dtype_of(dtype)
     found = open_source(source, revision, token, base)
-    if found.format in ("lerobot", "openpi") and policy.memory is not None:
+    if found.format == "openpi" and policy.memory is not None:
         raise UserError(
             f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
             "To begin training from it use start_from() (on the command line: init_from=…)."
@@ -96,7 +96,7 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     if source.format == "ours":
         return merge_state(source.tensors(), source.config.get("adapters"))
     if source.format == "lerobot":
-        check_window(source.config, str(source.folder))
+        check_window(policy, source.config, str(source.folder))
     adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
     tensors = source.tensors(lambda found: adapter.check_fit(found, state, source.shown))
     return adapter.translate(tensors, state, source.shown)

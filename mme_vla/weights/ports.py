@@ -12,9 +12,11 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
+from mme_vla.memory.spacetime import SpaceTime
+from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.weights.adapter import Adapter, pi05_of
-from mme_vla.weights.name_tables import prefixed
+from mme_vla.weights.name_tables import Piece, prefixed
 from mme_vla.weights.names import torch_backbone as names
 
 LEROBOT_PREFIX = "model."
@@ -30,12 +32,24 @@ WINDOW_MEMORY = {"use_visual_memory": "past pictures in its vision tower", "use_
 """LeRobot's short-window memory of π0.5, by the settings that turn it on; the first adds no tensors."""
 HISTORY = "proprio_history_proj"
 """The tensors that the second adds."""
+WINDOW = {
+    "memory_frames": ("frames", 6),
+    "memory_stride": ("stride", 30),
+    "memory_temporal_attention_every": ("every", 4),
+}
+"""Its other settings: how the memory `spacetime` calls them, and what LeRobot takes where they are not written."""
 _PI0 = re.compile(r"^(state_proj|action_time_mlp_(in|out))\.")
 
 
 def port_adapter(policy: MMEPolicy) -> Adapter:
-    """The tensors of a memoryless policy, or the memoryless part of another, in the ports' names (without `model.`)."""
+    """The tensors of a memoryless policy, or the memoryless part of another, in the ports' names (without `model.`).
+
+    Of the memory `spacetime` the layer of past states has a name too, where its tokens are as wide as the prefix.
+    """
     table = prefixed("backbone", names.torch_names(pi05_of(policy)))
+    memory = policy.memory
+    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == policy.backbone.token_width:
+        table |= {f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")}
     return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
 
 
@@ -68,20 +82,53 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
     return found
 
 
-def check_window(config: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of LeRobot's π0.5 that was trained to look at several frames, which this network cannot.
+def window_of(policy: Policy) -> dict[str, bool | int]:
+    """What LeRobot's settings of its short-window memory would be for a policy; all off for one that has none."""
+    memory = policy.memory
+    if not isinstance(memory, SpaceTime):
+        return dict.fromkeys(WINDOW_MEMORY, False)
+    look = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
+    seen = {"use_visual_memory": memory.looks_back is not None, "use_proprioceptive_memory": memory.states is not None}
+    return seen | {theirs: look[ours] for theirs, (ours, _) in WINDOW.items()}
+
+
+def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
+    """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's.
 
     Raises:
-        UserError: its `config.json` turns a short-window memory on.
+        UserError: its `config.json` turns on a memory that the policy does not have, or has otherwise.
     """
-    seen = [what for setting, what in WINDOW_MEMORY.items() if config.get(setting)]
-    if seen:
-        frames, stride = (brief(config.get(key)) for key in ("memory_frames", "memory_stride"))
+    has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
+    if not any(has.values()) and policy.memory is not None:
         raise UserError(
-            f"{source} reads {' and '.join(seen)} (LeRobot's short-window memory: memory_frames={frames}, "
-            f"memory_stride={stride}), which this library's π0.5 does not: whole, it would act on less than it was "
-            "trained with. To begin training from its weights use start_from() (on the command line: init_from=…)."
+            f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
+            "To begin training from it use start_from() (on the command line: init_from=…)."
         )
+    if any(has.values()):
+        has |= {theirs: config.get(theirs, usual) for theirs, (_, usual) in WINDOW.items()}
+    between = getattr(getattr(policy, "integration", None), "mutual", False)
+    if any(window_of(policy).get(setting) != value for setting, value in has.items()) or (
+        has["use_proprioceptive_memory"] and not between
+    ):
+        raise UserError(_other_window(has, source))
+
+
+def _other_window(has: Mapping[str, Any], source: str) -> str:
+    """What a policy has to be to load a checkpoint with these settings."""
+    seen = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
+    views, states = (str(has[setting]).lower() for setting in WINDOW_MEMORY)
+    integration = (
+        "integration=context integration.mutual=true" if has["use_proprioceptive_memory"] else "integration=none"
+    )
+    look = " ".join(f"memory.{ours}={brief(has[theirs])}" for theirs, (ours, _) in WINDOW.items())
+    frames, stride = (brief(has[key]) for key in ("memory_frames", "memory_stride"))
+    return (
+        f"{source} reads {' and '.join(seen)} (LeRobot's short-window memory: memory_frames={frames}, memory_stride="
+        f"{stride}), which this policy does not, or not so: whole, it would act on other things than it was trained "
+        f"with. Build the one that does: memory=spacetime {integration} {look} memory.views={views} "
+        f"memory.states={states}. To begin training another from its weights use start_from() (on the command line: "
+        "init_from=…)."
+    )
 
 
 def to_lerobot(policy: MMEPolicy, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:

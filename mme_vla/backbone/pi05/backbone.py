@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from mme_vla.backbone.base import Backbone, Draws, Inject, Injection
 from mme_vla.backbone.layers.attention import check_backend
@@ -19,7 +20,7 @@ from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
 from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
 from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.registry import BACKBONES
-from mme_vla.types import Batch
+from mme_vla.types import Batch, PastViews
 
 EULER_STEPS = 10  # as released
 
@@ -33,7 +34,7 @@ class Pi05Backbone(Backbone):
 
     Config = BackboneConfig
     sample_steps = EULER_STEPS
-    hosts = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions"})
+    hosts = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
     agrees = True
     compiles_sampling = True
     heads = ("action_in", "action_out", "time_in", "time_out")
@@ -96,9 +97,20 @@ class Pi05Backbone(Backbone):
 
     def encode_images(self, images: Tensor) -> Tensor:
         """Images [n, 3, s, s] in [−1, 1] → tokens [n, 256, d]; no graph is kept while the tower is frozen."""
+        return self._through_tower(images)
+
+    def _through_tower(self, images: Tensor, *clips: Any) -> Tensor:
         frozen = not any(p.requires_grad for p in self.vision.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
-            return self.vision(images)
+            return self.vision(images, *clips)
+
+    def view_tokens(self, images: Tensor, past: PastViews | None) -> Tensor:
+        """Tokens [b, v, n, d] of current views [b, v, 3, s, s], which look back at past ones where there are any."""
+        if past is None:
+            return self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+        clips = torch.cat([past.images, images[:, None]], 1).transpose(1, 2)  # b v t 3 s s
+        seen = functional.pad(past.mask, (0, 1), value=True)[:, None].expand(clips.shape[:3])
+        return self._through_tower(clips.flatten(0, 1), seen.flatten(0, 1), past.every).unflatten(0, clips.shape[:2])
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         """Tokens [n, grid², d] as memories store them."""
@@ -108,10 +120,10 @@ class Pi05Backbone(Backbone):
         """Blocks of the current views and the prompt.
 
         Args:
-            batch: masks and prompt. images: [b, v, 3, s, s] in [−1, 1], augmented if need be.
+            batch: masks, prompt, and past views where there are any, in [−1, 1].
+            images: [b, v, 3, s, s] in [−1, 1], augmented if need be.
         """
-        views = images.shape[1]
-        tokens = self.encode_images(images.flatten(0, 1)).unflatten(0, (-1, views))  # b v n d
+        tokens = self.view_tokens(images, batch.past)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         # Token embeddings are scaled by √d, image tokens are not.
         words = self.embedding(batch.prompt) * self.config.vlm.width**0.5

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from mme_vla.backbone.layers.attention import our_kernels
 from mme_vla.backbone.layers.precision import compute_dtype
 from mme_vla.backbone.pi05.sizes import VisionConfig
+from mme_vla.backbone.pi05.through_time import through_time
 from mme_vla.errors import UserError
 
 
@@ -40,8 +41,14 @@ class VisionTower(nn.Module):
         """Nothing in it differs in training: it stays as it is, and compiled code serves both modes."""
         return super().train(False)
 
-    def forward(self, images: Tensor) -> Tensor:
+    def forward(self, images: Tensor, seen: Tensor | None = None, every: int = 0) -> Tensor:
+        """Tokens of pictures [n, 3, s, s]; or of clips [n, t, 3, s, s], of the last of whose frames they are.
+
+        Args:
+            seen: [n, t] bool, False on frames of clips that are not there. every: see `PastViews`.
+        """
         vit: Any = self.vit
+        clips, images = images.shape[:-3], images.flatten(0, -4)
         convolution = vit.patch_embed.proj
         # Patches and positions in float32, as released; then the compute dtype.
         with torch.autocast(images.device.type if images.device.type != "meta" else "cpu", enabled=False):
@@ -51,8 +58,11 @@ class VisionTower(nn.Module):
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)
         with our_kernels(x):
-            for block in vit.blocks:
-                x = block(x)
+            if seen is None:
+                for block in vit.blocks:
+                    x = block(x)
+            else:
+                x = through_time(vit.blocks, x.unflatten(0, clips), seen, every)
         return vit.head(vit.norm(x)).to(dtype)
 
 

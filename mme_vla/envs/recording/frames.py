@@ -32,7 +32,8 @@ class FrameChoice:
         where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
         among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
         episode's first stored frame.
-    memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames.
+    memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames, and
+        so does the other where the memory gives a backbone past views.
 
     Raises:
         UserError: `at` is none of these.
@@ -62,8 +63,10 @@ class FrameChoice:
         shown = self._shown(steps, video)
         frames = {camera: frozenset(shown) for camera in CAMERAS}
         if self.memory is not None:
-            read = _build(self.memory).frames_read(np.array(shown, np.int64), video)
-            frames[MEMORY_CAMERA] |= frozenset(read.tolist())
+            memory = _build(self.memory)
+            read = frozenset(memory.frames_read(np.array(shown, np.int64), video).tolist())
+            for camera in CAMERAS if memory.looks_back is not None else (MEMORY_CAMERA,):
+                frames[camera] |= read
         return Drawing(frames, now=())
 
     def to_dict(self) -> dict[str, Any]:

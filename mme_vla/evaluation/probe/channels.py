@@ -87,7 +87,7 @@ class SelectionChannel(Channel):
             positions[its, 0] = 0.0 if entry is None else float(entry.time)
             mask[its] = entry is not None
         kept = mask[:, None]
-        return HistoryTokens(tokens.features.masked_fill(~kept, 0), positions.masked_fill(~kept, 0), mask)
+        return HistoryTokens(tokens.features.masked_fill(~kept, 0), positions.masked_fill(~kept, 0), mask, tokens.step)
 
     def answer(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None

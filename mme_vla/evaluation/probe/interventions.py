@@ -21,7 +21,7 @@ NEEDS = {
     "pauses": "a memory that sees frames at which nothing is decided",
     "subgoal": "a policy that reads subgoals",
     "recordings": "recorded episodes to take from: name them with recordings=…",
-    "boundaries": "recorded sub-tasks, which an episode in closed loop does not tell; offline=true has them",
+    "boundaries": "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by env=mme_vla",
 }
 """What an intervention can ask for, in words."""
 

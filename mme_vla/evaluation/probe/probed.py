@@ -25,13 +25,18 @@ class ProbedPolicy(Policy):
     """`inner` under an arm. It evaluates and rolls out as any policy does; its noise is that of the unprobed one."""
 
     def __init__(
-        self, inner: Policy, arm: Arm = UNPROBED, sessions: Sequence[Recording] = (), lenders: Lenders | None = None
+        self,
+        inner: Policy,
+        arm: Arm = UNPROBED,
+        sessions: Sequence[Recording] = (),
+        lenders: Lenders | None = None,
+        of_split: bool = False,
     ) -> None:
         """Stand before a policy.
 
         Args:
             sessions: what is shown before each episode, as far as the arm asks for it.
-            lenders: other episodes to take from.
+            lenders: other episodes to take from. of_split: the sessions are those of a stress split.
         """
         super().__init__()
         self.inner, self.arm, self.channel = inner, arm, channel_of(inner)
@@ -40,7 +45,12 @@ class ProbedPolicy(Policy):
         self.history_dtype, self.horizon, self.skipped = inner.history_dtype, inner.horizon, inner.skipped
         self.sample_steps, self.action_dim = inner.sample_steps, inner.action_dim
         self.most_actions = inner.most_actions
-        self.sessions, self.lenders = list(sessions)[: arm.feed.sessions], lenders
+        self.sessions, self.lenders, self.of_split = list(sessions)[: arm.feed.sessions], lenders, of_split
+
+    @property
+    def sessions_before(self) -> int:
+        """Unrelated episodes shown before each, as a split asks for them; those of an arm are a probe's own."""
+        return len(self.sessions) if self.of_split else 0
 
     @property
     def before(self) -> int:

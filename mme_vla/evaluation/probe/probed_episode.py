@@ -80,6 +80,12 @@ class ProbedEpisode(Episode):
         """Tell the policy's own episode what the arm made of the subgoal."""
         self.inner.subgoal = subgoal
 
+    def begun(self, frames: Sequence[int], exec_start: int) -> None:
+        """Note where sub-tasks began, the execution among them, as the frames are shown."""
+        told = np.array(sorted({0, exec_start, *frames}), np.int64)
+        shown = self._prober.arm.feed.shown(told, exec_start, self._prober.before)
+        self.boundaries = [int(frame) for frame in shown if frame >= 0]
+
     @property
     def state(self) -> Tensor:
         return self.inner.state

@@ -81,7 +81,8 @@ def run_probe(
     if wanted.recordings:
         notes += _on_recordings(policy, wanted, folder / OFFLINE, facts, shown)
     if wanted.jobs:
-        arms, left_out = choose_arms(wanted.given, policy, channel_of(policy), len(wanted.lend), boundaries=False)
+        told = base is make_env and settings.env == "mme_vla"
+        arms, left_out = choose_arms(wanted.given, policy, channel_of(policy), len(wanted.lend), boundaries=told)
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
         probe_online(
             policy, arms, wanted.jobs, folder, facts, settings, lend=wanted.lend, subgoals=subgoals,

@@ -136,7 +136,7 @@ def others(recordings: Sequence[Recording], own: Recording | None, goal: str) ->
 
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
     """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for all."""
-    if policy.memory is None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
-        return None
     memory = policy.memory
+    if memory is None or memory.looks_back is not None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
+        return None
     return np.union1d(memory.storage.kept_frames(length), memory.frames_scored(length))

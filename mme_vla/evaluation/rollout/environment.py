@@ -196,6 +196,8 @@ class ChunkEnv:
         progress = getattr(getattr(self._env, "task", None), "progress", None)
         if isinstance(progress, Progress):
             report["process"] = process_score(progress, str(report.get("status"))).to_dict()
+        if (began := getattr(self._env, "began", None)) is not None:
+            report["began"] = began
         report["seconds"] = {"sim": self._simulating, "render": self._rendered}
         self._simulating = self._rendered = 0.0
         self._goal = str((report.get("task_goal") or [getattr(self, "_goal", "")])[0])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mme_vla.embodiment.robomme import check_benchmark
-from mme_vla.envs.make import ACTION_SPACES, make_env
+from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
 from mme_vla.envs.vector.jobs import Job
 from mme_vla.envs.vector.pool import VecEnv
 from mme_vla.errors import UserError
@@ -84,6 +84,7 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
+    check_sessions(settings.split, policy.sessions_before)
     if base is make_env:
         check_benchmark(policy.embodiment, ACTION_SPACES)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
@@ -114,6 +115,7 @@ def _environments(
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
     options["most_actions"] = policy.most_actions
     if base is make_env:
+        options |= {"sessions": policy.sessions_before}
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
         options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":

@@ -33,6 +33,9 @@ class Pictures:
         self._grounded = subgoals is not None and subgoals.kind == "grounded"
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
+        memory = policy.memory
+        every = memory is not None and memory.looks_back is not None
+        self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
         self._reads = cache(self._reads_of)
         # Depth and poses of cameras come with every frame.
         self._all = settings.draw == "all" or bool(self._robot.readings) or self._reads(0) is None
@@ -68,7 +71,7 @@ class Pictures:
         return self._drawing(frozenset(self._within(exec_start, seen, stop)))
 
     def _drawing(self, frames: Container[int]) -> Drawing:
-        return Drawing({self._robot.memory_camera: frames}, self._robot.camera_names, self._grounded)
+        return Drawing(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)
 
     def _within(self, exec_start: int, first: int, stop: int) -> list[int]:
         reads = self._reads(exec_start)

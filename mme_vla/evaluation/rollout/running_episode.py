@@ -174,3 +174,4 @@ class RunningEpisode:
                 f"{self.job}: {len(frames['state'])} frames for {len(demo)} actions; rollouts need one frame an action."
             )
         self._frames, self._demo, self._led, self._info, self._at = frames, demo, led, info, 0
+        self.episode.begun(info.get("began", ()), self.video_frames)

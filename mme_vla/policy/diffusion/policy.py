@@ -20,6 +20,7 @@ from mme_vla.errors import UserError, brief
 from mme_vla.integration.feature_wise import PooledIntegration
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.composing import check_past
 from mme_vla.policy.diffusion.processing import DiffusionBatch, DiffusionProcessor
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
@@ -106,6 +107,7 @@ class DiffusionPolicy(Policy):
         memory: Memory | None = None
         if integration is not None:
             memory = MEMORIES.build(config["memory"], d_vision=sizes.memory_width, width=integration.memory_width)
+            check_past(config, memory, frozenset())
         if processor is not None and not isinstance(processor, DiffusionProcessor):
             raise UserError("Diffusion Policy needs its own processor: set processor=dp, or dp_tiny to try things out.")
         return cls(network, memory, integration, processor, config, **policy_options(cls, config))
