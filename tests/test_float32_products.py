@@ -67,7 +67,7 @@ def test_on_a_cpu_it_changes_no_number() -> None:
 
 
 def test_an_unknown_way_is_refused() -> None:
-    with pytest.raises(UserError, match=r"float32_products='tf23'.*did you mean 'tf32'"):
+    with pytest.raises(UserError, match=r"float32_products='tf23'.*Did you mean 'tf32'"):
         small_policy("ttt_modul", **{"+policy": {"float32_products": "tf23"}})
 
 

@@ -13,7 +13,7 @@ from mme_vla.envs.vector.jobs import Job
 from mme_vla.memory.joined import JoinedMemory
 from mme_vla.memory.sampling import recurrent_frames
 from mme_vla.policy.batching import Act, Prepare, Turns
-from mme_vla.testing.small import moving_frames, small_policy
+from mme_vla.testing.small import moving_frames
 
 STEPS = 6
 """A window of six frames is full after 96."""
@@ -97,13 +97,13 @@ def test_a_growing_window_needs_nothing_prepared(make):  # noqa: F811
     assert stream.updates == before
 
 
-def acted(policy, prepare: bool, chunks: int = 12) -> list[np.ndarray]:
+def acted(policy, prepare: bool, chunks: int = 6) -> list[np.ndarray]:
     frames, found = moving_frames(16), []
     episode = policy.start_episode("press the button")
     for chunk in range(chunks):
         shown = np.roll(frames, chunk, axis=2)
         episode.observe({"front": shown, "wrist": shown}, np.zeros((16, 8), np.float32))
-        found.append(policy.act(episode, 2))
+        found.append(policy.act(episode, 1))
         while prepare and policy.prepare(episode):
             pass
     return found
@@ -111,7 +111,7 @@ def acted(policy, prepare: bool, chunks: int = 12) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("model", ["ttt_modul", "rmt_context"])
 def test_preparing_changes_no_action(model):
-    policy = quick_policy(model, memory={"max_steps": 10})
+    policy = quick_policy(model, 8, memory={"max_steps": 4, "budget": 64})
     assert all(np.array_equal(a, b) for a, b in zip(acted(policy, True), acted(policy, False), strict=True))
 
 
@@ -134,9 +134,9 @@ def test_a_longer_window_is_never_full_in_a_whole_episode():
 
 def test_a_memory_of_several_prepares_each():
     members = [{"name": "framesamp", "budget": 64}, {"name": "ttt", "budget": 64, "max_steps": 4}]
-    policy = small_policy("framesamp_ttt_modul", memory={"members": members})
+    policy = quick_policy("framesamp_ttt_modul", 8, memory={"members": members})
     assert isinstance(policy.memory, JoinedMemory)
-    assert all(np.array_equal(a, b) for a, b in zip(acted(policy, True, 7), acted(policy, False, 7), strict=True))
+    assert all(np.array_equal(a, b) for a, b in zip(acted(policy, True), acted(policy, False), strict=True))
 
 
 def test_preparing_waits_for_everybody_and_keeps_nobody():
@@ -156,7 +156,7 @@ def test_preparing_waits_for_everybody_and_keeps_nobody():
 
 
 def test_rollouts_prepare_between_chunks(monkeypatch):
-    policy = quick_policy("ttt_modul", memory={"max_steps": 10})
+    policy = quick_policy("ttt_modul", 8, memory={"max_steps": 10})
     calls, prepare = [], policy.prepare
     monkeypatch.setattr(policy, "prepare", lambda episode: calls.append(episode.frames_seen) or prepare(episode))
 
@@ -174,7 +174,7 @@ def test_rollouts_prepare_between_chunks(monkeypatch):
 
 
 def test_a_server_prepares_after_it_has_answered(monkeypatch):
-    policy = quick_policy("rmt_modul", memory={"max_steps": 4, "chunk": 2})
+    policy = quick_policy("rmt_modul", 8, memory={"max_steps": 4, "chunk": 2})
     parts, done = course(video=9, rounds=6), []
     prepare = policy.prepare
     monkeypatch.setattr(policy, "prepare", lambda episode: done.append(left := prepare(episode)) or left)
