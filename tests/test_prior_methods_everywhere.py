@@ -62,7 +62,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
 
 @pytest.fixture(scope="module")
 def trained(data: Callable[[str], str], tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The run of a model after one update, its last checkpoint under `latest`."""
+    """The run of a model after one update."""
     pytest.importorskip("diffusers", reason="needs the prior methods' packages: uv sync --inexact --extra baselines")
 
     @cache
@@ -83,7 +83,7 @@ def update(model: str, data: str, folder: Path, *words: str) -> Path:
 
 @pytest.fixture(scope="module")
 def loaded(trained: Callable[[str], Path]) -> Callable[[str], Policy]:
-    return cache(lambda model: Policy.from_pretrained(trained(model) / "latest").eval())
+    return cache(lambda model: Policy.from_pretrained(trained(model)).eval())
 
 
 class DepthEnv(ScriptedEnv):
@@ -160,7 +160,7 @@ def test_it_is_probed_on_recordings(
     torch.manual_seed(0)
     found = probe_offline(policy, read_arms(["nodemo"]), recordings[:1], recordings, tmp_path / "lines.jsonl", chosen)
     moments = [line for line in found if isinstance(line, MomentLine)]
-    assert len(moments) == 2 and {line.episode for line in moments} == {recordings[0].name}
+    assert len(moments) == 2 and {line.recording for line in moments} == {recordings[0].name}
     assert all(np.isfinite(line.change) for line in moments)
     assert lines.read(tmp_path / "lines.jsonl")[0] == found
 
@@ -213,7 +213,7 @@ def test_a_sam2act_episode_ends_after_its_waypoints(loaded: Callable[[str], Poli
 @pytest.mark.parametrize("model", SHORT)
 def test_it_is_explained_by_inspect_and_stands_beside_its_paper_row(model: str, trained: Callable[[str], Path]) -> None:
     console = Console(record=True, width=200, file=io.StringIO())
-    show_checkpoint(trained(model) / "latest", console)
+    show_checkpoint(trained(model), console)
     said = console.export_text()
     assert "vision" in said and "action" in said and "normalisation" in said and model in said
     subgoal = {"openvla_oft_simplesg": "qwenvl", "openvla_oft_groundsg": "qwenvl"}.get(model)
