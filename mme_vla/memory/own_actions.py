@@ -51,6 +51,8 @@ class LSTMLayer(RecurrentLayer):
         self.inputs = nn.ModuleList(nn.Linear(hidden, 4 * hidden) for _ in range(layers))
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers))
         self.tokens = nn.Linear(hidden, budget * hidden)
+        # What is the same for every history must not be most of a token: norms above leave its direction alone.
+        nn.init.zeros_(self.tokens.bias)
         with torch.no_grad():
             for gates in self.inputs:
                 gates.bias[hidden : 2 * hidden] = torch.linspace(0, math.log(max(longest - 1, 2)), hidden)  # type: ignore[index]
