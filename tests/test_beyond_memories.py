@@ -15,6 +15,7 @@ from mme_vla.memory.gist import Gist
 from mme_vla.memory.history import CachedHistory
 from mme_vla.memory.learned_topk import LearnedTopK
 from mme_vla.memory.moment import Moment
+from mme_vla.memory.own_actions import LSTMLayer
 from mme_vla.memory.retrieval import Retrieval, chunks_of
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.registry import MEMORIES
@@ -342,3 +343,12 @@ def test_what_the_robot_did_is_no_vision_token_and_is_not_marked_beside_a_prompt
         given, own = batch.history.features, batch.history.mask.shape[1] - (64 if "members" in memory else 0)
         assert given[:, :own].abs().sum() > 0 and torch.equal(found.features[:, :own], given[:, :own])
         assert torch.equal(found.features[:, own:], -given[:, own:])
+
+
+@torch.no_grad()
+def test_a_fresh_memory_of_actions_still_knows_the_beginning_at_the_end_of_its_window() -> None:
+    layer = LSTMLayer(32, 2, 4, longest=256)
+    rows, valid = noise(2, 256, 1, 32), torch.ones(2, 256, dtype=torch.bool)
+    other = torch.cat([noise(2, 5, 1, 32, seed=1), rows[:, 5:]], 1)
+    end, otherwise = (layer.read(layer.advance(layer.initial(2), x, valid)[0])[0] for x in (rows, other))
+    assert float((end - otherwise).norm() / end.norm()) > 0.05

@@ -23,7 +23,7 @@ def test_a_memory_learns_what_only_the_video_showed(learn):
     assert learn("framesamp_expert")["error"] < 0.5 * GUESSING
 
 
-@pytest.mark.parametrize("model", BEYOND)
+@pytest.mark.parametrize("model", [*BEYOND, "actions_context", "spacetime_modul"])
 def test_so_does_each_memory_beyond_the_paper(learn, model):
     assert learn(model)["error"] < 0.5 * GUESSING
 

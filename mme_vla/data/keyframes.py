@@ -141,7 +141,8 @@ class EpisodeKeyframes:
             Of every camera pictures [n, s, s, 3] uint8, depths [n, s, s, 1] float32 in millimetres, poses [n, 3, 4].
         """
         kept = self._read("frames", "colours", "depth", "extrinsic")
-        at, found = np.searchsorted(kept["frames"], frames), {}
+        at = np.searchsorted(kept["frames"], frames)
+        found: dict[str, np.ndarray] = {}
         for camera in robot.cameras:
             c = CAMERAS.index(camera.name)
             beside = (kept["depth"][at, c][..., None].astype(np.float32), kept["extrinsic"][at, c].astype(np.float32))

@@ -11,6 +11,7 @@ no own action led to it (the video, the first frame) the last two are 0. On a ro
 frames they are 0 everywhere: the states say where it went.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,18 +37,25 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 class LSTMLayer(RecurrentLayer):
-    """An LSTM of several layers. State: hidden and cell states, each [b, layers, hidden], 0 at first."""
+    """An LSTM of several layers. State: hidden and cell states, each [b, layers, hidden], 0 at first.
 
-    def __init__(self, hidden: int, layers: int, budget: int) -> None:
+    Fresh cells forget at rates of their own, from half of what they hold a frame to a share in `longest` of it, evenly
+    in the logarithm (after Tallec and Ollivier, arXiv 1804.11188): with the usual bias of 1 nothing of a video would be
+    left after a hundred frames, and no loss could tell what there was to keep.
+    """
+
+    def __init__(self, hidden: int, layers: int, budget: int, longest: int) -> None:
         super().__init__()
         self.hidden, self.budget = hidden, budget
         self.norm = nn.LayerNorm(hidden)  # a fresh encoder's answers are small: the gates would hardly move
         self.inputs = nn.ModuleList(nn.Linear(hidden, 4 * hidden) for _ in range(layers))
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers))
         self.tokens = nn.Linear(hidden, budget * hidden)
+        # What is the same for every history must not be most of a token: norms above leave its direction alone.
+        nn.init.zeros_(self.tokens.bias)
         with torch.no_grad():
             for gates in self.inputs:
-                gates.bias[hidden : 2 * hidden].fill_(1.0)  # type: ignore[index]
+                gates.bias[hidden : 2 * hidden] = torch.linspace(0, math.log(max(longest - 1, 2)), hidden)  # type: ignore[index]
 
     def initial(self, batch: int) -> State:
         zeros = self.tokens.weight.new_zeros(batch, len(self.inputs), self.hidden, dtype=torch.float32)
@@ -109,7 +117,7 @@ class OwnActions(RecurrentMemory):
         if budget < 1 or layers < 1:
             raise UserError(f"memory.budget={budget}, memory.layers={layers}: both must be at least 1.")
         hidden = default_hidden(d_vision, hidden)
-        layer = LSTMLayer(hidden, layers, budget)
+        layer = LSTMLayer(hidden, layers, budget, max_steps)
         options |= {"grid": 1, "max_steps": max_steps, "max_video": max_video, "stride": stride}
         super().__init__(d_vision, width, layer, hidden, budget, **options)
         self.storage = StorageSpec(1, "mean", NEVER)

@@ -86,7 +86,7 @@ class SpaceTime(Memory):
         return read[read >= 0]
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        frames = step - self.stride * np.arange(self.frames - 1, -1, -1) if self.budget else np.zeros(0, np.int64)
+        frames: np.ndarray = step - self.stride * np.arange(self.frames - 1 if self.budget else -1, -1, -1)
         frames = frames[frames >= 0]
         return np.stack([frames, np.zeros_like(frames)], 1)
 

@@ -51,9 +51,9 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
     """
     n, t, p = x.shape[:3]
     q, k, v = attention.qkv(x).unflatten(-1, (3, attention.num_heads, -1)).permute(3, 0, 4, 1, 2, 5)  # n h t p c
-    in_time = (part.permute(0, 3, 1, 2, 4).flatten(0, 1) for part in (q, k, v))  # n·p h t c
+    of_patch = [part.permute(0, 3, 1, 2, 4).flatten(0, 1) for part in (q, k, v)]  # n·p h t c
     mask = before.repeat_interleave(p, 0)[:, None]
-    mixed = functional.scaled_dot_product_attention(*in_time, attn_mask=mask)
+    mixed = functional.scaled_dot_product_attention(of_patch[0], of_patch[1], of_patch[2], attn_mask=mask)
     mixed = mixed.unflatten(0, (n, p)).permute(0, 3, 2, 1, 4)  # n t h p c
     q, k = (part.transpose(1, 2).flatten(0, 1) for part in (q, k))
     answer = functional.scaled_dot_product_attention(q, k, mixed.flatten(0, 1))

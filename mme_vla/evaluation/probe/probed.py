@@ -45,12 +45,8 @@ class ProbedPolicy(Policy):
         self.history_dtype, self.horizon, self.skipped = inner.history_dtype, inner.horizon, inner.skipped
         self.sample_steps, self.action_dim = inner.sample_steps, inner.action_dim
         self.most_actions = inner.most_actions
-        self.sessions, self.lenders, self.of_split = list(sessions)[: arm.feed.sessions], lenders, of_split
-
-    @property
-    def sessions_before(self) -> int:
-        """Unrelated episodes shown before each, as a split asks for them; those of an arm are a probe's own."""
-        return len(self.sessions) if self.of_split else 0
+        self.sessions, self.lenders = list(sessions)[: arm.feed.sessions], lenders
+        self.sessions_before = len(self.sessions) if of_split else 0  # those of an arm are the probe's own
 
     @property
     def before(self) -> int:
