@@ -238,7 +238,8 @@ class EpisodeSource:
         first = min(start, length - 1)
         recorded = self.actions(episode, first, min(start + horizon, length) if start < length else length)
         chunk, known = recorded[np.minimum(steps, length - 1) - first], steps < length
-        chunk[np.ix_(np.flatnonzero(~known), self.robot.action.of_pose)] = 0
+        for place in self.robot.action.of_pose:
+            chunk[~known, place] = 0
         return chunk, known
 
     def past_actions(self, episode: int, start: int, most: int, offset: int = 0) -> np.ndarray:

@@ -48,14 +48,15 @@ class LSTMLayer(RecurrentLayer):
         super().__init__()
         self.hidden, self.budget = hidden, budget
         self.norm = nn.LayerNorm(hidden)  # a fresh encoder's answers are small: the gates would hardly move
-        self.inputs = nn.ModuleList(nn.Linear(hidden, 4 * hidden) for _ in range(layers))
+        inputs = [nn.Linear(hidden, 4 * hidden) for _ in range(layers)]
+        self.inputs = nn.ModuleList(inputs)
         self.recurrent = nn.ModuleList(nn.Linear(hidden, 4 * hidden, bias=False) for _ in range(layers))
         self.tokens = nn.Linear(hidden, budget * hidden)
         # What is the same for every history must not be most of a token: norms above leave its direction alone.
         nn.init.zeros_(self.tokens.bias)
         with torch.no_grad():
-            for gates in self.inputs:
-                gates.bias[hidden : 2 * hidden] = torch.linspace(0, math.log(max(longest - 1, 2)), hidden)  # type: ignore[index]
+            for gates in inputs:
+                gates.bias[hidden : 2 * hidden] = torch.linspace(0, math.log(max(longest - 1, 2)), hidden)
 
     def initial(self, batch: int) -> State:
         zeros = self.tokens.weight.new_zeros(batch, len(self.inputs), self.hidden, dtype=torch.float32)
