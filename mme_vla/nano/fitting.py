@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.files import read_json_lines, write_json
-from mme_vla.nano.learning import Decisions, load_all, statistics
+from mme_vla.nano.learning import Decisions, load_all, off_by, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -94,8 +94,9 @@ def train(
     assert trainer.last_checkpoint is not None
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
+    off = off_by(MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval(), held)
     spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
-    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), **spent})
+    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), "off_by_m": off.tolist(), **spent})
     return trainer.last_checkpoint
 
 
