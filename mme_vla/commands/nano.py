@@ -33,12 +33,12 @@ def main() -> None:
 
 
 def with_settings(words: Sequence[str]) -> list[str]:
-    """The words of a command line, after them what the task's file in configs/nano says; what is typed counts more."""
+    """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more."""
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
     own = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
     if own is None or not own.is_file() or any(word.startswith("nano=") for word in words):
         return list(words)
-    return [*words, f"nano={own.stem}"]
+    return [f"nano={own.stem}", *words]
 
 
 @cli("nano")
