@@ -33,7 +33,11 @@ def main() -> None:
 
 
 def with_settings(words: Sequence[str]) -> list[str]:
-    """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more."""
+    """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more.
+
+    `model=…` would be a choice for a tree that holds one model. Here it names the first of several.
+    """
+    words = [f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word for word in words]
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
     own = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
     if own is None or not own.is_file() or any(word.startswith("nano=") for word in words):
@@ -69,7 +73,7 @@ def run(config: Mapping[str, Any]) -> Path:
     folder = Path(config["output"])
     folder.mkdir(parents=True, exist_ok=True)
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
-    models = list(dict.fromkeys([config["model"], *config["beside"], *config["also"]]))
+    models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
     composed = {model: compose_policy(model, config["memories"], words) for model in models}
     drawn_for = [model for model in config["drawn_for"] if model not in composed]
     minutes = _Minutes(folder / "minutes.json")
@@ -91,7 +95,7 @@ def run(config: Mapping[str, Any]) -> Path:
                 episodes=config["also_episodes" if model in config["also"] else "episodes"],
                 seeds=config["policy_seeds"], workers=config["workers"], max_steps=config["max_steps"],
             )  # fmt: skip
-        if model == config["model"] and config["films"]:
+        if model == config["with_memory"] and config["films"]:
             with minutes.of("films"):
                 films = film(checkpoint, folder / "films", records[model])
     if config["planner"]:

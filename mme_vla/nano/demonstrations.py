@@ -59,17 +59,17 @@ class Demonstration:
             np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path: Path) -> "Demonstration":
-        """Read what `save` wrote."""
+    def load(cls, path: Path, pictures: bool = True) -> "Demonstration":
+        """Read what `save` wrote, or what of it is no picture."""
         with np.load(path) as file:
-            pictures = {
+            drawn = {
                 camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
                 for camera in CAMERAS
-                if f"{camera}_frames" in file
+                if pictures and f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
-            return cls(**about, states=file["states"], motions=motions, pictures=pictures)
+            return cls(**about, states=file["states"], motions=motions, pictures=drawn)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Training on demonstrations of planned motions: every decision is a sample, and all its tokens are made beforehand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -74,9 +74,9 @@ class Decisions(Dataset[int]):
 
     @classmethod
     def of(
-        cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1, elsewhere: float = ELSEWHERE
+        cls, policy: MMEPolicy, demonstrations: Iterable[Demonstration], often: int = 1, elsewhere: float = ELSEWHERE
     ) -> "Decisions":
-        """Make all tokens.
+        """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
@@ -86,11 +86,14 @@ class Decisions(Dataset[int]):
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
         """
-        items = [item for found in demonstrations for item in _items(policy, found)]
+        items: list[dict[str, Any]] = []
+        far: list[np.ndarray] = []
+        for found in demonstrations:
+            items += _items(policy, found)
+            far.append(_far(found.motions.targets, elsewhere))
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        far = torch.from_numpy(np.concatenate([_far(found.motions.targets, elsewhere) for found in demonstrations]))
-        return cls(_stack(items), far, often)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often)
 
     @classmethod
     def load(cls, path: Path, often: int = 1) -> "Decisions":
@@ -145,12 +148,7 @@ def off_by(policy: MMEPolicy, held: Decisions, seed: int = 0) -> Tensor:
     return (said - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
 
 
-def load_all(files: Sequence[Path]) -> list[Demonstration]:
-    """Recorded demonstrations, in this order."""
-    return [Demonstration.load(file) for file in files]
-
-
-def statistics(demonstrations: Sequence[Demonstration], policy: MMEPolicy) -> NormStats:
+def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:
     """What states and motions are normalised by; numbers that hardly move keep their size.
 
     Raises:
