@@ -22,6 +22,14 @@ def test_they_go_on_where_the_rule_of_the_test_split_ends() -> None:
     assert (further[0].split, further[0].episode, further[0].recovery) == (FURTHER, 0, None)
 
 
+@pytest.mark.parametrize("level", ["easy", "medium", "hard"])
+def test_those_of_one_difficulty_are_picked_from_the_same_rule_in_its_order(level: str) -> None:
+    rule = [metadata.formula("MoveCube", "test", n) for n in range(50, 900)]
+    wanted = [seed for seed, difficulty in rule if difficulty == level][:200]
+    found = metadata.episodes("MoveCube", f"further_{level}")
+    assert [spec.seed for spec in found] == wanted and {spec.difficulty for spec in found} == {level}
+
+
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_no_other_split_of_the_task_has_them(task: str) -> None:
     others = {spec.seed for split in (*metadata.SPLITS, MORE) for spec in metadata.episodes(task, split)}

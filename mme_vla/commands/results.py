@@ -11,7 +11,7 @@ from pathlib import Path
 
 from mme_vla.config.composition import print_user_errors
 from mme_vla.config.help import argument_parser
-from mme_vla.envs.metadata import FURTHER, FURTHER_EPISODES
+from mme_vla.envs.metadata import FURTHER_SPLITS
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.records import EpisodeRecord
@@ -97,7 +97,8 @@ def run(args: argparse.Namespace) -> None:
 def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
     """Episodes of a task in the split that the records are of."""
     splits = {record.split for record in records if split in (None, record.split)}
-    return FURTHER_EPISODES if splits == {FURTHER} else TEST_EPISODES
+    counts = {FURTHER_SPLITS.get(str(name), TEST_EPISODES) for name in splits}
+    return counts.pop() if len(counts) == 1 else TEST_EPISODES
 
 
 def show_curves(curves: Curves, args: argparse.Namespace) -> None:
