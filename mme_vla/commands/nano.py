@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json, write_json
 
 if TYPE_CHECKING:
+    from mme_vla.embodiment.actions import ActionSpace
     from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.evaluation.records import EpisodeRecord
     from mme_vla.nano.demonstrations import Scene
@@ -64,6 +66,7 @@ def command(cfg: DictConfig) -> None:
 
 def run(config: Mapping[str, Any]) -> Path:
     """All stages of a run; the path of its page; of a folder, where other commands are to go on there."""
+    from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
     from mme_vla.nano.evaluating import film, run_episodes
     from mme_vla.nano.fitting import compose_policy, train
@@ -73,6 +76,7 @@ def run(config: Mapping[str, Any]) -> Path:
     folder = Path(config["output"])
     folder.mkdir(parents=True, exist_ok=True)
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
+    words += config["overrides"]
     models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
     composed = {model: compose_policy(model, config["memories"], words) for model in models}
     drawn_for = [model for model in config["drawn_for"] if model not in composed]
@@ -81,7 +85,8 @@ def run(config: Mapping[str, Any]) -> Path:
         others = [compose_policy(model, config["memories"], words) for model in drawn_for]
         memories = [each["memory"] for each in (*composed.values(), *others)]
         choices = [FrameChoice(DECISIONS, memory) for memory in [None, *filter(None, memories)]]
-        files = record_all(config, folder / "demonstrations", choices)
+        robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
+        files = record_all(config, folder / "demonstrations", choices, robot.action)
     if config["record_only"]:
         return folder / "demonstrations"
     records: dict[str, list[EpisodeRecord]] = {}
@@ -144,11 +149,13 @@ def check_counts(counts: Any) -> None:
         raise UserError(f"demonstrations={brief(counts)}: it takes two, to learn from and to measure by.")
 
 
-def record_all(config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]") -> list[Path]:
+def record_all(
+    config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", acts: "ActionSpace"
+) -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
 
     Args:
-        choices: what the memories that will train on them read.
+        choices: what the memories that will train on them read. acts: of the robot that does.
 
     Raises:
         UserError: scene after scene without a demonstration that succeeds.
@@ -164,7 +171,8 @@ def record_all(config: Mapping[str, Any], folder: Path, choices: "Sequence[Frame
     with progress("record", sum(counts.values()), unit="demonstrations") as advance:
         for number, (level, wanted) in enumerate(counts.items()):
             first = int(config["first_seed"]) + number * SEEDS_APART
-            scenes = (Scene(config["task"], seed, level, folder, cameras, tuple(choices)) for seed in count(first))
+            scene = Scene(config["task"], first, level, folder, cameras, tuple(choices), config["carried_out"], acts)
+            scenes = (replace(scene, seed=seed) for seed in count(first))
             files += demonstrate(scenes, wanted, config["workers"], advance)
     return files
 

@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.waypoints import Motions
-from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.embodiment.options import Option, read_options
+from mme_vla.embodiment.robomme import benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.files import parse_json, write_atomically
 from mme_vla.subgoal.oracle import online_subgoal
 
 if TYPE_CHECKING:
+    from mme_vla.embodiment.actions import ActionSpace
     from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
@@ -77,6 +79,7 @@ class Scene:
     """A scene to demonstrate, and the folder of what comes of it.
 
     cameras: those that are drawn. choices: at which frames, for each memory that will train on it.
+    carried_out, acts: see `record`.
     """
 
     task: str
@@ -85,6 +88,8 @@ class Scene:
     folder: Path
     cameras: tuple[str, ...]
     choices: tuple["FrameChoice", ...]
+    carried_out: bool = False
+    acts: "ActionSpace | None" = None
 
     @property
     def path(self) -> Path:
@@ -110,7 +115,7 @@ class Scene:
 
 def demonstrated(scene: Scene) -> bool:
     """Demonstrate a scene into its file; whether the demonstrator succeeded."""
-    made = record(scene.task, scene.seed, scene.difficulty, scene.choices, scene.cameras)
+    made = record(scene.task, scene.seed, scene.difficulty, scene.choices, scene.cameras, scene.carried_out, scene.acts)
     if made is None:
         scene.failed.touch()
         return False
@@ -119,49 +124,120 @@ def demonstrated(scene: Scene) -> bool:
 
 
 def record(
-    task: str, seed: int, difficulty: str, choices: Sequence["FrameChoice"], cameras: Sequence[str] = ("front", "wrist")
+    task: str,
+    seed: int,
+    difficulty: str,
+    choices: Sequence["FrameChoice"],
+    cameras: Sequence[str] = ("front", "wrist"),
+    carried_out: bool = False,
+    acts: "ActionSpace | None" = None,
 ) -> Demonstration | None:
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
         choices: what the memories that will train on it read; these cameras are drawn at the frames of all of them.
+        carried_out: show what is seen while the demonstration's motions are carried out one by one, as a policy's are;
+            None too where that does not succeed. The demonstrator does more between some of its motions.
+        acts: of the robot that will learn from it. Where it chooses among options, the choices stand in place of
+            motions, and the options behind the goal; None: motions.
     """
-    from mme_vla.envs.drawing import Drawing
-    from mme_vla.envs.recording.frames import motions_of
-    from mme_vla.envs.recording.recorder import Recorder
     from mme_vla.envs.scene.placement import SceneError
 
     try:
         env = make_task(task, render=True, seed=seed, difficulty=difficulty)
     except SceneError:
         return None
-    steps: list[RecordedStep] = []
-    scenes: list[Any] = []
-
-    def take(step: "RecordedStep") -> None:
-        steps.append(step)
-        scenes.append(env.get_state_dict())
-
+    taken = _Taken(env)
     try:
-        result = Recorder(env, on_step=take, drawing=Drawing(now=())).record()
-        if not result.success:
+        chooser = acts if acts is not None and acts.choice else None
+        motions = _demonstrate(taken, choosing=chooser is not None)
+        if carried_out and motions is not None:
+            env.close()
+            env = make_task(task, render=True, seed=seed, difficulty=difficulty)
+            taken = _Taken(env)
+            motions = _carry_out(taken, motions.targets, chooser)
+        if motions is None:
             return None
-        motions = motions_of(steps)
-        drawn = [choice.drawing(steps).frames for choice in choices]
-        wanted = {camera: {k for k in range(len(steps)) if any(k in of[camera] for of in drawn)} for camera in cameras}
+        at = set(motions.decisions.tolist())
+        read = at.union(*(choice.read(motions.decisions, taken.video) for choice in choices))
+        wanted = {camera: read if camera == "front" else at for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):
-            _put_back(env, scenes[frame])
+            _put_back(env, taken.scenes[frame])
             for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
                 pictures[camera][frame] = picture
-        states = [benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]) for step in steps]
-        texts = [steps[frame].info for frame in motions.decisions]
+        goal = (
+            env.goals()[0].lower()
+            if chooser is None
+            else chooser.worded(env.goals()[0].lower(), _options(env, chooser))
+        )
+        texts = [taken.texts[frame] for frame in motions.decisions]
         return Demonstration(
-            type(env).__name__, seed, difficulty, env.goals()[0].lower(), len(steps), result.video, np.stack(states),
-            motions, pictures, {kind: _shown(texts, kind) for kind in SUBGOALS},
+            type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
+            np.stack(taken.states), motions, pictures, {kind: _shown(texts, kind) for kind in SUBGOALS},
         )  # fmt: skip
     finally:
         env.close()
+
+
+@dataclass
+class _Taken:
+    """What is noted of every frame of an episode; `video` of them come before its execution."""
+
+    env: "Task"
+    states: list[np.ndarray] = field(default_factory=list)
+    scenes: list[Any] = field(default_factory=list)
+    texts: list[Mapping[str, Any]] = field(default_factory=list)
+    video: int = 0
+
+    def add(self, observed: Mapping[str, Any], info: Mapping[str, Any], in_video: bool) -> None:
+        self.texts.append(info)
+        self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
+        self.scenes.append(self.env.get_state_dict())
+        self.video += in_video
+
+
+def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
+    """What a task offers to choose from."""
+    given = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
+    return read_options(given, len(chooser.choice))
+
+
+def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
+    """The motions of a demonstration, or its choices, if it succeeds."""
+    from mme_vla.envs.drawing import Drawing
+    from mme_vla.envs.recording.frames import choices_of, motions_of
+    from mme_vla.envs.recording.recorder import Recorder
+
+    steps: list[RecordedStep] = []
+
+    def take(step: "RecordedStep") -> None:
+        steps.append(step)
+        taken.add(step.obs, step.info, step.info["is_video_demo"])
+
+    result = Recorder(taken.env, on_step=take, drawing=Drawing(now=())).record()
+    if not result.success:
+        return None
+    return choices_of(steps) if choosing else motions_of(steps)
+
+
+def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
+    """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
+    from mme_vla.envs.drawing import Drawing
+    from mme_vla.envs.interface import RoboMMEEnv
+
+    env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
+    env.drawing = Drawing(now=())
+    env.on_frame = taken.add
+    env.reset()
+    decisions = []
+    for number, target in enumerate(targets, 1):
+        decisions.append(len(taken.states) - 1)
+        _, _, ended, _, info = env.step(target if chooser is None else benchmark_action(chooser, target))
+        if ended:
+            done = info["status"] == "success"
+            return Motions(np.array(decisions, np.int64), targets[:number]) if done else None
+    return None
 
 
 def _shown(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:

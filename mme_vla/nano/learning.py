@@ -25,6 +25,7 @@ NARROWEST = 0.1  # of an action's number, in metres or radians: less than that i
 
 
 _PAST = "history."
+JOINT_NOISE = 0.05
 ELSEWHERE = 0.05
 """Metres above the table from where on a motion is one to another place."""
 
@@ -66,22 +67,29 @@ class Decisions(Dataset[int]):
     batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
         an item `often` times.
+    noise: spread of what is added whenever a decision is learned, so that no episode is known by its last digits: to
+        each joint (radians; `JOINT_NOISE` of it) and to each number of a token.
     """
 
-    def __init__(self, batch: Batch, far: Tensor, often: int = 1) -> None:
-        self.batch, self.far = batch, far
+    def __init__(self, batch: Batch, far: Tensor, often: int = 1, noise: float = 0.0) -> None:
+        self.batch, self.far, self.noise = batch, far, noise
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
 
     @classmethod
     def of(
-        cls, policy: MMEPolicy, demonstrations: Iterable[Demonstration], often: int = 1, elsewhere: float = ELSEWHERE
+        cls,
+        policy: MMEPolicy,
+        demonstrations: Iterable[Demonstration],
+        often: int = 1,
+        elsewhere: float = ELSEWHERE,
+        noise: float = 0.0,
     ) -> "Decisions":
         """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
             often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
-                is elsewhere.
+                is elsewhere. noise: see the class.
 
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
@@ -93,10 +101,10 @@ class Decisions(Dataset[int]):
             far.append(_far(found.motions.targets, elsewhere))
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often, noise)
 
     @classmethod
-    def load(cls, path: Path, often: int = 1) -> "Decisions":
+    def load(cls, path: Path, often: int = 1, noise: float = 0.0) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
@@ -104,7 +112,7 @@ class Decisions(Dataset[int]):
         far = found.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
         now: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often)
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often, noise)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
@@ -127,7 +135,24 @@ class Decisions(Dataset[int]):
     def collate(self, rows: Sequence[int]) -> Batch:
         """The batch of these decisions."""
         chosen = torch.as_tensor(list(rows))
-        return self.batch.rows(chosen)
+        batch = self.batch.rows(chosen)
+        return self._noisy(batch) if self.noise else batch
+
+    def _noisy(self, batch: Batch) -> Batch:
+
+        def moved(values: Tensor, spread: float) -> Tensor:
+            return values + spread * torch.randn(values.shape)
+
+        assert batch.state is not None and batch.view_tokens is not None
+        joints = moved(batch.state[:, :-1], JOINT_NOISE * self.noise)  # the last number is the gripper's, centimetres
+        batch = replace(
+            batch,
+            state=torch.cat([joints, batch.state[:, -1:]], 1),
+            view_tokens=moved(batch.view_tokens, self.noise),
+        )
+        if batch.history is None:
+            return batch
+        return replace(batch, history=replace(batch.history, features=moved(batch.history.features, self.noise)))
 
 
 def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:

@@ -81,12 +81,7 @@ class FrameChoice:
             found: list[int] = motions_of(steps).decisions.tolist()
             return found
         if self.at == CHOICES:
-            rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
-            for k, step in enumerate(steps):
-                begins = step.info["is_subgoal_boundary"] and not step.info["is_completed"]
-                row = row_of(step.action["choice_action"]) if begins or k == video else None
-                rows[k] = 0 if row is None else row
-            chosen: list[int] = find_choices(rows[video:], video, range(len(LETTERS))).decisions.tolist()
+            chosen: list[int] = choices_of(steps).decisions.tolist()
             return chosen
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
 
@@ -97,6 +92,17 @@ def motions_of(steps: Sequence["RecordedStep"]) -> Motions:
     noted = np.stack([step.action["waypoint_action"] for step in steps])
     poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
     return find_motions(poses[video:], video)
+
+
+def choices_of(steps: Sequence["RecordedStep"]) -> Motions:
+    """The choices among the task's options that a demonstration's execution is made of."""
+    video = _video(steps)
+    rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
+    for k, step in enumerate(steps):
+        begins = step.info["is_subgoal_boundary"] and not step.info["is_completed"]
+        row = row_of(step.action["choice_action"]) if begins or k == video else None
+        rows[k] = 0 if row is None else row
+    return find_choices(rows[video:], video, range(len(LETTERS)))
 
 
 def _video(steps: Sequence["RecordedStep"]) -> int:
