@@ -5,24 +5,27 @@ frame; then the frames that are wanted are put back and drawn. That takes a seco
 """
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.waypoints import Motions, find_motions
-from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.data.waypoints import Motions
+from mme_vla.embodiment.options import Option, read_options
+from mme_vla.embodiment.robomme import benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.files import parse_json, write_atomically
+from mme_vla.subgoal.oracle import online_subgoal
 
 if TYPE_CHECKING:
+    from mme_vla.embodiment.actions import ActionSpace
+    from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
-Looks = Callable[[int, int], Sequence[int]]
-"""`looks(step, exec_start)`: the frames up to `step` that a memory remembers there."""
+SUBGOALS = ("simple", "grounded")
 CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
 
@@ -31,7 +34,8 @@ class Demonstration:
     """One episode of a task, with pictures of some frames.
 
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
-    pictures: camera → frame → [256, 256, 3] uint8.
+    subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
+    time. pictures: camera → frame → [256, 256, 3] uint8.
     """
 
     task: str
@@ -43,10 +47,12 @@ class Demonstration:
     states: np.ndarray
     motions: Motions
     pictures: dict[str, dict[int, np.ndarray]]
+    subgoals: dict[str, list[str]] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
-        about = {name: getattr(self, name) for name in ("task", "seed", "difficulty", "goal", "length", "exec_start")}
+        names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals")
+        about = {name: getattr(self, name) for name in names}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
         for camera, taken in self.pictures.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
@@ -55,62 +61,191 @@ class Demonstration:
             np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path: Path) -> "Demonstration":
-        """Read what `save` wrote."""
+    def load(cls, path: Path, pictures: bool = True) -> "Demonstration":
+        """Read what `save` wrote, or what of it is no picture."""
         with np.load(path) as file:
-            pictures = {
+            drawn = {
                 camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
                 for camera in CAMERAS
-                if f"{camera}_frames" in file
+                if pictures and f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
-            return cls(**about, states=file["states"], motions=motions, pictures=pictures)
+            return cls(**about, states=file["states"], motions=motions, pictures=drawn)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene to demonstrate, and the folder of what comes of it.
+
+    cameras: those that are drawn. choices: at which frames, for each memory that will train on it.
+    carried_out, acts: see `record`.
+    """
+
+    task: str
+    seed: int
+    difficulty: str
+    folder: Path
+    cameras: tuple[str, ...]
+    choices: tuple["FrameChoice", ...]
+    carried_out: bool = False
+    acts: "ActionSpace | None" = None
+
+    @property
+    def path(self) -> Path:
+        """The demonstration's file."""
+        return self.folder / f"{self.difficulty}-{self.seed}.npz"
+
+    @property
+    def failed(self) -> Path:
+        """A file that is there where the demonstrator did not succeed."""
+        return self.path.with_suffix(".failed")
+
+    @property
+    def tried(self) -> bool:
+        """Whether there is nothing left to do: it failed, or is there with every frame that is to be drawn."""
+        return self.failed.is_file() or (self.path.is_file() and self._complete())
+
+    def _complete(self) -> bool:
+        with np.load(self.path) as file:
+            exec_start = parse_json(str(file["about"]), str(self.path))["exec_start"]
+            read = [choice.read(file["decisions"], exec_start) for choice in self.choices]
+            return set().union(*read) <= set(file["front_frames"].tolist())
+
+
+def demonstrated(scene: Scene) -> bool:
+    """Demonstrate a scene into its file; whether the demonstrator succeeded."""
+    made = record(scene.task, scene.seed, scene.difficulty, scene.choices, scene.cameras, scene.carried_out, scene.acts)
+    if made is None:
+        scene.failed.touch()
+        return False
+    made.save(scene.path)
+    return True
 
 
 def record(
-    task: str, seed: int, difficulty: str, looks: Sequence[Looks], cameras: Sequence[str] = ("front", "wrist")
+    task: str,
+    seed: int,
+    difficulty: str,
+    choices: Sequence["FrameChoice"],
+    cameras: Sequence[str] = ("front", "wrist"),
+    carried_out: bool = False,
+    acts: "ActionSpace | None" = None,
 ) -> Demonstration | None:
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
-        looks: of the memories that will train on it; the front camera is drawn at these frames, and all at decisions.
+        choices: what the memories that will train on it read; these cameras are drawn at the frames of all of them.
+        carried_out: show what is seen while the demonstration's motions are carried out one by one, as a policy's are;
+            None too where that does not succeed. The demonstrator does more between some of its motions.
+        acts: of the robot that will learn from it. Where it chooses among options, the choices stand in place of
+            motions, and the options behind the goal; None: motions.
     """
-    from mme_vla.envs.recording.recorder import Recorder
     from mme_vla.envs.scene.placement import SceneError
 
     try:
         env = make_task(task, render=True, seed=seed, difficulty=difficulty)
     except SceneError:
         return None
-    states: list[np.ndarray] = []
-    waypoints: list[np.ndarray] = []
-    scenes: list[Any] = []
-
-    def take(step: "RecordedStep") -> None:
-        states.append(benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]))
-        waypoints.append(step.action["waypoint_action"])
-        scenes.append(env.get_state_dict())
-
+    taken = _Taken(env)
     try:
-        result = Recorder(env, render=False, on_step=take).record()
-        if not result.success:
+        chooser = acts if acts is not None and acts.choice else None
+        motions = _demonstrate(taken, choosing=chooser is not None)
+        if carried_out and motions is not None:
+            env.close()
+            env = make_task(task, render=True, seed=seed, difficulty=difficulty)
+            taken = _Taken(env)
+            motions = _carry_out(taken, motions.targets, chooser)
+        if motions is None:
             return None
-        motions = find_motions(np.stack(waypoints)[result.video :].astype(np.float32), result.video)
-        decisions = [int(frame) for frame in motions.decisions]
-        front = {int(frame) for look in looks for step in decisions for frame in look(step, result.video)}
-        wanted = {camera: set(decisions) | (front if camera == "front" else set()) for camera in cameras}
+        at = set(motions.decisions.tolist())
+        read = at.union(*(choice.read(motions.decisions, taken.video) for choice in choices))
+        wanted = {camera: read if camera == "front" else at for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):
-            _put_back(env, scenes[frame])
+            _put_back(env, taken.scenes[frame])
             for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
                 pictures[camera][frame] = picture
+        goal = (
+            env.goals()[0].lower()
+            if chooser is None
+            else chooser.worded(env.goals()[0].lower(), _options(env, chooser))
+        )
+        texts = [taken.texts[frame] for frame in motions.decisions]
         return Demonstration(
-            type(env).__name__, seed, difficulty, env.goals()[0].lower(), len(states), result.video, np.stack(states),
-            motions, pictures,
+            type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
+            np.stack(taken.states), motions, pictures, {kind: _shown(texts, kind) for kind in SUBGOALS},
         )  # fmt: skip
     finally:
         env.close()
+
+
+@dataclass
+class _Taken:
+    """What is noted of every frame of an episode; `video` of them come before its execution."""
+
+    env: "Task"
+    states: list[np.ndarray] = field(default_factory=list)
+    scenes: list[Any] = field(default_factory=list)
+    texts: list[Mapping[str, Any]] = field(default_factory=list)
+    video: int = 0
+
+    def add(self, observed: Mapping[str, Any], info: Mapping[str, Any], in_video: bool) -> None:
+        self.texts.append(info)
+        self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
+        self.scenes.append(self.env.get_state_dict())
+        self.video += in_video
+
+
+def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
+    """What a task offers to choose from."""
+    given = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
+    return read_options(given, len(chooser.choice))
+
+
+def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
+    """The motions of a demonstration, or its choices, if it succeeds."""
+    from mme_vla.envs.drawing import Drawing
+    from mme_vla.envs.recording.frames import choices_of, motions_of
+    from mme_vla.envs.recording.recorder import Recorder
+
+    steps: list[RecordedStep] = []
+
+    def take(step: "RecordedStep") -> None:
+        steps.append(step)
+        taken.add(step.obs, step.info, step.info["is_video_demo"])
+
+    result = Recorder(taken.env, on_step=take, drawing=Drawing(now=())).record()
+    if not result.success:
+        return None
+    return choices_of(steps) if choosing else motions_of(steps)
+
+
+def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
+    """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
+    from mme_vla.envs.drawing import Drawing
+    from mme_vla.envs.interface import RoboMMEEnv
+
+    env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
+    env.drawing = Drawing(now=())
+    env.on_frame = taken.add
+    env.reset()
+    decisions = []
+    for number, target in enumerate(targets, 1):
+        decisions.append(len(taken.states) - 1)
+        _, _, ended, _, info = env.step(target if chooser is None else benchmark_action(chooser, target))
+        if ended:
+            done = info["status"] == "success"
+            return Motions(np.array(decisions, np.int64), targets[:number]) if done else None
+    return None
+
+
+def _shown(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
+    """The subgoal at each decision; where the simulator names none, the last one stays."""
+    found: list[str] = []
+    for text in texts:
+        found.append(online_subgoal(text, kind) or (found[-1] if found else ""))
+    return found
 
 
 def _put_back(env: "Task", scene: Any) -> None:

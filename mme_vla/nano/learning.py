@@ -1,6 +1,6 @@
 """Training on demonstrations of planned motions: every decision is a sample, and all its tokens are made beforehand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,21 +10,24 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from mme_vla.backbone.base import stack_draws
 from mme_vla.errors import UserError
 from mme_vla.files import write_atomically
-from mme_vla.memory.base import stack_history
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats
+from mme_vla.processing.subgoal_text import perturb_point, subgoal_kind
 from mme_vla.types import Batch, HistoryTokens
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 
 
 _PAST = "history."
-OFTEN, ELSEWHERE = 4, 0.05
-"""How often a decision to go elsewhere is learned for every other; metres from where on it is elsewhere."""
+JOINT_NOISE = 0.05
+ELSEWHERE = 0.05
+"""Metres above the table from where on a motion is one to another place."""
 
 
 class SparseHistory(History):
@@ -33,13 +36,25 @@ class SparseHistory(History):
     tokens: frame → [patches, d_vision].
     """
 
-    def __init__(self, spec: StorageSpec, length: int, tokens: Mapping[int, Tensor], exec_start: int) -> None:
+    def __init__(
+        self,
+        spec: StorageSpec,
+        length: int,
+        tokens: Mapping[int, Tensor],
+        exec_start: int,
+        scores: FrameScores | None = None,
+    ) -> None:
         super().__init__(spec, exec_start)
+        self._scores = FrameScores.empty(spec.grid**2) if scores is None else scores
         self._length, self._kept = length, np.array(sorted(tokens), np.int64)
         self._tokens = torch.stack([tokens[int(frame)] for frame in self._kept])
 
     def __len__(self) -> int:
         return self._length
+
+    @property
+    def scores(self) -> FrameScores:
+        return self._scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._row_of(indices[:, 0], self._kept)
@@ -51,31 +66,45 @@ class Decisions(Dataset[int]):
 
     batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
-        an item `OFTEN` times.
+        an item `often` times.
+    noise: spread of what is added whenever a decision is learned, so that no episode is known by its last digits: to
+        each joint (radians; `JOINT_NOISE` of it) and to each number of a token.
     """
 
-    def __init__(self, batch: Batch, far: Tensor, often: int = 1) -> None:
-        self.batch, self.far = batch, far
+    def __init__(self, batch: Batch, far: Tensor, often: int = 1, noise: float = 0.0) -> None:
+        self.batch, self.far, self.noise = batch, far, noise
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
 
     @classmethod
-    def of(cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1) -> "Decisions":
-        """Make all tokens.
+    def of(
+        cls,
+        policy: MMEPolicy,
+        demonstrations: Iterable[Demonstration],
+        often: int = 1,
+        elsewhere: float = ELSEWHERE,
+        noise: float = 0.0,
+    ) -> "Decisions":
+        """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
+            often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
+                is elsewhere. noise: see the class.
 
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
         """
-        items = [item for found in demonstrations for item in _items(policy, found)]
+        items: list[dict[str, Any]] = []
+        far: list[np.ndarray] = []
+        for found in demonstrations:
+            items += _items(policy, found)
+            far.append(_far(found.motions.targets, elsewhere))
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        far = torch.from_numpy(np.concatenate([_far(found.motions.targets) for found in demonstrations]))
-        return cls(_stack(items), far, often)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often, noise)
 
     @classmethod
-    def load(cls, path: Path, often: int = 1) -> "Decisions":
+    def load(cls, path: Path, often: int = 1, noise: float = 0.0) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
@@ -83,7 +112,7 @@ class Decisions(Dataset[int]):
         far = found.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
         now: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often)
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often, noise)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
@@ -106,21 +135,45 @@ class Decisions(Dataset[int]):
     def collate(self, rows: Sequence[int]) -> Batch:
         """The batch of these decisions."""
         chosen = torch.as_tensor(list(rows))
-        return self.batch.rows(chosen)
+        batch = self.batch.rows(chosen)
+        return self._noisy(batch) if self.noise else batch
+
+    def _noisy(self, batch: Batch) -> Batch:
+
+        def moved(values: Tensor, spread: float) -> Tensor:
+            return values + spread * torch.randn(values.shape)
+
+        assert batch.state is not None and batch.view_tokens is not None
+        joints = moved(batch.state[:, :-1], JOINT_NOISE * self.noise)  # the last number is the gripper's, centimetres
+        batch = replace(
+            batch,
+            state=torch.cat([joints, batch.state[:, -1:]], 1),
+            view_tokens=moved(batch.view_tokens, self.noise),
+        )
+        if batch.history is None:
+            return batch
+        return replace(batch, history=replace(batch.history, features=moved(batch.history.features, self.noise)))
 
 
-def _far(targets: np.ndarray) -> np.ndarray:
-    """Which of an episode's motions [m, 7] end elsewhere above the table than the one before; the first does. [m]."""
+def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:
+    """Which of an episode's motions [m, 7] end that far above the table from the one before; the first does. [m]."""
     steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
-    return np.concatenate([[True], steps > ELSEWHERE])
+    return np.concatenate([[True], steps > elsewhere])
 
 
-def load_all(files: Sequence[Path]) -> list[Demonstration]:
-    """Recorded demonstrations, in this order."""
-    return [Demonstration.load(file) for file in files]
+@torch.no_grad()
+def off_by(policy: MMEPolicy, held: Decisions, seed: int = 0) -> Tensor:
+    """How far above the table motions to another place end from where they should, the first of each chunk; [n] m."""
+    rows = held.far.nonzero()[:, 0].tolist()
+    batch, generator = held.collate(rows), torch.Generator().manual_seed(seed)
+    assert batch.actions is not None and batch.state is not None
+    chunk = policy.sample_actions(batch, stack_draws([policy.sample_draws(generator) for _ in rows])).float()
+    processor = policy.require_processor()
+    said = processor.absolute_actions(chunk, batch.state)
+    return (said - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
 
 
-def statistics(demonstrations: Sequence[Demonstration], policy: MMEPolicy) -> NormStats:
+def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:
     """What states and motions are normalised by; numbers that hardly move keep their size.
 
     Raises:
@@ -149,11 +202,12 @@ def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
     flat = views.flatten(0, 1).float() / 255 * 2 - 1
     view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
     history = _history(policy, found)
+    subgoals = _subgoals(policy, found)
     items = []
     for place, frame in enumerate(decisions):
         state = found.states[frame]
         chunk, recorded = found.motions.chunk(frame, processor.horizon)
-        prompt, prompt_mask = processor.prompt(found.goal, state=state)
+        prompt, prompt_mask = processor.prompt(found.goal, subgoal=subgoals[place], state=state)
         item = {
             "view_tokens": view_tokens[place], "prompt": prompt, "prompt_mask": prompt_mask,
             "state": torch.from_numpy(state), "actions": processor.actions(chunk, state),
@@ -168,16 +222,38 @@ def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
 def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
     if policy.memory is None:
         return None
-    taken = found.pictures[policy.embodiment.memory_camera]
+    drawn = found.pictures[policy.embodiment.memory_camera]
+    read = policy.frames_read(found.motions.decisions, found.exec_start).tolist()
+    taken = {frame: drawn[frame] for frame in read if frame in drawn} or drawn
     tokens = policy.encode_frames(np.stack(list(taken.values())))
     history = SparseHistory(
-        policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start
+        policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start,
+        _scores(policy.memory, taken),
     )  # fmt: skip
     if policy.memory.reads_motion:  # an action is a motion of many frames here, so the states alone tell what was done
         nothing = np.zeros((found.length, policy.embodiment.action.width), np.float32)
         moved = policy.require_processor().motion(found.states[: found.length], nothing, np.zeros(found.length, bool))
         history.motion = moved.__getitem__
     return history
+
+
+def _scores(memory: Memory, pictures: Mapping[int, np.ndarray]) -> FrameScores:
+    """What the memory's scorer says of these frames, as it says it while an episode runs."""
+    scorer = memory.make_scorer()
+    said = {} if scorer is None else {frame: scorer(frame, pictures[frame]) for frame in sorted(pictures)}
+    rows = {frame: values for frame, values in said.items() if values is not None}
+    if not rows:
+        return FrameScores.empty(memory.storage.grid**2)
+    return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
+
+
+def _subgoals(policy: MMEPolicy, found: Demonstration) -> Sequence[str | None]:
+    """The subgoal of each decision as the simulator says it, its point moved a little; None where none is read."""
+    kind = subgoal_kind(policy)
+    if kind is None:
+        return [None] * len(found.motions.decisions)
+    noise, rng = int(policy.config["subgoal_text"]["point_noise"]), np.random.default_rng(found.seed)
+    return [perturb_point(text, noise, rng) for text in found.subgoals[kind.removesuffix("_subgoal")]]
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.choice_rows import CHOICE_NUMBERS, find_choices, row_of
-from mme_vla.data.waypoints import find_motions, known_poses
+from mme_vla.data.waypoints import Motions, find_motions, known_poses
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.episodes import spans
@@ -59,15 +59,20 @@ class FrameChoice:
 
     def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
         """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
-        video = sum(step.info["is_video_demo"] for step in steps)
+        video = _video(steps)
         shown = self._shown(steps, video)
         frames = {camera: frozenset(shown) for camera in CAMERAS}
         if self.memory is not None:
-            memory = _build(self.memory)
-            read = frozenset(memory.frames_read(np.array(shown, np.int64), video).tolist())
-            for camera in CAMERAS if memory.looks_back is not None else (MEMORY_CAMERA,):
+            read = self.read(np.array(shown, np.int64), video)
+            for camera in CAMERAS if _build(self.memory).looks_back is not None else (MEMORY_CAMERA,):
                 frames[camera] |= read
         return Drawing(frames, now=())
+
+    def read(self, shown: np.ndarray, exec_start: int) -> frozenset[int]:
+        """What the memory may read when it is asked at these frames [n], the execution beginning at `exec_start`."""
+        if self.memory is None:
+            return frozenset()
+        return frozenset(_build(self.memory).frames_read(shown, exec_start).tolist())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
@@ -77,19 +82,35 @@ class FrameChoice:
         if isinstance(self.at, int):
             return list(range(video, len(steps), self.at))
         if self.at == DECISIONS:
-            noted = np.stack([step.action["waypoint_action"] for step in steps])
-            poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
-            found: list[int] = find_motions(poses[video:], video).decisions.tolist()
+            found: list[int] = motions_of(steps).decisions.tolist()
             return found
         if self.at == CHOICES:
-            rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
-            for k, step in enumerate(steps):
-                begins = step.info["is_subgoal_boundary"] and not step.info["is_completed"]
-                row = row_of(step.action["choice_action"]) if begins or k == video else None
-                rows[k] = 0 if row is None else row
-            chosen: list[int] = find_choices(rows[video:], video, range(len(LETTERS))).decisions.tolist()
+            chosen: list[int] = choices_of(steps).decisions.tolist()
             return chosen
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
+
+
+def motions_of(steps: Sequence["RecordedStep"]) -> Motions:
+    """The planned motions of a demonstration's execution."""
+    video = _video(steps)
+    noted = np.stack([step.action["waypoint_action"] for step in steps])
+    poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
+    return find_motions(poses[video:], video)
+
+
+def choices_of(steps: Sequence["RecordedStep"]) -> Motions:
+    """The choices among the task's options that a demonstration's execution is made of."""
+    video = _video(steps)
+    rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
+    for k, step in enumerate(steps):
+        begins = step.info["is_subgoal_boundary"] and not step.info["is_completed"]
+        row = row_of(step.action["choice_action"]) if begins or k == video else None
+        rows[k] = 0 if row is None else row
+    return find_choices(rows[video:], video, range(len(LETTERS)))
+
+
+def _video(steps: Sequence["RecordedStep"]) -> int:
+    return sum(step.info["is_video_demo"] for step in steps)
 
 
 def _build(section: Mapping[str, Any]) -> "Memory":

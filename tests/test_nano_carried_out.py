@@ -1,0 +1,51 @@
+"""Demonstrations carried out motion by motion show what a policy meets; and noise that hides last digits."""
+
+import numpy as np
+import pytest
+import torch
+from test_nano import demonstration, nano
+
+from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.envs.make import make_env
+from mme_vla.envs.rendering_check import render_backend
+from mme_vla.errors import UserError
+from mme_vla.nano.demonstrations import record
+from mme_vla.nano.learning import Decisions, statistics
+
+SCENE = {"seed": 3_000_001, "difficulty": "easy"}
+
+
+def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    made = record("SwingXtimes", choices=[], cameras=["front"], carried_out=True, **SCENE)  # type: ignore[arg-type]
+    assert made is not None
+    env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]
+    seen, _ = env.reset()
+    for number, (frame, target) in enumerate(zip(made.motions.decisions, made.motions.targets, strict=True)):
+        now = benchmark_state(seen["joint_state_list"][-1], seen["gripper_state_list"][-1])
+        assert np.allclose(made.states[frame], now, atol=1e-3), number
+        seen, _, ended, _, info = env.step(target)
+    env.close()
+    assert ended and info["status"] == "success"
+
+
+def test_noise_is_in_what_is_learned_and_not_in_what_is_asked_for() -> None:
+    policy, made = nano().eval(), demonstration()
+    policy.require_processor().stats = statistics([made], policy)
+    plain, noisy = (Decisions.of(policy, [made], noise=noise) for noise in (0.0, 0.2))
+    torch.manual_seed(0)
+    batch, moved = plain.collate([0, 1, 2]), noisy.collate([0, 1, 2])
+    assert batch.state is not None and moved.state is not None and batch.history and moved.history
+    for before, after, spread in (
+        (batch.view_tokens, moved.view_tokens, 0.2),
+        (batch.history.features, moved.history.features, 0.2),
+        (batch.state[:, :-1], moved.state[:, :-1], 0.01),
+    ):
+        assert before is not None and after is not None
+        assert (after - before).std().item() == pytest.approx(spread, rel=0.5)
+    assert torch.equal(batch.state[:, -1], moved.state[:, -1])
+    assert batch.actions is not None and torch.equal(batch.actions, moved.actions)  # type: ignore[arg-type]
