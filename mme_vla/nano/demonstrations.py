@@ -16,6 +16,7 @@ from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.files import parse_json, write_atomically
+from mme_vla.nano.snapshots import Snapshots
 
 if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import RecordedStep
@@ -69,12 +70,18 @@ class Demonstration:
 
 
 def record(
-    task: str, seed: int, difficulty: str, looks: Sequence[Looks], cameras: Sequence[str] = ("front", "wrist")
+    task: str,
+    seed: int,
+    difficulty: str,
+    looks: Sequence[Looks],
+    cameras: Sequence[str] = ("front", "wrist"),
+    execute: int = 1,
 ) -> Demonstration | None:
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
         looks: of the memories that will train on it; the front camera is drawn at these frames, and all at decisions.
+        execute: motions of a chunk that are executed: only every so many decisions is a policy asked, and drawn.
     """
     from mme_vla.envs.recording.recorder import Recorder
     from mme_vla.envs.scene.placement import SceneError
@@ -85,24 +92,24 @@ def record(
         return None
     states: list[np.ndarray] = []
     waypoints: list[np.ndarray] = []
-    scenes: list[Any] = []
+    scenes = Snapshots(env)
 
     def take(step: "RecordedStep") -> None:
         states.append(benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]))
         waypoints.append(step.action["waypoint_action"])
-        scenes.append(env.get_state_dict())
+        scenes.take()
 
     try:
         result = Recorder(env, render=False, on_step=take).record()
         if not result.success:
             return None
         motions = find_motions(np.stack(waypoints)[result.video :].astype(np.float32), result.video)
-        decisions = [int(frame) for frame in motions.decisions]
+        decisions = [int(frame) for frame in motions.decisions[::execute]]
         front = {int(frame) for look in looks for step in decisions for frame in look(step, result.video)}
         wanted = {camera: set(decisions) | (front if camera == "front" else set()) for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):
-            _put_back(env, scenes[frame])
+            scenes.put_back(frame)
             for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
                 pictures[camera][frame] = picture
         return Demonstration(
@@ -111,12 +118,6 @@ def record(
         )  # fmt: skip
     finally:
         env.close()
-
-
-def _put_back(env: "Task", scene: Any) -> None:
-    env.set_state_dict(scene)
-    for thing in env.things:
-        thing.show()
 
 
 def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:
