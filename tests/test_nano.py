@@ -12,8 +12,9 @@ from safetensors.torch import load
 
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.nano.tower import CLASSES, WEIGHTS
+from mme_vla.commands import nano as nano_command
 from mme_vla.commands.loading import shipped_checkpoint
-from mme_vla.commands.nano import check_counts
+from mme_vla.commands.nano import check_counts, with_settings
 from mme_vla.data.waypoints import Motions
 from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.memory.framesamp import FrameSamp
@@ -43,8 +44,9 @@ def demonstration(frames: tuple[int, ...] = (0, 15, 39, 47, 63, 66, 79, 95, 119,
     targets = rng.uniform(-0.2, 0.2, (3, 7)).astype(np.float32)
     motions = Motions(np.array([66, 120, 155]), targets)
     states = rng.uniform(-1, 1, (180, 8)).astype(np.float32)
+    said = {"simple": ["pick it up"] * 3, "grounded": ["pick it up at <1, 2>"] * 3}
     goal = "watch the video carefully, then pick up the container hiding the green cube"
-    return Demonstration("VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": pictures})
+    return Demonstration("VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": pictures}, said)
 
 
 def test_it_keeps_a_backbones_promises() -> None:
@@ -99,7 +101,7 @@ def test_a_demonstration_is_read_as_it_was_written(tmp_path: Path) -> None:
     made.save(tmp_path / "a.npz")
     read = Demonstration.load(tmp_path / "a.npz")
     assert (read.goal, read.length, read.exec_start) == (made.goal, made.length, made.exec_start)
-    assert np.array_equal(read.motions.targets, made.motions.targets)
+    assert np.array_equal(read.motions.targets, made.motions.targets) and read.subgoals == made.subgoals
     assert list(read.pictures) == ["front"] and np.array_equal(read.pictures["front"][66], made.pictures["front"][66])
 
 
@@ -166,6 +168,17 @@ def test_a_history_gives_only_what_it_has() -> None:
 def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) -> None:
     with pytest.raises(UserError, match=words):
         check_counts(counts)
+
+
+def test_a_tasks_own_settings_come_with_its_name_unless_others_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "nano").mkdir()
+    (tmp_path / "nano" / "StopCube.yaml").touch()
+    monkeypatch.setattr(nano_command, "config_dir", lambda: tmp_path)
+    assert with_settings(["task=StopCube", "seed=1"]) == ["task=StopCube", "seed=1", "nano=StopCube"]
+    for words in (["task=BinFill"], ["seed=1"], ["task=StopCube", "nano=mine"]):
+        assert with_settings(words) == words
 
 
 def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:

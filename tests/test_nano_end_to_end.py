@@ -14,7 +14,7 @@ from mme_vla.evaluation.record_log import find_records, read_folders
 
 SMALL = (
     "demonstrations.easy=2", "demonstrations.medium=0", "demonstrations.hard=0", "train.steps=20",
-    "train.batch_size=4", "train.val_every=10", "episodes=2", "policy_seeds=[7]", "max_steps=20", "beside=[]",
+    "train.batch_size=4", "train.val_every=10", "episodes=2", "max_steps=20", "beside=[]", "drawn_for=[]",
 )  # fmt: skip
 
 

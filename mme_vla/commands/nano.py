@@ -1,6 +1,7 @@
 """`python -m mme_vla.nano task=VideoUnmask model=framesamp_modul`: from nothing to a page of results on two cores."""
 
 import os
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.config.composition import cli, config_dir
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json, write_json
 
 if TYPE_CHECKING:
+    from mme_vla.memory.base import Memory
     from mme_vla.nano.demonstrations import Looks
 
 # Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
@@ -22,8 +24,23 @@ SEEDS_APART = 100_000  # first seeds of two difficulties
 RETRIES = 20  # scenes in a row that no demonstration succeeds in
 
 
+def main() -> None:
+    """Run the command with the task's own settings, where it has a file of them."""
+    sys.argv[1:] = with_settings(sys.argv[1:])
+    command()
+
+
+def with_settings(words: Sequence[str]) -> list[str]:
+    """The words of a command line, after them what the task's file in configs/nano says; what is typed counts more."""
+    tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
+    own = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
+    if own is None or not own.is_file() or any(word.startswith("nano=") for word in words):
+        return list(words)
+    return [*words, f"nano={own.stem}"]
+
+
 @cli("nano")
-def main(cfg: DictConfig) -> None:
+def command(cfg: DictConfig) -> None:
     """Record, train, evaluate and write the page, each as far as it is not there.
 
     Raises:
@@ -40,7 +57,7 @@ def main(cfg: DictConfig) -> None:
 
 
 def run(config: Mapping[str, Any]) -> Path:
-    """All stages of a run; the path of its page."""
+    """All stages of a run; the path of its page, or the folder of the demonstrations where nothing else is wanted."""
     from mme_vla.nano.evaluating import run_episodes
     from mme_vla.nano.fitting import build, compose_policy, train
     from mme_vla.nano.page import write_page
@@ -50,14 +67,18 @@ def run(config: Mapping[str, Any]) -> Path:
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
     models = list(dict.fromkeys([config["model"], *config["beside"]]))
     composed = {model: compose_policy(model, config["memories"], words) for model in models}
+    drawn_for = [model for model in config["drawn_for"] if model not in composed]
     minutes = _Minutes(folder / "minutes.json")
     with minutes.of("demonstrations"):
-        memories = [build(each).memory for each in composed.values()]
+        others = [compose_policy(model, config["memories"], words) for model in drawn_for]
+        memories = [build(each).memory for each in (*composed.values(), *others)]
         looks: list[Looks] = [memory_looks(memory) for memory in memories if memory is not None]
         files = record_all(config, folder / "demonstrations", looks)
+    if config["record_only"]:
+        return folder / "demonstrations"
     for model, each in composed.items():
         with minutes.of(f"training {model}"):
-            checkpoint = train(each, config["train"], folder / model, files)
+            checkpoint = train(each, config["train"], folder / model, files, config["learning"])
         with minutes.of(f"evaluation {model}"):
             run_episodes(
                 checkpoint, folder / model / config["split"], config["task"], split=config["split"],
@@ -69,22 +90,11 @@ def run(config: Mapping[str, Any]) -> Path:
     return page
 
 
-def memory_looks(memory: Any) -> "Looks":
+def memory_looks(memory: "Memory") -> "Looks":
     """Which frames a memory remembers at a step, from the step alone."""
-    import numpy as np
-
-    from mme_vla.memory.history import History
-
-    class Unseen(History):
-        def __init__(self, length: int, exec_start: int) -> None:
-            super().__init__(memory.storage, exec_start)
-            self._length = length
-
-        def __len__(self) -> int:
-            return self._length
 
     def look(step: int, exec_start: int) -> list[int]:
-        frames: list[int] = np.unique(memory.select(Unseen(step + 1, exec_start), step)[:, 0]).tolist()
+        frames: list[int] = memory.frames_read([step], exec_start).tolist()
         return frames
 
     return look

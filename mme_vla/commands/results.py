@@ -11,8 +11,10 @@ from pathlib import Path
 
 from mme_vla.config.composition import print_user_errors
 from mme_vla.config.help import argument_parser
+from mme_vla.envs.metadata import FURTHER, FURTHER_EPISODES
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.demo import demo_records
@@ -66,12 +68,13 @@ def run(args: argparse.Namespace) -> None:
     """
     from rich.console import Console
 
-    protocol = Protocol(
-        tuple(args.tasks or PAPER_ORDER), args.episodes, args.errors, args.confidence, args.samples, args.seed
-    )
     if args.demo == bool(args.runs):
         raise UserError("Name files or folders of episode records, or --demo for made-up ones (not both).")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
+    protocol = Protocol(
+        tuple(args.tasks or PAPER_ORDER), args.episodes or _episodes(records, args.split), args.errors, args.confidence,
+        args.samples, args.seed,
+    )  # fmt: skip
     if args.stress:
         show_curves(stress_curves(records, args.confidence, args.conflicts), args)
         return
@@ -89,6 +92,12 @@ def run(args: argparse.Namespace) -> None:
         console.print(f"• {note}", markup=False, highlight=False, soft_wrap=True)
     for path in write(results, comparisons, args):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
+    """Episodes of a task in the split that the records are of."""
+    splits = {record.split for record in records if split in (None, record.split)}
+    return FURTHER_EPISODES if splits == {FURTHER} else TEST_EPISODES
 
 
 def show_curves(curves: Curves, args: argparse.Namespace) -> None:
@@ -172,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
     parser.add_argument("--brief", action="store_true", help="print the overview only")
     parser.add_argument("--tasks", nargs="+", metavar="TASK", help="what a whole run consists of (default: all 16)")
-    parser.add_argument("--episodes", type=int, default=TEST_EPISODES, help="episodes of a task (default: %(default)s)")
+    parser.add_argument("--episodes", type=int, help="episodes of a task (default: as the split has)")
     parser.add_argument("--split", help="test, val or train, where there are records of several")
     parser.add_argument("--errors", default="failure", choices=("failure", "missing"),
                         help="episodes that ended in an error count as failures (default), or as not run")  # fmt: skip

@@ -37,7 +37,8 @@ def make_env(
 
     Args:
         task: one of the 16 task names, or a task of your own registered in `TASKS`.
-        split: `train`, `val` or `test`; `twin` or `stress:<dial>=<n>` for variants of the latter.
+        split: `train`, `val` or `test`; `twin` or `stress:<dial>=<n>` for variants of the latter; `further` for 100
+            scenes beyond it.
         episode: which episode of the split.
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.

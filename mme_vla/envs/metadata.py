@@ -25,9 +25,15 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 """Episodes a task has in each split."""
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
-_COUNTS = {**SPLITS, MORE: 900}
+FURTHER, FURTHER_EPISODES = "further", 100
+"""Episodes that go on where the test split's rule ends, for tests on scenes that nobody has looked at; no split either."""
+_COUNTS = {**SPLITS, MORE: 900, FURTHER: FURTHER_EPISODES}
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
-_FIRST_SEED = {"train": (0, 1000), "val": (1_000_000, 10_000), "test": (500_000, 10_000), MORE: (2_000_000, 100_000)}
+_TEST_SEED = (500_000, 10_000)
+_FIRST_SEED = {
+    "train": (0, 1000), "val": (1_000_000, 10_000), "test": _TEST_SEED, MORE: (2_000_000, 100_000), FURTHER: _TEST_SEED,
+}  # fmt: skip
+_FIRST_NUMBER = {FURTHER: SPLITS["test"]}  # in the rule of seeds and difficulties; elsewhere 0
 _CYCLE = ("easy", "easy", "medium", "hard")
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
 _PACKAGE_FOLDER = Path("env_metadata")
@@ -53,7 +59,8 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
     """Seed before any retry, and difficulty, of an episode; of a task of the user's own, as if it were number 0."""
     offset, stride = _FIRST_SEED[split]
     number = TASK_NAMES.index(task) + 1 if task in TASK_NAMES else 0
-    return offset + stride * number + 100 * episode, _CYCLE[episode % 4]
+    place = _FIRST_NUMBER.get(split, 0) + episode
+    return offset + stride * number + 100 * place, _CYCLE[place % 4]
 
 
 def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
@@ -62,7 +69,8 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
         split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`,
-            900 episodes a task that the benchmark does not have.
+            900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
+            gives after its own 50 (number 0 is what number 50 would be; no seed was raised).
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
 
@@ -75,7 +83,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
     if variant is not None:
         variant.check(task)
         return [replace(spec, split=split) for spec in episodes(task, BASE, folder)]
-    if task not in TASK_NAMES or split == MORE:
+    if task not in TASK_NAMES or split not in SPLITS:
         return [EpisodeSpec(task, split, i, *formula(task, split, i)) for i in range(_COUNTS[split])]
     folder = folder or os.environ.get(FOLDER_VARIABLE)
     if folder:

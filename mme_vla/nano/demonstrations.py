@@ -5,8 +5,8 @@ frame; then the frames that are wanted are put back and drawn. That takes a seco
 """
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.files import parse_json, write_atomically
 from mme_vla.nano.snapshots import Snapshots
+from mme_vla.subgoal.oracle import online_subgoal
 
 if TYPE_CHECKING:
     from mme_vla.envs.recording.recorder import RecordedStep
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 Looks = Callable[[int, int], Sequence[int]]
 """`looks(step, exec_start)`: the frames up to `step` that a memory remembers there."""
+SUBGOALS = ("simple", "grounded")
 CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
 
@@ -32,7 +34,8 @@ class Demonstration:
     """One episode of a task, with pictures of some frames.
 
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
-    pictures: camera → frame → [256, 256, 3] uint8.
+    subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
+    time. pictures: camera → frame → [256, 256, 3] uint8.
     """
 
     task: str
@@ -44,10 +47,12 @@ class Demonstration:
     states: np.ndarray
     motions: Motions
     pictures: dict[str, dict[int, np.ndarray]]
+    subgoals: dict[str, list[str]] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
         """Write it as one file, which appears whole or not at all."""
-        about = {name: getattr(self, name) for name in ("task", "seed", "difficulty", "goal", "length", "exec_start")}
+        names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals")
+        about = {name: getattr(self, name) for name in names}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
         for camera, taken in self.pictures.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
@@ -83,6 +88,7 @@ def record(
         looks: of the memories that will train on it; the front camera is drawn at these frames, and all at decisions.
         execute: motions of a chunk that are executed: only every so many decisions is a policy asked, and drawn.
     """
+    from mme_vla.envs.drawing import Drawing
     from mme_vla.envs.recording.recorder import Recorder
     from mme_vla.envs.scene.placement import SceneError
 
@@ -93,14 +99,16 @@ def record(
     states: list[np.ndarray] = []
     waypoints: list[np.ndarray] = []
     scenes = Snapshots(env)
+    texts: list[dict[str, Any]] = []
 
     def take(step: "RecordedStep") -> None:
         states.append(benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]))
         waypoints.append(step.action["waypoint_action"])
         scenes.take()
+        texts.append(step.info)
 
     try:
-        result = Recorder(env, render=False, on_step=take).record()
+        result = Recorder(env, on_step=take, drawing=Drawing(now=())).record()
         if not result.success:
             return None
         motions = find_motions(np.stack(waypoints)[result.video :].astype(np.float32), result.video)
@@ -114,10 +122,18 @@ def record(
                 pictures[camera][frame] = picture
         return Demonstration(
             type(env).__name__, seed, difficulty, env.goals()[0].lower(), len(states), result.video, np.stack(states),
-            motions, pictures,
+            motions, pictures, {kind: _shown(texts, kind, decisions) for kind in SUBGOALS},
         )  # fmt: skip
     finally:
         env.close()
+
+
+def _shown(texts: Sequence[Mapping[str, Any]], kind: str, decisions: Sequence[int]) -> list[str]:
+    """The subgoal at each decision; where the simulator names none, the last one stays."""
+    found: list[str] = []
+    for frame in decisions:
+        found.append(online_subgoal(texts[frame], kind) or (found[-1] if found else ""))
+    return found
 
 
 def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:

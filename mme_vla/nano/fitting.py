@@ -11,7 +11,7 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.files import read_json_lines, write_json
-from mme_vla.nano.learning import OFTEN, Decisions, load_all, statistics
+from mme_vla.nano.learning import Decisions, load_all, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -59,11 +59,12 @@ def train(
     settings: Mapping[str, Any],
     folder: Path,
     files: Sequence[Path],
+    learning: Mapping[str, Any],
 ) -> Path:
     """Train a policy in `folder`, or go on with it; the last checkpoint.
 
     Args:
-        config: as `compose_policy` gives it. settings: the section `train`.
+        config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`.
         files: demonstrations; one in `HELD_OUT` only measures the loss.
     """
     from accelerate import Accelerator
@@ -72,14 +73,14 @@ def train(
         return checkpoints_in(folder / "checkpoints")[-1]
     begun, cpu = time.perf_counter(), time.process_time()
     chosen = TrainSettings.from_dict(settings, int(config["seed"]))
-    whole = {**config, "train": dict(settings)}
+    whole = {**config, "train": dict(settings), "learning": dict(learning)}
     resume = str(folder) if checkpoints_in(folder / "checkpoints") else None
     folder.mkdir(parents=True, exist_ok=True)
     run, lock = claim_run(folder, True, resume, whole)
     with ExitStack() as held_lock:
         held_lock.push(lock)  # it is held already
         policy = build(config)
-        samples, held = prepared(policy, folder, files)
+        samples, held = prepared(policy, folder, files, learning)
         policy.config["card"] = {"data": f"{len(files)} demonstrations", "recipe": dict(settings)}
         validation = Validation(held, held.collate, chosen.val_samples, chosen.batch_size, chosen.seed)
         trainer = Trainer(policy, samples, samples.collate, validation, chosen, run, whole, Accelerator(cpu=True))
@@ -98,7 +99,9 @@ def train(
     return trainer.last_checkpoint
 
 
-def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[Decisions, Decisions]:
+def prepared(
+    policy: MMEPolicy, folder: Path, files: Sequence[Path], learning: Mapping[str, Any]
+) -> tuple[Decisions, Decisions]:
     """Decisions to learn from, and to measure by; their tokens, and the statistics, are made once for a folder."""
     learnt_file, held_file, stats_file = (
         folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
@@ -106,12 +109,12 @@ def prepared(policy: MMEPolicy, folder: Path, files: Sequence[Path]) -> tuple[De
     processor = policy.require_processor()
     if held_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        return Decisions.load(learnt_file, OFTEN), Decisions.load(held_file)
+        return Decisions.load(learnt_file, learning["often"]), Decisions.load(held_file)
     learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
     processor.stats = statistics(learnt, policy)
     processor.stats.save(stats_file)
     samples, held = (
-        Decisions.of(policy, learnt, OFTEN),
+        Decisions.of(policy, learnt, **learning),
         Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:])),
     )
     samples.save(learnt_file)

@@ -23,8 +23,8 @@ NARROWEST = 0.1  # of an action's number, in metres or radians: less than that i
 
 
 _PAST = "history."
-OFTEN, ELSEWHERE = 4, 0.05
-"""How often a decision to go elsewhere is learned for every other; metres from where on it is elsewhere."""
+ELSEWHERE = 0.05
+"""Metres above the table from where on a motion is one to another place."""
 
 
 class SparseHistory(History):
@@ -51,7 +51,7 @@ class Decisions(Dataset[int]):
 
     batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
-        an item `OFTEN` times.
+        an item `often` times.
     """
 
     def __init__(self, batch: Batch, far: Tensor, often: int = 1) -> None:
@@ -59,11 +59,15 @@ class Decisions(Dataset[int]):
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
 
     @classmethod
-    def of(cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1) -> "Decisions":
+    def of(
+        cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1, elsewhere: float = ELSEWHERE
+    ) -> "Decisions":
         """Make all tokens.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
+            often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
+                is elsewhere.
 
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
@@ -71,7 +75,7 @@ class Decisions(Dataset[int]):
         items = [item for found in demonstrations for item in _items(policy, found)]
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        far = torch.from_numpy(np.concatenate([_far(found.motions.targets) for found in demonstrations]))
+        far = torch.from_numpy(np.concatenate([_far(found.motions.targets, elsewhere) for found in demonstrations]))
         return cls(_stack(items), far, often)
 
     @classmethod
@@ -109,10 +113,10 @@ class Decisions(Dataset[int]):
         return self.batch.rows(chosen)
 
 
-def _far(targets: np.ndarray) -> np.ndarray:
-    """Which of an episode's motions [m, 7] end elsewhere above the table than the one before; the first does. [m]."""
+def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:
+    """Which of an episode's motions [m, 7] end that far above the table from the one before; the first does. [m]."""
     steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
-    return np.concatenate([[True], steps > ELSEWHERE])
+    return np.concatenate([[True], steps > elsewhere])
 
 
 def load_all(files: Sequence[Path]) -> list[Demonstration]:

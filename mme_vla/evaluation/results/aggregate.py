@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mme_vla.envs.metadata import FURTHER
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run, count_outcomes, merge
 from mme_vla.evaluation.results import paper
@@ -195,7 +196,8 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
 def _method(
     model: str, subgoal: str | None, budget: int | None, composition: str | None, runs: list[Run], protocol: Protocol
 ) -> Method:
-    known = paper.paper_method(model, subgoal) if budget in (None, USUAL_BUDGET) else None
+    papers = budget in (None, USUAL_BUDGET) and all(run.key.split != FURTHER for run in runs)
+    known = paper.paper_method(model, subgoal) if papers else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
     runs = sorted(runs, key=lambda run: (str(run.key.checkpoint).zfill(12), run.key.model_seed))
@@ -302,6 +304,10 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
         if method.paper and limits != {MAX_STEPS}:
             given = ", ".join(map(str, sorted(limits)))
             notes.append(f"{method.label} ran with a limit of {given} steps; the paper's is {MAX_STEPS}.")
+    if any(run.key.split == FURTHER for method in methods for run in method.runs):
+        notes.append(
+            f"Split {FURTHER!r}: scenes beyond the benchmark's own; figures of it are none of the benchmark's."
+        )
     if outside:
         notes.append(f"{outside} records of other tasks, or of episodes from {protocol.episodes} on, are left out.")
     return notes
