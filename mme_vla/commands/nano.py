@@ -73,7 +73,8 @@ def run(config: Mapping[str, Any]) -> Path:
         others = [compose_policy(model, config["memories"], words) for model in drawn_for]
         memories = [build(each).memory for each in (*composed.values(), *others)]
         looks: list[Looks] = [memory_looks(memory) for memory in memories if memory is not None]
-        files = record_all(config, folder / "demonstrations", looks)
+        execute = int(composed[config["model"]]["embodiment"]["action"]["execute"])
+        files = record_all(config, folder / "demonstrations", looks, execute)
     if config["record_only"]:
         return folder / "demonstrations"
     for model, each in composed.items():
@@ -116,8 +117,11 @@ def check_counts(counts: Any) -> None:
         raise UserError(f"demonstrations={brief(counts)}: it takes two, to learn from and to measure by.")
 
 
-def record_all(config: Mapping[str, Any], folder: Path, looks: "list[Looks]") -> list[Path]:
+def record_all(config: Mapping[str, Any], folder: Path, looks: "list[Looks]", execute: int = 1) -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
+
+    Args:
+        execute: motions of a chunk that are executed before the policy is asked again.
 
     Raises:
         UserError: scene after scene without a demonstration that succeeds.
@@ -132,14 +136,21 @@ def record_all(config: Mapping[str, Any], folder: Path, looks: "list[Looks]") ->
     with progress("record", sum(counts.values()), unit="demonstrations") as advance:
         for number, (level, wanted) in enumerate(counts.items()):
             first = int(config["first_seed"]) + number * SEEDS_APART
-            for path in demonstrations_of(config["task"], level, first, wanted, folder, looks, cameras):
+            for path in demonstrations_of(config["task"], level, first, wanted, folder, looks, cameras, execute):
                 files.append(path)
                 advance(1)
     return files
 
 
 def demonstrations_of(
-    task: str, level: str, first_seed: int, count: int, folder: Path, looks: "list[Looks]", cameras: Sequence[str]
+    task: str,
+    level: str,
+    first_seed: int,
+    count: int,
+    folder: Path,
+    looks: "list[Looks]",
+    cameras: Sequence[str],
+    execute: int = 1,
 ) -> Iterator[Path]:
     """The files of `count` demonstrations from this seed on; what is there is not made again, nor tried.
 
@@ -153,7 +164,7 @@ def demonstrations_of(
         path = folder / f"{level}-{seed}.npz"
         none = path.with_suffix(".failed")
         if not path.is_file() and not none.is_file():
-            made = record(task, seed, level, looks, cameras)
+            made = record(task, seed, level, looks, cameras, execute)
             if made is None:
                 none.touch()
             else:

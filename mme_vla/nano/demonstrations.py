@@ -112,9 +112,10 @@ def record(
         if not result.success:
             return None
         motions = find_motions(np.stack(waypoints)[result.video :].astype(np.float32), result.video)
-        decisions = [int(frame) for frame in motions.decisions[::execute]]
-        front = {int(frame) for look in looks for step in decisions for frame in look(step, result.video)}
-        wanted = {camera: set(decisions) | (front if camera == "front" else set()) for camera in cameras}
+        decisions = [int(frame) for frame in motions.decisions]
+        asked = decisions[::execute]
+        front = {int(frame) for look in looks for step in asked for frame in look(step, result.video)}
+        wanted = {camera: set(asked) | (front if camera == "front" else set()) for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):
             scenes.put_back(frame)

@@ -49,7 +49,8 @@ class SparseHistory(History):
 class Decisions(Dataset[int]):
     """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
 
-    batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
+    batch: every decision, or every so many where the robot executes more motions of a chunk than one; the tokens of
+        the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
         an item `often` times.
     """
@@ -75,8 +76,9 @@ class Decisions(Dataset[int]):
         items = [item for found in demonstrations for item in _items(policy, found)]
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        far = torch.from_numpy(np.concatenate([_far(found.motions.targets, elsewhere) for found in demonstrations]))
-        return cls(_stack(items), far, often)
+        execute = policy.embodiment.action.execute
+        far = np.concatenate([_far(found.motions.targets, elsewhere)[::execute] for found in demonstrations])
+        return cls(_stack(items), torch.from_numpy(far), often)
 
     @classmethod
     def load(cls, path: Path, often: int = 1) -> "Decisions":
@@ -148,7 +150,7 @@ def _widened(stats: QuantileStats) -> QuantileStats:
 @torch.no_grad()
 def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
     processor, cameras = policy.require_processor(), policy.embodiment.camera_names
-    decisions = [int(frame) for frame in found.motions.decisions]
+    decisions = [int(frame) for frame in found.motions.decisions[:: policy.embodiment.action.execute]]
     views = processor.images([np.stack([found.pictures[name][frame] for frame in decisions]) for name in cameras])
     flat = views.flatten(0, 1).float() / 255 * 2 - 1
     view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))

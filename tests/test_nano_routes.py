@@ -1,0 +1,57 @@
+"""Policies that execute several motions of a chunk are asked at every so many decisions: they learn from those alone."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mme_vla import UserError, build_policy
+from mme_vla.config.composition import compose
+from mme_vla.data.waypoints import Motions
+from mme_vla.embodiment import Embodiment
+from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.nano.learning import Decisions, statistics
+from mme_vla.policy.mme import MMEPolicy
+
+DECISIONS = np.array([20, 40, 60, 80, 100])
+
+
+def policy(execute: int) -> MMEPolicy:
+    return build_policy(
+        "framesamp_modul", backbone="nano", embodiment="robomme_waypoint_front_route", policy={"augment": False},
+        memory={"budget": 32, "grid": 1, "every": 8}, **{"embodiment.action.execute": execute},
+    )  # fmt: skip
+
+
+def demonstration(frames: range | list[int]) -> Demonstration:
+    rng = np.random.default_rng(0)
+    pictures = {frame: rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
+    motions = Motions(DECISIONS, rng.uniform(-0.2, 0.2, (5, 7)).astype(np.float32))
+    states = rng.uniform(-1, 1, (120, 8)).astype(np.float32)
+    return Demonstration("RouteStick", 3, "easy", "follow the same path", 120, 20, states, motions, {"front": pictures})
+
+
+@pytest.mark.parametrize(("execute", "asked"), [(1, [0, 1, 2, 3, 4]), (2, [0, 2, 4]), (14, [0])])
+def test_what_is_executed_without_asking_again_is_no_decision_to_learn(execute: int, asked: list[int]) -> None:
+    found, made = policy(execute), demonstration(range(120))
+    found.require_processor().stats = statistics([made], found)
+    samples = Decisions.of(found, [made])
+    batch = samples.collate(range(len(asked)))
+    assert len(samples.batch.prompt) == len(samples.far) == len(asked)
+    assert batch.state is not None and batch.action_mask is not None
+    assert np.array_equal(batch.state.numpy(), made.states[DECISIONS[asked]])
+    assert batch.action_mask.sum(1).tolist() == [5 - place for place in asked]
+
+
+def test_a_route_decided_at_once_needs_the_frames_before_it_alone() -> None:
+    found, video = policy(14), demonstration([0, 7, 15, 20])
+    found.require_processor().stats = statistics([video], found)
+    assert len(Decisions.of(found, [video])) == 1
+    with pytest.raises(UserError, match="holds no tokens"):
+        Decisions.of(policy(14), [demonstration([0, 7, 20])])
+
+
+def test_the_robot_of_routes_has_a_motion_for_each_half_of_the_longest_route(tmp_path: Path) -> None:
+    robot = Embodiment.from_dict(dict(compose("policy", ["embodiment=robomme_waypoint_front_route"]).embodiment))
+    assert (robot.action.horizon, robot.action.execute, robot.action.space) == (14, 14, "waypoint")
+    assert robot.camera_names == ("front",)
