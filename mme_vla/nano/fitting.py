@@ -109,7 +109,7 @@ def prepared(
     processor = policy.require_processor()
     if held_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        return Decisions.load(learnt_file, learning["often"]), Decisions.load(held_file)
+        return Decisions.load(learnt_file, learning["often"], learning["blur"]), Decisions.load(held_file)
     learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
     processor.stats = statistics(learnt, policy)
     processor.stats.save(stats_file)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -53,22 +54,30 @@ class Decisions(Dataset[int]):
         the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
         an item `often` times.
+    blur: noise that is added to every token of pictures, in the present and remembered, as it is learned: its size in
+        standard deviations of what a token's number is over all decisions. Few demonstrations are learned by heart
+        less that way.
     """
 
-    def __init__(self, batch: Batch, far: Tensor, often: int = 1) -> None:
-        self.batch, self.far = batch, far
+    def __init__(self, batch: Batch, far: Tensor, often: int = 1, blur: float = 0.0) -> None:
+        self.batch, self.far, self._blur = batch, far, blur
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
 
     @classmethod
     def of(
-        cls, policy: MMEPolicy, demonstrations: Sequence[Demonstration], often: int = 1, elsewhere: float = ELSEWHERE
+        cls,
+        policy: MMEPolicy,
+        demonstrations: Sequence[Demonstration],
+        often: int = 1,
+        elsewhere: float = ELSEWHERE,
+        blur: float = 0.0,
     ) -> "Decisions":
         """Make all tokens.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
             often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
-                is elsewhere.
+                is elsewhere. blur: see the class.
 
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
@@ -78,10 +87,10 @@ class Decisions(Dataset[int]):
             raise UserError("The demonstrations hold no decision to learn from.")
         execute = policy.embodiment.action.execute
         far = np.concatenate([_far(found.motions.targets, elsewhere)[::execute] for found in demonstrations])
-        return cls(_stack(items), torch.from_numpy(far), often)
+        return cls(_stack(items), torch.from_numpy(far), often, blur)
 
     @classmethod
-    def load(cls, path: Path, often: int = 1) -> "Decisions":
+    def load(cls, path: Path, often: int = 1, blur: float = 0.0) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
@@ -89,7 +98,7 @@ class Decisions(Dataset[int]):
         far = found.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
         now: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often)
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often, blur)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
@@ -112,7 +121,28 @@ class Decisions(Dataset[int]):
     def collate(self, rows: Sequence[int]) -> Batch:
         """The batch of these decisions."""
         chosen = torch.as_tensor(list(rows))
-        return self.batch.rows(chosen)
+        batch = self.batch.rows(chosen)
+        if not self._blur:
+            return batch
+        generator = torch.Generator().manual_seed(hash(tuple(rows)))  # of numbers alone, so the same everywhere
+        assert batch.view_tokens is not None
+        batch = replace(batch, view_tokens=self._blurred(batch.view_tokens, "views", generator))
+        if batch.history is not None:
+            features = self._blurred(batch.history.features, "past", generator)
+            batch = replace(batch, history=replace(batch.history, features=features))
+        return batch
+
+    def _blurred(self, tokens: Tensor, name: str, generator: torch.Generator) -> Tensor:
+        noise = torch.randn(tokens.shape, generator=generator)
+        return (tokens + self._blur * self._spread[name] * noise).to(tokens.dtype)
+
+    @cached_property
+    def _spread(self) -> dict[str, Tensor]:
+        """The standard deviation of each number of a token, of the present pictures and of those remembered."""
+        found = {"views": self.batch.view_tokens, "past": None}
+        if self.batch.history is not None:
+            found["past"] = self.batch.history.features[self.batch.history.mask]
+        return {name: t.float().flatten(0, -2).std(0) for name, t in found.items() if t is not None}
 
 
 def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:
