@@ -176,7 +176,8 @@ def test_a_tasks_own_settings_come_with_its_name_unless_others_are_named(
     (tmp_path / "nano").mkdir()
     (tmp_path / "nano" / "StopCube.yaml").touch()
     monkeypatch.setattr(nano_command, "config_dir", lambda: tmp_path)
-    assert with_settings(["task=StopCube", "seed=1"]) == ["task=StopCube", "seed=1", "nano=StopCube"]
+    assert with_settings(["task=StopCube", "seed=1"]) == ["nano=StopCube", "task=StopCube", "seed=1"]
+    assert with_settings(["model=ttt_modul"]) == ["with_memory=ttt_modul"]
     for words in (["task=BinFill"], ["seed=1"], ["task=StopCube", "nano=mine"]):
         assert with_settings(words) == words
 

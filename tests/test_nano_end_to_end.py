@@ -14,7 +14,7 @@ from mme_vla.evaluation.record_log import find_records, read_folders
 
 SMALL = (
     "demonstrations.easy=2", "demonstrations.medium=0", "demonstrations.hard=0", "train.steps=20",
-    "train.batch_size=4", "train.val_every=10", "episodes=2", "max_steps=20", "beside=[]", "drawn_for=[]",
+    "train.batch_size=4", "train.val_every=10", "episodes=2", "max_steps=20", "beside=[]", "also=[]", "drawn_for=[]",
 )  # fmt: skip
 
 
@@ -24,15 +24,17 @@ def test_from_nothing_to_a_page_and_again_without_doing_anything_twice(tmp_path:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    words = ["mme_vla.nano", "task=VideoUnmask", *SMALL, f"output={tmp_path}"]
+    words = ["mme_vla.nano", "task=VideoUnmask", "model=framesamp_modul", *SMALL, f"output={tmp_path}"]
     done = forked.run(*words, hidden=hidden(("sim",)))  # the extra suffices alone
     assert done.returncode == 0, done.stderr
-    records = read_folders(find_records([tmp_path]))
+    records = read_folders(find_records([tmp_path / "framesamp_modul"]))
     assert [record.episode for record in sorted(records, key=lambda r: r.episode)] == [0, 1]
     assert {record.action_space for record in records} == {"waypoint"}
     page = (tmp_path / "page.md").read_text()
-    assert "| framesamp_modul" in page and (tmp_path / "learning.png").is_file()
+    assert "| framesamp_modul" in page and "| planner" in page and (tmp_path / "learning.png").is_file()
+    films = list(tmp_path.glob("films/failure/**/*.mp4"))
+    assert len(films) == 1 and films[0].name in page
     written = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")}
     assert forked.run(*words).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == written
-    assert len(read_folders(find_records([tmp_path]))) == 2
+    assert len(read_folders(find_records([tmp_path / "framesamp_modul"]))) == 2

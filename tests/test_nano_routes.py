@@ -1,9 +1,10 @@
-"""Policies that execute several motions of a chunk are asked at every so many decisions: they learn from those alone."""
+"""Policies that execute several motions of a chunk are asked at every so many decisions, and learn those alone."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
@@ -48,10 +49,29 @@ def test_a_route_decided_at_once_needs_the_frames_before_it_alone() -> None:
     found.require_processor().stats = statistics([video], found)
     assert len(Decisions.of(found, [video])) == 1
     with pytest.raises(UserError, match="holds no tokens"):
-        Decisions.of(policy(14), [demonstration([0, 7, 20])])
+        Decisions.of(found, [demonstration([0, 7, 20])])
 
 
-def test_the_robot_of_routes_has_a_motion_for_each_half_of_the_longest_route(tmp_path: Path) -> None:
+def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are(tmp_path: Path) -> None:
+    found, made = policy(1), demonstration(range(120))
+    found.require_processor().stats = statistics([made], found)
+    sharp = Decisions.of(found, [made])
+    sharp.save(tmp_path / "a.safetensors")
+    blurred = Decisions.load(tmp_path / "a.safetensors", blur=0.5)
+    now, same, other = blurred.collate([0, 1, 2]), blurred.collate([0, 1, 2]), blurred.collate([2, 1, 0])
+    seen = sharp.collate([0, 1, 2])
+    assert now.view_tokens is not None and seen.view_tokens is not None and now.history is not None
+    assert same.view_tokens is not None and other.view_tokens is not None and seen.history is not None
+    assert torch.equal(now.view_tokens, same.view_tokens)
+    assert not torch.equal(now.view_tokens[1], other.view_tokens[1])
+    spread = sharp.batch.view_tokens.float().flatten(0, -2).std(0)  # type: ignore[union-attr]
+    off = (now.view_tokens.float() - seen.view_tokens.float()).flatten(0, -2).std(0)
+    assert torch.allclose(off[spread > 0.01], 0.5 * spread[spread > 0.01], rtol=0.4)
+    assert torch.equal(now.history.mask, seen.history.mask)
+    assert not torch.equal(now.history.features, seen.history.features)
+
+
+def test_the_robot_of_routes_has_a_motion_for_each_half_of_the_longest_route() -> None:
     robot = Embodiment.from_dict(dict(compose("policy", ["embodiment=robomme_waypoint_front_route"]).embodiment))
     assert (robot.action.horizon, robot.action.execute, robot.action.space) == (14, 14, "waypoint")
     assert robot.camera_names == ("front",)

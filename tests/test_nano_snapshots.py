@@ -11,8 +11,9 @@ from mme_vla.nano.demonstrations import record
 def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
     """Marks come and go, and belong to no thing of the task: what is drawn afterwards has them where they were."""
     from mme_vla.envs.make import make_env
+    from mme_vla.envs.recording.frames import FrameChoice
 
-    made = record("PatternLock", 3_000_001, "easy", [lambda step, start: range(0, step + 1, 7)], ["front"], execute=8)
+    made = record("PatternLock", 3_000_001, "easy", [FrameChoice(list(range(0, 200, 7)))], ["front"])
     assert made is not None
     env = make_env("PatternLock", seed=3_000_001, difficulty="easy", action_space="waypoint")
     try:

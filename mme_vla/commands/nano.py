@@ -3,8 +3,9 @@
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import count, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +16,9 @@ from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json, write_json
 
 if TYPE_CHECKING:
-    from mme_vla.memory.base import Memory
-    from mme_vla.nano.demonstrations import Looks
+    from mme_vla.envs.recording.frames import FrameChoice
+    from mme_vla.evaluation.records import EpisodeRecord
+    from mme_vla.nano.demonstrations import Scene
 
 # Threads that wait asleep leave their cores to others; it counts only when set before PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -31,12 +33,16 @@ def main() -> None:
 
 
 def with_settings(words: Sequence[str]) -> list[str]:
-    """The words of a command line, after them what the task's file in configs/nano says; what is typed counts more."""
+    """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more.
+
+    `model=…` would be a choice for a tree that holds one model. Here it names the first of several.
+    """
+    words = [f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word for word in words]
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
     own = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
     if own is None or not own.is_file() or any(word.startswith("nano=") for word in words):
         return list(words)
-    return [*words, f"nano={own.stem}"]
+    return [f"nano={own.stem}", *words]
 
 
 @cli("nano")
@@ -58,47 +64,66 @@ def command(cfg: DictConfig) -> None:
 
 def run(config: Mapping[str, Any]) -> Path:
     """All stages of a run; the path of its page, or the folder of the demonstrations where nothing else is wanted."""
-    from mme_vla.nano.evaluating import run_episodes
-    from mme_vla.nano.fitting import build, compose_policy, train
+    from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
+    from mme_vla.nano.evaluating import film, run_episodes
+    from mme_vla.nano.fitting import compose_policy, train
     from mme_vla.nano.page import write_page
+    from mme_vla.nano.planner import NAME as PLANNER
 
     folder = Path(config["output"])
     folder.mkdir(parents=True, exist_ok=True)
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
-    models = list(dict.fromkeys([config["model"], *config["beside"]]))
+    models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
     composed = {model: compose_policy(model, config["memories"], words) for model in models}
     drawn_for = [model for model in config["drawn_for"] if model not in composed]
     minutes = _Minutes(folder / "minutes.json")
     with minutes.of("demonstrations"):
         others = [compose_policy(model, config["memories"], words) for model in drawn_for]
-        memories = [build(each).memory for each in (*composed.values(), *others)]
-        looks: list[Looks] = [memory_looks(memory) for memory in memories if memory is not None]
-        execute = int(composed[config["model"]]["embodiment"]["action"]["execute"])
-        files = record_all(config, folder / "demonstrations", looks, execute)
+        memories = [each["memory"] for each in (*composed.values(), *others)]
+        asked = int(composed[config["with_memory"]]["embodiment"]["action"]["execute"])
+        choices = [FrameChoice(DECISIONS, memory, asked) for memory in [None, *filter(None, memories)]]
+        files = record_all(config, folder / "demonstrations", choices)
     if config["record_only"]:
         return folder / "demonstrations"
+    records: dict[str, list[EpisodeRecord]] = {}
+    films: list[Path] = []
     for model, each in composed.items():
         with minutes.of(f"training {model}"):
             checkpoint = train(each, config["train"], folder / model, files, config["learning"])
         with minutes.of(f"evaluation {model}"):
-            run_episodes(
+            records[model] = run_episodes(
                 checkpoint, folder / model / config["split"], config["task"], split=config["split"],
-                episodes=config["episodes"], seeds=config["policy_seeds"], workers=config["workers"],
-                max_steps=config["max_steps"],
+                episodes=config["also_episodes" if model in config["also"] else "episodes"],
+                seeds=config["policy_seeds"], workers=config["workers"], max_steps=config["max_steps"],
             )  # fmt: skip
-    page = write_page(folder, config, models, minutes.spent)
+        if model == config["with_memory"] and config["films"]:
+            with minutes.of("films"):
+                films = film(checkpoint, folder / "films", records[model])
+    if config["planner"]:
+        with minutes.of("evaluation planner"):
+            records[PLANNER] = plan_all(config, folder / "planner" / config["split"])
+    without = next((model for model, each in composed.items() if each["memory"] is None), None)
+    page = write_page(folder, config, records, without, minutes.spent, films)
     print(page)
     return page
 
 
-def memory_looks(memory: "Memory") -> "Looks":
-    """Which frames a memory remembers at a step, from the step alone."""
+def plan_all(config: Mapping[str, Any], folder: Path) -> "list[EpisodeRecord]":
+    """The oracle bracket: the demonstrator's motions on every episode, unless `folder` has its record; all records."""
+    from mme_vla.commands.record import carry_out
+    from mme_vla.envs.episodes import choose_episodes
+    from mme_vla.evaluation.record_log import RecordLog, read_records
+    from mme_vla.nano.planner import Replay, replay
 
-    def look(step: int, exec_start: int) -> list[int]:
-        frames: list[int] = memory.frames_read([step], exec_start).tolist()
-        return frames
-
-    return look
+    file = folder / "episodes.jsonl"
+    known = {record.episode for record in (read_records(file) if file.is_file() else ())}
+    specs = choose_episodes(config["task"], config["episodes"], config["split"])
+    missing = [Replay(spec, config["max_steps"]) for spec in specs if spec.episode not in known]
+    with RecordLog(file) as log:
+        for record in carry_out(missing, replay, config["workers"]):
+            log.append(record)
+    wanted = {spec.episode for spec in specs}
+    return [record for record in read_records(file) if record.episode in wanted]
 
 
 def check_counts(counts: Any) -> None:
@@ -117,81 +142,81 @@ def check_counts(counts: Any) -> None:
         raise UserError(f"demonstrations={brief(counts)}: it takes two, to learn from and to measure by.")
 
 
-def record_all(config: Mapping[str, Any], folder: Path, looks: "list[Looks]", execute: int = 1) -> list[Path]:
+def record_all(config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]") -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
 
     Args:
-        execute: motions of a chunk that are executed before the policy is asked again.
+        choices: what the memories that will train on them read.
 
     Raises:
         UserError: scene after scene without a demonstration that succeeds.
     """
     from mme_vla.data.progress import progress
     from mme_vla.embodiment.robomme import CAMERAS
+    from mme_vla.nano.demonstrations import Scene
 
     folder.mkdir(parents=True, exist_ok=True)
-    cameras = [name for name in CAMERAS if name == "front" or "front" not in config["embodiment"]]
+    cameras = tuple(name for name in CAMERAS if name == "front" or "front" not in config["embodiment"])
     counts: dict[str, int] = config["demonstrations"]
     files: list[Path] = []
     with progress("record", sum(counts.values()), unit="demonstrations") as advance:
         for number, (level, wanted) in enumerate(counts.items()):
             first = int(config["first_seed"]) + number * SEEDS_APART
-            for path in demonstrations_of(config["task"], level, first, wanted, folder, looks, cameras, execute):
-                files.append(path)
-                advance(1)
+            scenes = (Scene(config["task"], seed, level, folder, cameras, tuple(choices)) for seed in count(first))
+            files += demonstrate(scenes, wanted, config["workers"], advance)
     return files
 
 
-def demonstrations_of(
-    task: str,
-    level: str,
-    first_seed: int,
-    count: int,
-    folder: Path,
-    looks: "list[Looks]",
-    cameras: Sequence[str],
-    execute: int = 1,
-) -> Iterator[Path]:
-    """The files of `count` demonstrations from this seed on; what is there is not made again, nor tried.
+def demonstrate(
+    scenes: "Iterator[Scene]", wanted: int, workers: int = 1, advance: Callable[[int], None] = lambda _: None
+) -> list[Path]:
+    """The files of the first demonstrations of these scenes that succeed; what is there is not made again, nor tried.
 
     Raises:
-        UserError: scene after scene without a demonstration that succeeds.
+        UserError: scene after scene without one.
     """
-    from mme_vla.nano.demonstrations import record
+    from mme_vla.commands.record import carry_out
+    from mme_vla.nano.demonstrations import demonstrated
 
-    failed, found, seed = 0, 0, first_seed
-    while found < count:
-        path = folder / f"{level}-{seed}.npz"
-        none = path.with_suffix(".failed")
-        if not path.is_file() and not none.is_file():
-            made = record(task, seed, level, looks, cameras, execute)
-            if made is None:
-                none.touch()
-            else:
-                made.save(path)
-        there = path.is_file()
-        failed = 0 if there else failed + 1
+    found: list[Path] = []
+    failed = 0
+    while len(found) < wanted:
+        some = list(islice(scenes, min(RETRIES, wanted - len(found))))
+        missing = [scene for scene in some if not scene.tried]
+        advance(sum(scene.path.is_file() for scene in some if scene.tried))
+        for made in carry_out(missing, demonstrated, workers):
+            advance(int(made))
+        new = [scene.path for scene in some if scene.path.is_file()]
+        found += new
+        failed = 0 if new else failed + len(some)
         if failed >= RETRIES:
-            raise UserError(f"{task}: {RETRIES} {level} scenes in a row, to seed {seed}, cannot be demonstrated.")
-        seed += 1
-        if there:
-            found += 1
-            yield path
+            last = some[-1]
+            raise UserError(
+                f"{last.task}: {failed} {last.difficulty} scenes in a row, to seed {last.seed}, cannot be demonstrated."
+            )
+    return found
 
 
 class _Minutes:
-    """Wall minutes of each stage, added up over the runs of a command that was interrupted."""
+    """Minutes of each stage, added up over interrupted runs: on the clock, and of processors for this process."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.spent: dict[str, float] = read_json(path, "minutes of a run") if path.is_file() else {}
+
+    @property
+    def spent(self) -> dict[str, list[float]]:
+        """Stage → minutes on the clock, and of this process; other runs of the command may add to them meanwhile."""
+        return read_json(self._path, "minutes of a run") if self._path.is_file() else {}
 
     @contextmanager
     def of(self, stage: str) -> Iterator[None]:
         """Time what happens inside; a stage that had nothing to do counts its moment."""
-        begun = time.perf_counter()
+        begun = time.perf_counter(), time.process_time()
         try:
             yield
         finally:
-            self.spent[stage] = self.spent.get(stage, 0.0) + (time.perf_counter() - begun) / 60
-            write_json(self._path, self.spent)
+            now = time.perf_counter(), time.process_time()
+            spent = self.spent
+            before = spent.get(stage, [0.0, 0.0])
+            spent[stage] = [old + (b - a) / 60 for old, a, b in zip(before, begun, now, strict=True)]
+            write_json(self._path, spent)

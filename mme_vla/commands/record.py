@@ -2,9 +2,10 @@
 
 import multiprocessing
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,7 +109,7 @@ def record(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | Non
     folder.mkdir(parents=True, exist_ok=True)
     missing = [job for job in jobs if not (folder / f"{job.name}.json").is_file()]
     with progress("record", len(jobs), len(jobs) - len(missing), "episodes") as advance:
-        for _ in _carry_out(missing, folder, workers, previews):
+        for _ in carry_out(missing, partial(record_episode, folder=folder, previews=previews), workers):
             advance(1)
     return [read_json(folder / f"{job.name}.json", "what is known of a recorded episode") for job in jobs]
 
@@ -147,15 +148,20 @@ def _begin_worker(plugins: Sequence[str]) -> None:
     import_plugins(plugins)
 
 
-def _carry_out(jobs: Sequence[Job], folder: Path, workers: int, previews: Path | None) -> Iterator[dict[str, Any]]:
+def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> Iterator[R]:
+    """Do work that simulates, in so many processes; what came of it, as it is done.
+
+    Args:
+        work: importable by name, or a partial of such, where there are several processes.
+    """
     if workers == 1 or len(jobs) < 2:
         import mme_vla.envs.vector.preloaded  # noqa: F401 - scenes are built faster from here on
 
-        yield from (record_episode(job, folder, previews) for job in jobs)
+        yield from map(work, jobs)
         return
     with _pool(workers) as pool:
         with signals_held():  # the workers are started here, and inherit that
-            futures = [pool.submit(record_episode, job, folder, previews) for job in jobs]
+            futures = [pool.submit(work, job) for job in jobs]
         try:
             for future in as_completed(futures):
                 yield future.result()

@@ -26,7 +26,7 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
 FURTHER, FURTHER_EPISODES = "further", 100
-"""Episodes that go on where the test split's rule ends, for tests on scenes that nobody has looked at; no split either."""
+"""Episodes that go on where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
 _COUNTS = {**SPLITS, MORE: 900, FURTHER: FURTHER_EPISODES}
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _TEST_SEED = (500_000, 10_000)

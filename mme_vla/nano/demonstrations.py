@@ -5,14 +5,14 @@ frame; then the frames that are wanted are put back and drawn. That takes a seco
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.waypoints import Motions, find_motions
+from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.files import parse_json, write_atomically
@@ -20,11 +20,10 @@ from mme_vla.nano.snapshots import Snapshots
 from mme_vla.subgoal.oracle import online_subgoal
 
 if TYPE_CHECKING:
+    from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
 
-Looks = Callable[[int, int], Sequence[int]]
-"""`looks(step, exec_start)`: the frames up to `step` that a memory remembers there."""
 SUBGOALS = ("simple", "grounded")
 CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
@@ -61,34 +60,75 @@ class Demonstration:
             np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path: Path) -> "Demonstration":
-        """Read what `save` wrote."""
+    def load(cls, path: Path, pictures: bool = True) -> "Demonstration":
+        """Read what `save` wrote, or what of it is no picture."""
         with np.load(path) as file:
-            pictures = {
+            drawn = {
                 camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
                 for camera in CAMERAS
-                if f"{camera}_frames" in file
+                if pictures and f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
-            return cls(**about, states=file["states"], motions=motions, pictures=pictures)
+            return cls(**about, states=file["states"], motions=motions, pictures=drawn)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene to demonstrate, and the folder of what comes of it.
+
+    cameras: those that are drawn. choices: at which frames, for each memory that will train on it.
+    """
+
+    task: str
+    seed: int
+    difficulty: str
+    folder: Path
+    cameras: tuple[str, ...]
+    choices: tuple["FrameChoice", ...]
+
+    @property
+    def path(self) -> Path:
+        """The demonstration's file."""
+        return self.folder / f"{self.difficulty}-{self.seed}.npz"
+
+    @property
+    def failed(self) -> Path:
+        """A file that is there where the demonstrator did not succeed."""
+        return self.path.with_suffix(".failed")
+
+    @property
+    def tried(self) -> bool:
+        """Whether there is nothing left to do: it failed, or is there with every frame that is to be drawn."""
+        return self.failed.is_file() or (self.path.is_file() and self._complete())
+
+    def _complete(self) -> bool:
+        with np.load(self.path) as file:
+            exec_start = parse_json(str(file["about"]), str(self.path))["exec_start"]
+            read = [choice.read(file["decisions"][:: choice.every], exec_start) for choice in self.choices]
+            return set().union(*read) <= set(file["front_frames"].tolist())
+
+
+def demonstrated(scene: Scene) -> bool:
+    """Demonstrate a scene into its file; whether the demonstrator succeeded."""
+    made = record(scene.task, scene.seed, scene.difficulty, scene.choices, scene.cameras)
+    if made is None:
+        scene.failed.touch()
+        return False
+    made.save(scene.path)
+    return True
 
 
 def record(
-    task: str,
-    seed: int,
-    difficulty: str,
-    looks: Sequence[Looks],
-    cameras: Sequence[str] = ("front", "wrist"),
-    execute: int = 1,
+    task: str, seed: int, difficulty: str, choices: Sequence["FrameChoice"], cameras: Sequence[str] = ("front", "wrist")
 ) -> Demonstration | None:
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
-        looks: of the memories that will train on it; the front camera is drawn at these frames, and all at decisions.
-        execute: motions of a chunk that are executed: only every so many decisions is a policy asked, and drawn.
+        choices: what the memories that will train on it read; these cameras are drawn at the frames of all of them.
     """
     from mme_vla.envs.drawing import Drawing
+    from mme_vla.envs.recording.frames import motions_of
     from mme_vla.envs.recording.recorder import Recorder
     from mme_vla.envs.scene.placement import SceneError
 
@@ -96,44 +136,40 @@ def record(
         env = make_task(task, render=True, seed=seed, difficulty=difficulty)
     except SceneError:
         return None
-    states: list[np.ndarray] = []
-    waypoints: list[np.ndarray] = []
+    steps: list[RecordedStep] = []
     scenes = Snapshots(env)
-    texts: list[dict[str, Any]] = []
 
     def take(step: "RecordedStep") -> None:
-        states.append(benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]))
-        waypoints.append(step.action["waypoint_action"])
+        steps.append(step)
         scenes.take()
-        texts.append(step.info)
 
     try:
         result = Recorder(env, on_step=take, drawing=Drawing(now=())).record()
         if not result.success:
             return None
-        motions = find_motions(np.stack(waypoints)[result.video :].astype(np.float32), result.video)
-        decisions = [int(frame) for frame in motions.decisions]
-        asked = decisions[::execute]
-        front = {int(frame) for look in looks for step in asked for frame in look(step, result.video)}
-        wanted = {camera: set(asked) | (front if camera == "front" else set()) for camera in cameras}
+        motions = motions_of(steps)
+        drawn = [choice.drawing(steps).frames for choice in choices]
+        wanted = {camera: {k for k in range(len(steps)) if any(k in of[camera] for of in drawn)} for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):
             scenes.put_back(frame)
             for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
                 pictures[camera][frame] = picture
+        states = [benchmark_state(step.obs["joint_state"], step.obs["gripper_state"]) for step in steps]
+        texts = [steps[frame].info for frame in motions.decisions]
         return Demonstration(
-            type(env).__name__, seed, difficulty, env.goals()[0].lower(), len(states), result.video, np.stack(states),
-            motions, pictures, {kind: _shown(texts, kind, decisions) for kind in SUBGOALS},
+            type(env).__name__, seed, difficulty, env.goals()[0].lower(), len(steps), result.video, np.stack(states),
+            motions, pictures, {kind: _shown(texts, kind) for kind in SUBGOALS},
         )  # fmt: skip
     finally:
         env.close()
 
 
-def _shown(texts: Sequence[Mapping[str, Any]], kind: str, decisions: Sequence[int]) -> list[str]:
+def _shown(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
     """The subgoal at each decision; where the simulator names none, the last one stays."""
     found: list[str] = []
-    for frame in decisions:
-        found.append(online_subgoal(texts[frame], kind) or (found[-1] if found else ""))
+    for text in texts:
+        found.append(online_subgoal(text, kind) or (found[-1] if found else ""))
     return found
 
 

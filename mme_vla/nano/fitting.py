@@ -11,7 +11,8 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.files import read_json_lines, write_json
-from mme_vla.nano.learning import Decisions, load_all, statistics
+from mme_vla.nano.demonstrations import Demonstration
+from mme_vla.nano.learning import Decisions, off_by, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -94,8 +95,9 @@ def train(
     assert trainer.last_checkpoint is not None
     if not finished:
         raise SystemExit(128 + (trainer.stopped_by or 0))
+    off = off_by(MMEPolicy.from_pretrained(str(trainer.last_checkpoint)).eval(), held)
     spent = {"minutes": (time.perf_counter() - begun) / 60, "cpu_minutes": (time.process_time() - cpu) / 60}
-    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), **spent})
+    write_json(folder / DONE, {"steps": chosen.steps, "decisions": len(samples), "off_by_m": off.tolist(), **spent})
     return trainer.last_checkpoint
 
 
@@ -110,12 +112,16 @@ def prepared(
     if held_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
         return Decisions.load(learnt_file, learning["often"], learning["blur"]), Decisions.load(held_file)
-    learnt = load_all([file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files)
-    processor.stats = statistics(learnt, policy)
+    learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
+    processor.stats = statistics((Demonstration.load(file, pictures=False) for file in learnt), policy)
     processor.stats.save(stats_file)
     samples, held = (
-        Decisions.of(policy, learnt, **learning),
-        Decisions.of(policy, load_all(files[HELD_OUT - 1 :: HELD_OUT] or files[-1:])),
+        Decisions.of(policy, map(Demonstration.load, learnt), **learning),
+        Decisions.of(
+            policy,
+            map(Demonstration.load, files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]),
+            elsewhere=learning["elsewhere"],
+        ),
     )
     samples.save(learnt_file)
     held.save(held_file)

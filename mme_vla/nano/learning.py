@@ -1,6 +1,6 @@
 """Training on demonstrations of planned motions: every decision is a sample, and all its tokens are made beforehand."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -11,13 +11,15 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from mme_vla.backbone.base import stack_draws
 from mme_vla.errors import UserError
 from mme_vla.files import write_atomically
-from mme_vla.memory.base import stack_history
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats
+from mme_vla.processing.subgoal_text import perturb_point, subgoal_kind
 from mme_vla.types import Batch, HistoryTokens
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
@@ -34,13 +36,25 @@ class SparseHistory(History):
     tokens: frame → [patches, d_vision].
     """
 
-    def __init__(self, spec: StorageSpec, length: int, tokens: Mapping[int, Tensor], exec_start: int) -> None:
+    def __init__(
+        self,
+        spec: StorageSpec,
+        length: int,
+        tokens: Mapping[int, Tensor],
+        exec_start: int,
+        scores: FrameScores | None = None,
+    ) -> None:
         super().__init__(spec, exec_start)
+        self._scores = FrameScores.empty(spec.grid**2) if scores is None else scores
         self._length, self._kept = length, np.array(sorted(tokens), np.int64)
         self._tokens = torch.stack([tokens[int(frame)] for frame in self._kept])
 
     def __len__(self) -> int:
         return self._length
+
+    @property
+    def scores(self) -> FrameScores:
+        return self._scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._row_of(indices[:, 0], self._kept)
@@ -67,12 +81,12 @@ class Decisions(Dataset[int]):
     def of(
         cls,
         policy: MMEPolicy,
-        demonstrations: Sequence[Demonstration],
+        demonstrations: Iterable[Demonstration],
         often: int = 1,
         elsewhere: float = ELSEWHERE,
         blur: float = 0.0,
     ) -> "Decisions":
-        """Make all tokens.
+        """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
@@ -82,12 +96,14 @@ class Decisions(Dataset[int]):
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
         """
-        items = [item for found in demonstrations for item in _items(policy, found)]
+        items: list[dict[str, Any]] = []
+        far: list[np.ndarray] = []
+        for found in demonstrations:
+            items += _items(policy, found)
+            far.append(_far(found.motions.targets, elsewhere)[:: policy.embodiment.action.execute])
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        execute = policy.embodiment.action.execute
-        far = np.concatenate([_far(found.motions.targets, elsewhere)[::execute] for found in demonstrations])
-        return cls(_stack(items), torch.from_numpy(far), often, blur)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often, blur)
 
     @classmethod
     def load(cls, path: Path, often: int = 1, blur: float = 0.0) -> "Decisions":
@@ -151,12 +167,19 @@ def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:
     return np.concatenate([[True], steps > elsewhere])
 
 
-def load_all(files: Sequence[Path]) -> list[Demonstration]:
-    """Recorded demonstrations, in this order."""
-    return [Demonstration.load(file) for file in files]
+@torch.no_grad()
+def off_by(policy: MMEPolicy, held: Decisions, seed: int = 0) -> Tensor:
+    """How far above the table motions to another place end from where they should, the first of each chunk; [n] m."""
+    rows = held.far.nonzero()[:, 0].tolist()
+    batch, generator = held.collate(rows), torch.Generator().manual_seed(seed)
+    assert batch.actions is not None and batch.state is not None
+    chunk = policy.sample_actions(batch, stack_draws([policy.sample_draws(generator) for _ in rows])).float()
+    processor = policy.require_processor()
+    said = processor.absolute_actions(chunk, batch.state)
+    return (said - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
 
 
-def statistics(demonstrations: Sequence[Demonstration], policy: MMEPolicy) -> NormStats:
+def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:
     """What states and motions are normalised by; numbers that hardly move keep their size.
 
     Raises:
@@ -185,11 +208,12 @@ def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
     flat = views.flatten(0, 1).float() / 255 * 2 - 1
     view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
     history = _history(policy, found)
+    subgoals = _subgoals(policy, found)[:: policy.embodiment.action.execute]
     items = []
     for place, frame in enumerate(decisions):
         state = found.states[frame]
         chunk, recorded = found.motions.chunk(frame, processor.horizon)
-        prompt, prompt_mask = processor.prompt(found.goal, state=state)
+        prompt, prompt_mask = processor.prompt(found.goal, subgoal=subgoals[place], state=state)
         item = {
             "view_tokens": view_tokens[place], "prompt": prompt, "prompt_mask": prompt_mask,
             "state": torch.from_numpy(state), "actions": processor.actions(chunk, state),
@@ -204,16 +228,39 @@ def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
 def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
     if policy.memory is None:
         return None
-    taken = found.pictures[policy.embodiment.memory_camera]
+    drawn = found.pictures[policy.embodiment.memory_camera]
+    asked = found.motions.decisions[:: policy.embodiment.action.execute]
+    read = policy.frames_read(asked, found.exec_start).tolist()
+    taken = {frame: drawn[frame] for frame in read if frame in drawn} or drawn
     tokens = policy.encode_frames(np.stack(list(taken.values())))
     history = SparseHistory(
-        policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start
+        policy.memory.storage, found.length, dict(zip(taken, tokens, strict=True)), found.exec_start,
+        _scores(policy.memory, taken),
     )  # fmt: skip
     if policy.memory.reads_motion:  # an action is a motion of many frames here, so the states alone tell what was done
         nothing = np.zeros((found.length, policy.embodiment.action.width), np.float32)
         moved = policy.require_processor().motion(found.states[: found.length], nothing, np.zeros(found.length, bool))
         history.motion = moved.__getitem__
     return history
+
+
+def _scores(memory: Memory, pictures: Mapping[int, np.ndarray]) -> FrameScores:
+    """What the memory's scorer says of these frames, as it says it while an episode runs."""
+    scorer = memory.make_scorer()
+    said = {} if scorer is None else {frame: scorer(frame, pictures[frame]) for frame in sorted(pictures)}
+    rows = {frame: values for frame, values in said.items() if values is not None}
+    if not rows:
+        return FrameScores.empty(memory.storage.grid**2)
+    return FrameScores(np.array(list(rows), np.int64), np.stack(list(rows.values())))
+
+
+def _subgoals(policy: MMEPolicy, found: Demonstration) -> Sequence[str | None]:
+    """The subgoal of each decision as the simulator says it, its point moved a little; None where none is read."""
+    kind = subgoal_kind(policy)
+    if kind is None:
+        return [None] * len(found.motions.decisions)
+    noise, rng = int(policy.config["subgoal_text"]["point_noise"]), np.random.default_rng(found.seed)
+    return [perturb_point(text, noise, rng) for text in found.subgoals[kind.removesuffix("_subgoal")]]
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:

@@ -4,47 +4,61 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mme_vla.evaluation.record_log import find_records, read_folders
+import numpy as np
+
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.intervals import wilson
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
-from mme_vla.files import write_atomically
-from mme_vla.nano.fitting import learning_curve
+from mme_vla.files import read_json, write_atomically
+from mme_vla.nano.fitting import DONE, learning_curve
+from mme_vla.nano.planner import NAME as PLANNER
 
 PAGE, CURVES = "page.md", "learning.png"
 LEVELS = ("easy", "medium", "hard")
 
 
-def write_page(folder: Path, config: Mapping[str, Any], models: Sequence[str], minutes: Mapping[str, float]) -> Path:
+def write_page(
+    folder: Path,
+    config: Mapping[str, Any],
+    records: Mapping[str, Sequence[EpisodeRecord]],
+    without: str | None,
+    minutes: Mapping[str, Sequence[float]],
+    films: Sequence[Path],
+) -> Path:
     """Write `page.md` and the plot beside it into the run's folder.
 
     Args:
-        models: the one with memory first. minutes: wall minutes of each stage.
+        records: of each model, the one with memory first, and of the oracle planner. without: the one without memory,
+            which all others are compared with. minutes: of each stage, on the clock and of processors. films: one of a
+            success, one of a failure, as far as there are such.
     """
-    records = read_folders(find_records([folder / model / config["split"] for model in models]))
-    results, comparisons = compared(records, config["task"], config["split"])
-    plot_curves({model: learning_curve(folder / model) for model in models}, folder / CURVES)
+    trained = [model for model in records if model != PLANNER]
+    results, comparisons = compared(records, config["task"], config["split"], without)
+    plot_curves({model: learning_curve(folder / model) for model in trained}, folder / CURVES)
     parts = [
         f"# {config['task']} on two cores",
         "",
         f"{sum(config['demonstrations'].values())} demonstrations, {config['train']['steps']} updates, split "
         f"`{config['split']}`; each episode once for each of the seeds {', '.join(map(str, config['policy_seeds']))} "
-        "of the policy's noise.",
+        f"of the policy's noise. Brackets: `{PLANNER}` is the demonstrator, which knows where everything is, through "
+        f"the policies' actions; {f'`{without}` has no memory' if without else 'no policy without memory was run'}.",
         "",
-        success_table(records),
+        success_table(records, {model: read_json(folder / model / DONE, "a training's end") for model in trained}),
         "",
         *([to_markdown(comparison_table(comparisons))] if comparisons else []),
         *[f"- {comparison.verdict}" for comparison in comparisons],
         *[f"- {note}" for note in results.notes],
         "",
-        "| stage | wall minutes |",
-        "| --- | ---: |",
-        *[f"| {stage} | {spent:.1f} |" for stage, spent in minutes.items()],
+        "| stage | minutes | of the command's own process on a processor |",
+        "| --- | ---: | ---: |",
+        *[f"| {stage} | {wall:.1f} | {processors:.1f} |" for stage, (wall, processors) in minutes.items()],
         "",
         f"![Loss on held-out demonstrations]({CURVES})",
+        "",
+        *[f"- film: [{film.stem}](<{film.relative_to(folder)}>)" for film in films],
         "",
     ]
     with write_atomically(folder / PAGE) as draft:
@@ -52,27 +66,46 @@ def write_page(folder: Path, config: Mapping[str, Any], models: Sequence[str], m
     return folder / PAGE
 
 
-def compared(records: Sequence[EpisodeRecord], task: str, split: str) -> tuple[Results, list[Comparison]]:
-    """What the records say of one task, and the first method against each other one that shares episodes with it."""
-    protocol = Protocol((task,))
-    results = aggregate(records, protocol, split)
-    first, *others = results.methods
-    pairs: list[tuple[Method, Method]] = [(first, other) for other in others if common_episodes(first, other)]
-    return results, compare_all(pairs, protocol)
+def compared(
+    records: Mapping[str, Sequence[EpisodeRecord]], task: str, split: str, without: str | None
+) -> tuple[Results, list[Comparison]]:
+    """What the records say of one task, and each model against the one without memory on the episodes of both.
+
+    With none without memory: the first model against each other one.
+    """
+    every = [record for own in records.values() for record in own]
+    protocol = Protocol((task,), 1 + max(record.episode for record in every))
+    results = aggregate(every, protocol, split)
+    methods = {model: _method(results, own[0]) for model, own in records.items() if model != PLANNER}
+    fixed = next(iter(methods)) if without is None else without
+    others = [method for model, method in methods.items() if model != fixed]
+    pairs = [(methods[fixed], other) if without is None else (other, methods[fixed]) for other in others]
+    return results, compare_all([pair for pair in pairs if common_episodes(*pair)], protocol)
 
 
-def success_table(records: Sequence[EpisodeRecord]) -> str:
-    """Success of each model, in all and by difficulty: won / run, and Wilson's interval of the distinct episodes."""
-    lines = ["| model | " + " | ".join(("all", "95 % interval", *LEVELS)) + " |", "| --- " + "| ---: " * 5 + "|"]
-    for model in dict.fromkeys(record.model for record in records):
-        own = [record for record in records if record.model == model]
+def _method(results: Results, record: EpisodeRecord) -> Method:
+    return next(method for method in results.methods if any(run.key == record.run for run in method.runs))
+
+
+def success_table(records: Mapping[str, Sequence[EpisodeRecord]], ends: Mapping[str, Mapping[str, Any]]) -> str:
+    """Success of each model, in all and by difficulty: won / run, and Wilson's interval of the distinct episodes.
+
+    Args:
+        ends: of each trained model, what `train` wrote: how far off its held-out decisions to go elsewhere were.
+    """
+    columns = ("memory tokens", "all", "95 % interval", *LEVELS, "off by, held out", "within 2 cm")
+    lines = ["| model | " + " | ".join(columns) + " |", "| --- " + "| ---: " * len(columns) + "|"]
+    for model, own in records.items():
         rate, episodes = _won(own) / len(own), len({record.episode for record in own})
         interval = wilson(rate, episodes)
         levels = [[record for record in own if record.difficulty == level] for level in LEVELS]
         cells = [f"{_won(part)}/{len(part)}" if part else "" for part in (own, *levels)]
         shown = f"{100 * rate:.0f} % ({cells[0]})"
         spread = f"{100 * interval.low:.0f} … {100 * interval.high:.0f} %"
-        lines.append("| " + " | ".join((model, shown, spread, *cells[1:])) + " |")
+        off = np.array(ends[model]["off_by_m"]) if model in ends else None
+        held = ("", "") if off is None else (f"{100 * np.median(off):.1f} cm", f"{100 * np.mean(off <= 0.02):.0f} %")
+        row = (own[0].model, own[0].memory_budget or "", shown, spread, *cells[1:], *held)
+        lines.append("| " + " | ".join(map(str, row)) + " |")
     return "\n".join(lines)
 
 

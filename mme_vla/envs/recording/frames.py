@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.choice_rows import CHOICE_NUMBERS, find_choices, row_of
-from mme_vla.data.waypoints import find_motions, known_poses
+from mme_vla.data.waypoints import Motions, find_motions, known_poses
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.episodes import spans
@@ -33,6 +33,7 @@ class FrameChoice:
         among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
         episode's first stored frame.
     memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames.
+    every: of the decisions, every so many, for a policy that executes so many motions before it is asked again.
 
     Raises:
         UserError: `at` is none of these.
@@ -40,6 +41,7 @@ class FrameChoice:
 
     at: str | int | Sequence[int | str]
     memory: Mapping[str, Any] | None = None
+    every: int = 1
 
     def __post_init__(self) -> None:
         if isinstance(self.at, bool) or (isinstance(self.at, int) and self.at < 1):
@@ -58,13 +60,17 @@ class FrameChoice:
 
     def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
         """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
-        video = sum(step.info["is_video_demo"] for step in steps)
+        video = _video(steps)
         shown = self._shown(steps, video)
         frames = {camera: frozenset(shown) for camera in CAMERAS}
-        if self.memory is not None:
-            read = _build(self.memory).frames_read(np.array(shown, np.int64), video)
-            frames[MEMORY_CAMERA] |= frozenset(read.tolist())
+        frames[MEMORY_CAMERA] |= self.read(np.array(shown, np.int64), video)
         return Drawing(frames, now=())
+
+    def read(self, shown: np.ndarray, exec_start: int) -> frozenset[int]:
+        """What the memory may read when it is asked at these frames [n], the execution beginning at `exec_start`."""
+        if self.memory is None:
+            return frozenset()
+        return frozenset(_build(self.memory).frames_read(shown, exec_start).tolist())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
@@ -74,9 +80,7 @@ class FrameChoice:
         if isinstance(self.at, int):
             return list(range(video, len(steps), self.at))
         if self.at == DECISIONS:
-            noted = np.stack([step.action["waypoint_action"] for step in steps])
-            poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
-            found: list[int] = find_motions(poses[video:], video).decisions.tolist()
+            found: list[int] = motions_of(steps).decisions[:: self.every].tolist()
             return found
         if self.at == CHOICES:
             rows = np.zeros((len(steps), len(CHOICE_NUMBERS)), np.float32)
@@ -87,6 +91,18 @@ class FrameChoice:
             chosen: list[int] = find_choices(rows[video:], video, range(len(LETTERS))).decisions.tolist()
             return chosen
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
+
+
+def motions_of(steps: Sequence["RecordedStep"]) -> Motions:
+    """The planned motions of a demonstration's execution."""
+    video = _video(steps)
+    noted = np.stack([step.action["waypoint_action"] for step in steps])
+    poses = known_poses(noted, video, lambda k: steps[k].action["eef_action"])
+    return find_motions(poses[video:], video)
+
+
+def _video(steps: Sequence["RecordedStep"]) -> int:
+    return sum(step.info["is_video_demo"] for step in steps)
 
 
 def _build(section: Mapping[str, Any]) -> "Memory":
