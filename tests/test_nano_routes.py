@@ -1,6 +1,7 @@
 """Policies that execute several motions of a chunk are asked at every so many decisions, and learn those alone."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment import Embodiment
+from mme_vla.envs.recording.frames import DECISIONS as AT_DECISIONS
+from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy
@@ -75,3 +78,17 @@ def test_the_robot_of_routes_has_a_motion_for_each_half_of_the_longest_route() -
     robot = Embodiment.from_dict(dict(compose("policy", ["embodiment=robomme_waypoint_front_route"]).embodiment))
     assert (robot.action.horizon, robot.action.execute, robot.action.space) == (14, 14, "waypoint")
     assert robot.camera_names == ("front",)
+
+
+def step(number: int, video: int) -> SimpleNamespace:
+    """A recorded step of an execution in which a motion takes two frames."""
+    row = np.full(7, np.nan) if number < video else np.full(7, (number - video) // 2, np.float64)
+    actions = {"waypoint_action": row, "eef_action": np.zeros(7)}
+    return SimpleNamespace(action=actions, info={"is_video_demo": number < video})
+
+
+@pytest.mark.parametrize(("every", "drawn"), [(1, {3, 4, 6, 8}), (2, {3, 6}), (14, {3})])
+def test_only_decisions_that_a_policy_is_asked_for_are_drawn(every: int, drawn: set[int]) -> None:
+    steps = [step(number, 3) for number in range(11)]
+    found = FrameChoice(AT_DECISIONS, None, every).drawing(steps)  # type: ignore[arg-type]
+    assert set(found.frames["front"]) == drawn

@@ -73,6 +73,7 @@ def run(config: Mapping[str, Any]) -> Path:
     folder = Path(config["output"])
     folder.mkdir(parents=True, exist_ok=True)
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
+    words += config["overrides"]
     models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
     composed = {model: compose_policy(model, config["memories"], words) for model in models}
     drawn_for = [model for model in config["drawn_for"] if model not in composed]
