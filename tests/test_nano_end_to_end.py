@@ -8,9 +8,11 @@ from test_extras import hidden
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
+from mme_vla.envs import metadata
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.nano.planner import Replay, replay
 
 SMALL = (
     "demonstrations.easy=2", "demonstrations.medium=0", "demonstrations.hard=0", "train.steps=20",
@@ -38,3 +40,10 @@ def test_from_nothing_to_a_page_and_again_without_doing_anything_twice(tmp_path:
     assert forked.run(*words).returncode == 0
     assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*.npz")} == written
     assert len(read_folders(find_records([tmp_path / "framesamp_modul"]))) == 2
+
+
+def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:
+    spec = metadata.episode("VideoUnmask", "val", 0)
+    record = replay(Replay(spec, max_steps=500))
+    assert (record.model, record.outcome, record.seed) == ("planner", "success", spec.seed)
+    assert replay(Replay(spec, max_steps=record.steps // 2)).outcome == "timeout"

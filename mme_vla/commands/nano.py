@@ -63,7 +63,7 @@ def command(cfg: DictConfig) -> None:
 
 
 def run(config: Mapping[str, Any]) -> Path:
-    """All stages of a run; the path of its page, or the folder of the demonstrations where nothing else is wanted."""
+    """All stages of a run; the path of its page; of a folder, where other commands are to go on there."""
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
     from mme_vla.nano.evaluating import film, run_episodes
     from mme_vla.nano.fitting import compose_policy, train
@@ -96,10 +96,13 @@ def run(config: Mapping[str, Any]) -> Path:
                 checkpoint, folder / model / config["split"], config["task"], split=config["split"],
                 episodes=config["also_episodes" if model in config["also"] else "episodes"],
                 seeds=config["policy_seeds"], workers=config["workers"], max_steps=config["max_steps"],
+                shard=config["shard"],
             )  # fmt: skip
-        if model == config["with_memory"] and config["films"]:
+        if model == config["with_memory"] and config["films"] and config["shard"] is None:
             with minutes.of("films"):
                 films = film(checkpoint, folder / "films", records[model])
+    if config["shard"] is not None:
+        return folder
     if config["planner"]:
         with minutes.of("evaluation planner"):
             records[PLANNER] = plan_all(config, folder / "planner" / config["split"])

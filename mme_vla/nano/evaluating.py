@@ -6,7 +6,7 @@ from typing import Any
 
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import VIDEOS, evaluate, memory_budget
-from mme_vla.evaluation.rollout.plan import choose_episodes
+from mme_vla.evaluation.rollout.plan import choose_episodes, choose_shard
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.digest import composition_digest
@@ -29,13 +29,14 @@ def run_episodes(
     workers: int | None = None,
     video: str = "none",
     max_steps: int = MAX_STEPS,
+    shard: str | None = None,
 ) -> list[EpisodeRecord]:
     """Run what `folder` has no record of yet, once for each seed of the policy's noise; all records.
 
     A policy that reads subgoals is told the simulator's own.
 
     Args:
-        split, episodes: as `evaluate` has them.
+        split, episodes, shard: as `evaluate` has them.
     """
     policy = MMEPolicy.from_pretrained(str(checkpoint)).eval()
     kind = subgoal_kind(policy)
@@ -49,7 +50,8 @@ def run_episodes(
             memory_budget=memory_budget(policy), composition=composition_digest(policy.config),
         )  # fmt: skip
         done = evaluate(
-            policy, jobs, folder / f"seed{seed}", facts, settings, subgoals=subgoals, source=str(checkpoint)
+            policy, jobs, folder / f"seed{seed}", facts, settings, subgoals=subgoals, shard=choose_shard(shard),
+            source=str(checkpoint),
         )  # fmt: skip
         records += done.records
     return records
