@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from conftest import REPOSITORY
 
 from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
@@ -13,10 +14,12 @@ from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.recording.frames import DECISIONS as AT_DECISIONS
 from mme_vla.envs.recording.frames import FrameChoice
+from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy
 
+ROWS = {"framesamp": 69, "pi05": 1, "planner": 100}
 DECISIONS = np.array([20, 40, 60, 80, 100])
 
 
@@ -92,3 +95,12 @@ def test_only_decisions_that_a_policy_is_asked_for_are_drawn(every: int, drawn: 
     steps = [step(number, 3) for number in range(11)]
     found = FrameChoice(AT_DECISIONS, None, every).drawing(steps)  # type: ignore[arg-type]
     assert set(found.frames["front"]) == drawn
+
+
+def test_the_pages_figures_of_routes_follow_from_the_records() -> None:
+    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / "RouteStick"]))
+    won = {model: {r.episode for r in records if r.model.startswith(model) and r.success} for model in ROWS}
+    assert len(records) == 300 and {model: len(found) for model, found in won.items()} == ROWS
+    assert won["pi05"] < won["framesamp"]
+    page = (REPOSITORY / "docs" / "nano.md").read_text()
+    assert "| **69 %** (59 … 77) | 50/50 | 15/25 | 4/25 |" in page and "| 1 % (0 … 5) | 1/50 | 0/25 | 0/25 |" in page
