@@ -106,8 +106,8 @@ def run(config: Mapping[str, Any]) -> Path:
     if config["planner"]:
         with minutes.of("evaluation planner"):
             records[PLANNER] = plan_all(config, folder / "planner" / config["split"])
-    without = next((model for model, each in composed.items() if each["memory"] is None), None)
-    page = write_page(folder, config, records, without, minutes.spent, films)
+    blind = [model for model, each in composed.items() if each["memory"] is None and not each["subgoal_text"]]
+    page = write_page(folder, config, records, next(iter(blind), None), minutes.spent, films)
     print(page)
     return page
 
@@ -185,7 +185,7 @@ def demonstrate(
     found: list[Path] = []
     failed = 0
     while len(found) < wanted:
-        some = list(islice(scenes, min(RETRIES, wanted - len(found))))
+        some = list(islice(scenes, min(RETRIES - failed, wanted - len(found))))
         missing = [scene for scene in some if not scene.tried]
         advance(sum(scene.path.is_file() for scene in some if scene.tried))
         for made in carry_out(missing, demonstrated, workers):
