@@ -84,8 +84,9 @@ def run(config: Mapping[str, Any]) -> Path:
     with minutes.of("demonstrations"):
         others = [compose_policy(model, config["memories"], words) for model in drawn_for]
         memories = [each["memory"] for each in (*composed.values(), *others)]
-        choices = [FrameChoice(DECISIONS, memory) for memory in [None, *filter(None, memories)]]
         robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
+        asked = robot.action.execute
+        choices = [FrameChoice(DECISIONS, memory, asked) for memory in [None, *filter(None, memories)]]
         files = record_all(config, folder / "demonstrations", choices, robot.action)
     if config["record_only"]:
         return folder / "demonstrations"
@@ -109,8 +110,8 @@ def run(config: Mapping[str, Any]) -> Path:
     if config["planner"]:
         with minutes.of("evaluation planner"):
             records[PLANNER] = plan_all(config, folder / "planner" / config["split"])
-    without = next((model for model, each in composed.items() if each["memory"] is None), None)
-    page = write_page(folder, config, records, without, minutes.spent, films)
+    blind = [model for model, each in composed.items() if each["memory"] is None and not each["subgoal_text"]]
+    page = write_page(folder, config, records, next(iter(blind), None), minutes.spent, films)
     print(page)
     return page
 
@@ -191,7 +192,7 @@ def demonstrate(
     found: list[Path] = []
     failed = 0
     while len(found) < wanted:
-        some = list(islice(scenes, min(RETRIES, wanted - len(found))))
+        some = list(islice(scenes, min(RETRIES - failed, wanted - len(found))))
         missing = [scene for scene in some if not scene.tried]
         advance(sum(scene.path.is_file() for scene in some if scene.tried))
         for made in carry_out(missing, demonstrated, workers):

@@ -17,6 +17,7 @@ from mme_vla.embodiment.options import Option, read_options
 from mme_vla.embodiment.robomme import benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
 from mme_vla.files import parse_json, write_atomically
+from mme_vla.nano.snapshots import Snapshots
 from mme_vla.subgoal.oracle import online_subgoal
 
 if TYPE_CHECKING:
@@ -109,7 +110,7 @@ class Scene:
     def _complete(self) -> bool:
         with np.load(self.path) as file:
             exec_start = parse_json(str(file["about"]), str(self.path))["exec_start"]
-            read = [choice.read(file["decisions"], exec_start) for choice in self.choices]
+            read = [choice.read(file["decisions"][:: choice.every], exec_start) for choice in self.choices]
             return set().union(*read) <= set(file["front_frames"].tolist())
 
 
@@ -158,12 +159,13 @@ def record(
             motions = _carry_out(taken, motions.targets, chooser)
         if motions is None:
             return None
-        at = set(motions.decisions.tolist())
-        read = at.union(*(choice.read(motions.decisions, taken.video) for choice in choices))
+        asked = [motions.decisions[:: choice.every] for choice in choices]
+        at = {frame for frames in asked for frame in frames.tolist()}
+        read = at.union(*(choice.read(at, taken.video) for choice, at in zip(choices, asked, strict=True)))
         wanted = {camera: read if camera == "front" else at for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):
-            _put_back(env, taken.scenes[frame])
+            taken.put_back(frame)
             for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
                 pictures[camera][frame] = picture
         goal = (
@@ -186,15 +188,21 @@ class _Taken:
 
     env: "Task"
     states: list[np.ndarray] = field(default_factory=list)
-    scenes: list[Any] = field(default_factory=list)
+    scenes: Snapshots | None = None
     texts: list[Mapping[str, Any]] = field(default_factory=list)
     video: int = 0
 
     def add(self, observed: Mapping[str, Any], info: Mapping[str, Any], in_video: bool) -> None:
         self.texts.append(info)
         self.states.append(benchmark_state(observed["joint_state"], observed["gripper_state"]))
-        self.scenes.append(self.env.get_state_dict())
+        self.scenes = self.scenes or Snapshots(self.env)  # of the scene as its episode begins
+        self.scenes.take()
         self.video += in_video
+
+    def put_back(self, frame: int) -> None:
+        """Make the scene stand as it did in a frame."""
+        assert self.scenes is not None
+        self.scenes.put_back(frame)
 
 
 def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
@@ -246,12 +254,6 @@ def _shown(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
     for text in texts:
         found.append(online_subgoal(text, kind) or (found[-1] if found else ""))
     return found
-
-
-def _put_back(env: "Task", scene: Any) -> None:
-    env.set_state_dict(scene)
-    for thing in env.things:
-        thing.show()
 
 
 def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:

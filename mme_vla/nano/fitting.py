@@ -111,7 +111,8 @@ def prepared(
     processor = policy.require_processor()
     if held_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        return Decisions.load(learnt_file, learning["often"], learning["noise"]), Decisions.load(held_file)
+        size = {name: learning[name] for name in ("often", "noise", "blur")}
+        return Decisions.load(learnt_file, **size), Decisions.load(held_file)
     learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
     processor.stats = statistics((Demonstration.load(file, pictures=False) for file in learnt), policy)
     processor.stats.save(stats_file)

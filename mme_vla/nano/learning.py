@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -64,15 +65,17 @@ class SparseHistory(History):
 class Decisions(Dataset[int]):
     """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
 
-    batch: every decision; the tokens of the current pictures (`Batch.view_tokens`) stand in place of the pictures.
+    batch: every decision, or every so many where the robot executes more motions of a chunk than one; the tokens of
+        the current pictures (`Batch.view_tokens`) stand in place of the pictures.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
         an item `often` times.
-    noise: spread of what is added whenever a decision is learned, so that no episode is known by its last digits: to
-        each joint (radians; `JOINT_NOISE` of it) and to each number of a token.
+    noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
+        to each number of a token and, `JOINT_NOISE` of it, to each joint (radians).
+    blur: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
     """
 
-    def __init__(self, batch: Batch, far: Tensor, often: int = 1, noise: float = 0.0) -> None:
-        self.batch, self.far, self.noise = batch, far, noise
+    def __init__(self, batch: Batch, far: Tensor, often: int = 1, noise: float = 0.0, blur: float = 0.0) -> None:
+        self.batch, self.far, self.noise, self.blur = batch, far, noise, blur
         self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(far, often, 1))
 
     @classmethod
@@ -83,13 +86,14 @@ class Decisions(Dataset[int]):
         often: int = 1,
         elsewhere: float = ELSEWHERE,
         noise: float = 0.0,
+        blur: float = 0.0,
     ) -> "Decisions":
         """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
             often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
-                is elsewhere. noise: see the class.
+                is elsewhere. noise, blur: see the class.
 
         Raises:
             UserError: there is no decision, or a frame that the memory remembers was not drawn.
@@ -98,13 +102,13 @@ class Decisions(Dataset[int]):
         far: list[np.ndarray] = []
         for found in demonstrations:
             items += _items(policy, found)
-            far.append(_far(found.motions.targets, elsewhere))
+            far.append(_far(found.motions.targets, elsewhere)[:: policy.embodiment.action.execute])
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often, noise)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(far)), often, noise, blur)
 
     @classmethod
-    def load(cls, path: Path, often: int = 1, noise: float = 0.0) -> "Decisions":
+    def load(cls, path: Path, often: int = 1, noise: float = 0.0, blur: float = 0.0) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
@@ -112,7 +116,7 @@ class Decisions(Dataset[int]):
         far = found.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in found.items() if name.startswith(_PAST)}
         now: dict[str, Any] = {name: value for name, value in found.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often, noise)
+        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), far, often, noise, blur)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
@@ -136,23 +140,30 @@ class Decisions(Dataset[int]):
         """The batch of these decisions."""
         chosen = torch.as_tensor(list(rows))
         batch = self.batch.rows(chosen)
-        return self._noisy(batch) if self.noise else batch
+        return self._noisy(batch, rows) if self.noise or self.blur else batch
 
-    def _noisy(self, batch: Batch) -> Batch:
+    def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
+        generator = torch.Generator().manual_seed(hash(tuple(rows)))  # of numbers alone, so the same everywhere
 
-        def moved(values: Tensor, spread: float) -> Tensor:
-            return values + spread * torch.randn(values.shape)
+        def moved(values: Tensor, size: float | Tensor) -> Tensor:
+            return (values + size * torch.randn(values.shape, generator=generator)).to(values.dtype)
 
         assert batch.state is not None and batch.view_tokens is not None
+        size = {name: self.noise + self.blur * spread for name, spread in self._spread.items()}
         joints = moved(batch.state[:, :-1], JOINT_NOISE * self.noise)  # the last number is the gripper's, centimetres
-        batch = replace(
-            batch,
-            state=torch.cat([joints, batch.state[:, -1:]], 1),
-            view_tokens=moved(batch.view_tokens, self.noise),
-        )
+        state = torch.cat([joints, batch.state[:, -1:]], 1)
+        batch = replace(batch, state=state, view_tokens=moved(batch.view_tokens, size["views"]))
         if batch.history is None:
             return batch
-        return replace(batch, history=replace(batch.history, features=moved(batch.history.features, self.noise)))
+        return replace(batch, history=replace(batch.history, features=moved(batch.history.features, size["past"])))
+
+    @cached_property
+    def _spread(self) -> dict[str, Tensor]:
+        """The standard deviation of each number of a token, of the present pictures and of those remembered."""
+        found = {"views": self.batch.view_tokens, "past": None}
+        if self.batch.history is not None:
+            found["past"] = self.batch.history.features[self.batch.history.mask]
+        return {name: t.float().flatten(0, -2).std(0) for name, t in found.items() if t is not None}
 
 
 def _far(targets: np.ndarray, elsewhere: float) -> np.ndarray:
@@ -197,12 +208,12 @@ def _widened(stats: QuantileStats) -> QuantileStats:
 @torch.no_grad()
 def _items(policy: MMEPolicy, found: Demonstration) -> list[dict[str, Any]]:
     processor, cameras = policy.require_processor(), policy.embodiment.camera_names
-    decisions = [int(frame) for frame in found.motions.decisions]
+    decisions = [int(frame) for frame in found.motions.decisions[:: policy.embodiment.action.execute]]
     views = processor.images([np.stack([found.pictures[name][frame] for frame in decisions]) for name in cameras])
     flat = views.flatten(0, 1).float() / 255 * 2 - 1
     view_tokens = policy.backbone.encode_images(flat).unflatten(0, (len(decisions), -1))
     history = _history(policy, found)
-    subgoals = _subgoals(policy, found)
+    subgoals = _subgoals(policy, found)[:: policy.embodiment.action.execute]
     items = []
     for place, frame in enumerate(decisions):
         state = found.states[frame]
@@ -223,7 +234,8 @@ def _history(policy: MMEPolicy, found: Demonstration) -> History | None:
     if policy.memory is None:
         return None
     drawn = found.pictures[policy.embodiment.memory_camera]
-    read = policy.frames_read(found.motions.decisions, found.exec_start).tolist()
+    asked = found.motions.decisions[:: policy.embodiment.action.execute]
+    read = policy.frames_read(asked, found.exec_start).tolist()
     taken = {frame: drawn[frame] for frame in read if frame in drawn} or drawn
     tokens = policy.encode_frames(np.stack(list(taken.values())))
     history = SparseHistory(

@@ -34,6 +34,7 @@ class FrameChoice:
         episode's first stored frame.
     memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames, and
         so does the other where the memory gives a backbone past views.
+    every: of the decisions, every so many, for a policy that executes so many motions before it is asked again.
 
     Raises:
         UserError: `at` is none of these.
@@ -41,6 +42,7 @@ class FrameChoice:
 
     at: str | int | Sequence[int | str]
     memory: Mapping[str, Any] | None = None
+    every: int = 1
 
     def __post_init__(self) -> None:
         if isinstance(self.at, bool) or (isinstance(self.at, int) and self.at < 1):
@@ -82,7 +84,7 @@ class FrameChoice:
         if isinstance(self.at, int):
             return list(range(video, len(steps), self.at))
         if self.at == DECISIONS:
-            found: list[int] = motions_of(steps).decisions.tolist()
+            found: list[int] = motions_of(steps).decisions[:: self.every].tolist()
             return found
         if self.at == CHOICES:
             chosen: list[int] = choices_of(steps).decisions.tolist()
