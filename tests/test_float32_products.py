@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mme_vla import UserError
-from mme_vla.backbone.layers.precision import float32_products
+from mme_vla.config.devices import float32_products
 from mme_vla.testing.small import random_batch, small_policy
 
 SWITCH = torch.backends.cuda.matmul

@@ -13,7 +13,8 @@ def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
     from mme_vla.envs.make import make_env
     from mme_vla.envs.recording.frames import FrameChoice
 
-    made = record("PatternLock", 3_000_001, "easy", [FrameChoice(list(range(0, 200, 7)))], ["front"])
+    remembered = {"name": "framesamp", "budget": 16, "grid": 1, "every": 7}
+    made = record("PatternLock", 3_000_001, "easy", [FrameChoice("decisions", remembered)], ["front"])
     assert made is not None
     env = make_env("PatternLock", seed=3_000_001, difficulty="easy", action_space="waypoint")
     try:

@@ -1,11 +1,20 @@
-"""The device that a command line names."""
+"""The device that a command line names, and how it multiplies.
 
+What stays in float32 is computed as it is anywhere (`ieee`), unless `policy.float32_products=tf32` lets a GPU's tensor
+cores round what goes into the products of recurrent memories. Nothing else is touched: no switch of PyTorch's is left
+other than it was.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
     import torch
+
+FLOAT32_PRODUCTS = ("ieee", "tf32")
 
 
 def find_device(name: str) -> "torch.device":
@@ -26,3 +35,35 @@ def find_device(name: str) -> "torch.device":
     if device.type == "cuda" and (device.index or 0) >= gpus:
         raise UserError(f"device={name}: PyTorch sees {gpus} GPUs here, counted from 0; use one of them, or cpu.")
     return device
+
+
+def checked_products(how: str) -> str:
+    """`how`, once it is one of `FLOAT32_PRODUCTS`.
+
+    Raises:
+        UserError: it is not.
+    """
+    if how not in FLOAT32_PRODUCTS:
+        raise UserError(
+            f"policy.float32_products={how!r}: choose ieee (exact products) or tf32 (their inputs keep ten bits on a "
+            f"GPU). {did_you_mean(str(how), FLOAT32_PRODUCTS)}"
+        )
+    return how
+
+
+@contextmanager
+def float32_products(how: str) -> Iterator[None]:
+    """Inside, float32 matrix products of a GPU are `ieee` or `tf32`; behind it they are what they were before.
+
+    `tf32` keeps ten bits of what goes into a product and adds up in float32: numbers that came from bfloat16, which has
+    seven, lose nothing. The switch is the process's: no other thread should be computing on the GPU in float32.
+    """
+    import torch
+
+    switch = torch.backends.cuda.matmul
+    before = switch.fp32_precision
+    switch.fp32_precision = how
+    try:
+        yield
+    finally:
+        switch.fp32_precision = before

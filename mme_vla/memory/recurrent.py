@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from mme_vla.backbone.layers.precision import float32_products
+from mme_vla.config.devices import float32_products
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory, every_one, token_positions, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder

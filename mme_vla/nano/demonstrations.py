@@ -159,9 +159,9 @@ def record(
             motions = _carry_out(taken, motions.targets, chooser)
         if motions is None:
             return None
-        asked = [motions.decisions[:: choice.every] for choice in choices]
+        asked = [motions.decisions[:: choice.every] for choice in choices] or [motions.decisions]
         at = {frame for frames in asked for frame in frames.tolist()}
-        read = at.union(*(choice.read(at, taken.video) for choice, at in zip(choices, asked, strict=True)))
+        read = at.union(*(choice.read(frames, taken.video) for choice, frames in zip(choices, asked, strict=False)))
         wanted = {camera: read if camera == "front" else at for camera in cameras}
         pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*wanted.values())):

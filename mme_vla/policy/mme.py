@@ -13,10 +13,10 @@ from torch import Tensor
 import mme_vla.integration
 import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
-from mme_vla.backbone.layers.precision import checked_products
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shape import read_backbone
 from mme_vla.backbone.shard_groups import ShardGroup
+from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
 from mme_vla.integration.base import Integration, doors_of
