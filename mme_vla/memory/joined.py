@@ -111,7 +111,7 @@ class JoinedMemory(Memory):
         fixed = [self.memories[i].capacity for i in self._order[1:]]
         lengths = [history.mask.shape[1] - sum(fixed), *fixed]
         pieces = zip(*(getattr(history, name).split(lengths, 1) for name in _FIELDS), strict=True)
-        return [(i, HistoryTokens(*each, step=history.step)) for i, each in zip(self._order, pieces, strict=True)]
+        return [(i, HistoryTokens(f, p, m, history.step)) for i, (f, p, m) in zip(self._order, pieces, strict=True)]
 
     def start_stream(self) -> tuple[Any, ...]:
         return tuple(member.start_stream() for member in self.memories)
