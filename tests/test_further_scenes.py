@@ -24,8 +24,8 @@ def test_they_go_on_where_the_rule_of_the_test_split_ends() -> None:
 
 @pytest.mark.parametrize("level", ["easy", "medium", "hard"])
 def test_those_of_one_difficulty_are_picked_from_the_same_rule_in_its_order(level: str) -> None:
-    rule = [metadata.formula("MoveCube", "test", n) for n in range(50, 900)]
-    wanted = [seed for seed, difficulty in rule if difficulty == level][:200]
+    rule = [metadata.formula("MoveCube", "test", n) for n in range(50, 1650)]
+    wanted = [seed for seed, difficulty in rule if difficulty == level][:400]
     found = metadata.episodes("MoveCube", f"further_{level}")
     assert [spec.seed for spec in found] == wanted and {spec.difficulty for spec in found} == {level}
 

@@ -28,7 +28,7 @@ MORE = "more"
 FURTHER, FURTHER_EPISODES = "further", 100
 """Episodes that go on where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
 _CYCLE = ("easy", "easy", "medium", "hard")
-FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 200 for level in ("easy", "medium", "hard")}
+FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
 """Episodes a task has in each of these; `further_hard` are the hard ones as the same rule goes on, and so forth."""
 _COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS}
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
@@ -83,7 +83,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
         split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`,
             900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
             gives after its own 50 (number 0 is what number 50 would be; no seed was raised), or `further_easy`,
-            `further_medium`, `further_hard`, 200 of one difficulty by the same rule.
+            `further_medium`, `further_hard`, 400 of one difficulty by the same rule.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
 
