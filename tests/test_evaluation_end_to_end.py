@@ -72,7 +72,7 @@ def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(
 
     words = ("evaluate", f"checkpoint={trained}", *EPISODES, f"output={tmp_path / 'killed'}")
     with started(*words, TWO) as process:
-        until = time.monotonic() + 200
+        until = time.monotonic() + 400
         while len(finished := lines(tmp_path / "killed")) < 2:
             assert process.poll() is None and time.monotonic() < until
             time.sleep(0.05)

@@ -154,12 +154,8 @@ class RecurrentMemory(Memory):
         # Statistics are wanted of one update in many: not worth compiling for.
         compiled = None if self.reporting else self._compiled
         advance = self.layer.advance if compiled is None else partial(compiled, self.layer)
-        how = self.float32_products
-
-        def step(*inputs: Any) -> tuple[State, Statistics]:
-            with float32_products(how):  # here, where the backward pass computes the chunk again
-                return advance(*inputs)
-
+        # Within the step, which the backward pass computes again; a graph has no place for a switch of the process.
+        step = advance if torch.compiler.is_compiling() else partial(_multiplying, self.float32_products, advance)
         window = self.layer.window
         start = self.init_state(len(x))
         # All chunks are laid out alike, whatever the window's length: they share one code.
@@ -299,3 +295,8 @@ def layer_norm(norm: nn.LayerNorm, x: Tensor) -> Tensor:
 def default_hidden(d_vision: int, hidden: int | None) -> int:
     """A quarter of the vision width, at least 64: 512 at full size, as released."""
     return hidden or max(64, d_vision // 4)
+
+
+def _multiplying(how: str, advance: Callable[..., Any], *inputs: Any) -> tuple[State, Statistics]:
+    with float32_products(how):
+        return advance(*inputs)
