@@ -29,16 +29,25 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
     assert set(made.motions.decisions.tolist()) == set(made.pictures["front"])
 
 
-def test_the_counting_row_is_of_a_hundred_scenes_of_one_difficulty() -> None:
-    config = compose("nano", ["nano=SwingXtimes", "task=SwingXtimes"])
-    chosen = choose_episodes("SwingXtimes", list(config.episodes), config.split)
-    assert len({spec.seed for spec in chosen}) == 100 and {spec.difficulty for spec in chosen} == {"easy"}
+@pytest.mark.parametrize(("task", "level"), [("SwingXtimes", "easy"), ("VideoRepick", "hard")])
+def test_a_row_by_choices_is_of_a_hundred_scenes_of_one_difficulty(task: str, level: str) -> None:
+    config = compose("nano", [f"nano={task}", f"task={task}"])
+    chosen = choose_episodes(task, list(config.episodes), config.split)
+    assert len({spec.seed for spec in chosen}) == 100 and {spec.difficulty for spec in chosen} == {level}
 
 
-@pytest.mark.parametrize("model", ["framesamp_modul", "pi05"])
-def test_the_counting_rows_figures_follow_from_the_records(model: str) -> None:
-    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / "SwingXtimes" / model]))
+@pytest.mark.parametrize(
+    ("task", "model"),
+    [
+        ("SwingXtimes", "framesamp_modul"),
+        ("SwingXtimes", "pi05"),
+        ("VideoRepick", "actions_modul"),
+        ("VideoRepick", "pi05"),
+    ],
+)
+def test_the_figures_of_rows_by_choices_follow_from_the_records(task: str, model: str) -> None:
+    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / task / model]))
     page = (REPOSITORY / "docs" / "nano.md").read_text()
-    (row,) = [line for line in page.splitlines() if f"choices | `{model}`" in line]
+    (row,) = [line for line in page.splitlines() if line.startswith(f"| {task}, ") and f"choices | `{model}`" in line]
     done = sum(record.success for record in records)
     assert f"| {len(records)} |" in row and f"{100 * done / len(records):.0f} % (" in row
