@@ -11,6 +11,7 @@ shipped (eager). Needs the extra `vlm` (LeRobot's policy is built on transformer
 import argparse
 import time as time_of
 from collections.abc import Callable
+from unittest.mock import patch
 
 import torch
 from timing import alternate, machine
@@ -65,10 +66,13 @@ def lerobot_pi05(dtype: str, reduced: bool = True) -> nn.Module:
         config.vocab_size = SIZES["vocab_size"]
         return expert_class(config=config)
 
-    theirs.get_gemma_config = sizes_of
-    theirs.PaliGemmaForConditionalGenerationWithPiGemma = reduced_vlm
-    theirs.PiGemmaForCausalLM = reduced_expert
-    return theirs.PI05Pytorch(config)
+    reduced_parts = {
+        "get_gemma_config": sizes_of,
+        "PaliGemmaForConditionalGenerationWithPiGemma": reduced_vlm,
+        "PiGemmaForCausalLM": reduced_expert,
+    }
+    with patch.multiple(theirs, **reduced_parts):
+        return theirs.PI05Pytorch(config)
 
 
 def our_pi05(dtype: str) -> nn.Module:
