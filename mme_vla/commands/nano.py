@@ -17,7 +17,7 @@ from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json, write_json
 
 if TYPE_CHECKING:
-    from mme_vla.embodiment.actions import ActionSpace
+    from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.evaluation.records import EpisodeRecord
     from mme_vla.nano.demonstrations import Scene
@@ -87,7 +87,7 @@ def run(config: Mapping[str, Any]) -> Path:
         robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
         asked = robot.action.execute
         choices = [FrameChoice(DECISIONS, memory, asked) for memory in [None, *filter(None, memories)]]
-        files = record_all(config, folder / "demonstrations", choices, robot.action)
+        files = record_all(config, folder / "demonstrations", choices, robot)
     if config["record_only"]:
         return folder / "demonstrations"
     records: dict[str, list[EpisodeRecord]] = {}
@@ -151,28 +151,28 @@ def check_counts(counts: Any) -> None:
 
 
 def record_all(
-    config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", acts: "ActionSpace"
+    config: Mapping[str, Any], folder: Path, choices: "Sequence[FrameChoice]", robot: "Embodiment"
 ) -> list[Path]:
     """Demonstrate until there are as many as wanted, each in a file of its own; the files in their order.
 
     Args:
-        choices: what the memories that will train on them read. acts: of the robot that does.
+        choices: what the memories that will train on them read. robot: the one that does.
 
     Raises:
         UserError: scene after scene without a demonstration that succeeds.
     """
     from mme_vla.data.progress import progress
-    from mme_vla.embodiment.robomme import CAMERAS
     from mme_vla.nano.demonstrations import Scene
 
     folder.mkdir(parents=True, exist_ok=True)
-    cameras = tuple(name for name in CAMERAS if name == "front" or "front" not in config["embodiment"])
+    cameras = tuple(robot.camera_names)
     counts: dict[str, int] = config["demonstrations"]
     files: list[Path] = []
     with progress("record", sum(counts.values()), unit="demonstrations") as advance:
         for number, (level, wanted) in enumerate(counts.items()):
             first = int(config["first_seed"]) + number * SEEDS_APART
-            scene = Scene(config["task"], first, level, folder, cameras, tuple(choices), config["carried_out"], acts)
+            how = (cameras, tuple(choices), config["carried_out"], robot.action)
+            scene = Scene(config["task"], first, level, folder, *how)
             scenes = (replace(scene, seed=seed) for seed in count(first))
             files += demonstrate(scenes, wanted, config["workers"], advance)
     return files
