@@ -8,8 +8,6 @@ the recurrent memories, and a selection of stored tokens stands for what an epis
 sees the same bank as acting.
 """
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from torch import nn
@@ -17,16 +15,16 @@ from torch import nn
 from mme_vla.errors import UserError
 from mme_vla.memory.attending import by_frame
 from mme_vla.memory.bank import MemoryBank
-from mme_vla.memory.base import Memory, every_one, whole_frames
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.memory.sampling import recurrent_frames
+from mme_vla.memory.whole import WholeFrames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("bank")
-class Banked(Memory):
+class Banked(WholeFrames):
     """grid×grid tokens of the current frame, each fused with what the bank answers to it."""
 
     pad_left = True
@@ -79,15 +77,6 @@ class Banked(Memory):
     def chosen(self, step: int, exec_start: int) -> np.ndarray:
         """The moments at `step`, the last of them `step` itself."""
         return recurrent_frames(step, exec_start, self.moments, self.video, self.stride)
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([self.chosen(int(step), exec_start) for step in steps])
-
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.chosen(step, history.exec_start), self.storage.grid)
-
-    def padded_length(self, count: int) -> int:
-        return count
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2

@@ -7,7 +7,6 @@ alone. There the gists are keys and values inside a video model; here they are m
 layers, the spacing of frames, and that an episode with more frames than the budget holds keeps evenly spaced ones.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -16,18 +15,18 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError
 from mme_vla.memory.attending import ReadingBlock, by_frame, heads_of, not_later, rows_at
-from mme_vla.memory.base import Memory, every_one, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.framesamp import evenly_spaced_frames
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.memory.sampling import recurrent_frames
+from mme_vla.memory.whole import WholeFrames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("gist")
-class Gist(Memory):
+class Gist(WholeFrames):
     """[anchors, whole | gists of the frames between | recent frames, whole], in the order of time."""
 
     pad_left = True
@@ -96,15 +95,6 @@ class Gist(Memory):
         if len(between) > self.between:
             between = between[evenly_spaced_frames(len(between) - 1, self.between)]
         return np.concatenate([first, between, last])
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([self.chosen(int(step), exec_start) for step in steps])
-
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.chosen(step, history.exec_start), self.storage.grid)
-
-    def padded_length(self, count: int) -> int:
-        return count
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2

@@ -8,7 +8,6 @@ time-contrastive stage; and the encoder's answers of all steps are handed over, 
 integration may look at a moment at its time. The paper looks back four steps; this memory as far as its budget goes.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,17 +16,17 @@ from torch import Tensor, nn
 
 from mme_vla.errors import UserError
 from mme_vla.memory.attending import ReadingBlock, by_frame, heads_of, not_later
-from mme_vla.memory.base import Memory, every_one, whole_frames
 from mme_vla.memory.encoder import FeatureEncoder
-from mme_vla.memory.history import History, StorageSpec
+from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.memory.sampling import recurrent_frames
+from mme_vla.memory.whole import WholeFrames
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("moment")
-class Moment(Memory):
+class Moment(WholeFrames):
     """`moments` tokens of each of budget / moments frames, every token knowing the frames before its own."""
 
     pad_left = True
@@ -81,15 +80,6 @@ class Moment(Memory):
     def chosen(self, step: int, exec_start: int) -> np.ndarray:
         """The frames read at `step`, the last of them `step`."""
         return recurrent_frames(step, exec_start, self.steps, max(5 * self.steps // 8, 1), self.stride)
-
-    def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([self.chosen(int(step), exec_start) for step in steps])
-
-    def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.chosen(step, history.exec_start), self.storage.grid)
-
-    def padded_length(self, count: int) -> int:
-        return count
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         patches = self.storage.grid**2
