@@ -30,7 +30,8 @@ def written(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
 
 
 def equal(one: Policy, other: Policy) -> bool:
-    return all(torch.equal(x, other.state_dict()[name]) for name, x in one.state_dict().items())
+    theirs = other.state_dict()
+    return all(torch.equal(value, theirs[name]) for name, value in one.state_dict().items())
 
 
 def test_a_run_is_written_in_the_published_names_and_read_again(tmp_path: Path) -> None:
@@ -80,9 +81,10 @@ def test_a_run_that_holds_its_adapters_alone_is_read_beside_its_base(tmp_path: P
     (run / "lora_adapter" / "adapter_config.json").write_text(json.dumps(said))
     merge_adapters(policy)
     read = load_weights(built(seed=2), run, base=base)
-    for name, tensor in policy.state_dict().items():
-        torch.testing.assert_close(read.state_dict()[name], tensor, msg=name)
-    assert sum(not torch.equal(t, built().state_dict()[n]) for n, t in read.state_dict().items()) == len(adapters) // 2
+    merged, found, fresh = policy.state_dict(), read.state_dict(), built().state_dict()
+    for name, tensor in merged.items():
+        torch.testing.assert_close(found[name], tensor, msg=name)
+    assert sum(not torch.equal(tensor, fresh[name]) for name, tensor in found.items()) == len(adapters) // 2
     with pytest.raises(UserError, match=r"adapters apart .*openvla/openvla-7b.*base="):
         load_weights(built(seed=2), run)
     with pytest.raises(UserError, match="leave it out"):

@@ -107,8 +107,11 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
     from matplotlib.figure import Figure
 
     rows = -(-result.space.width // 2)
-    figure = Figure(figsize=(13, 2.4 * rows), layout="constrained")
+    height = 2.4 * rows + 1.1
+    figure = Figure(figsize=(13, height))
     FigureCanvasAgg(figure)
+    # Margins in inches: laying them out by the texts' extents would draw everything twice.
+    figure.subplots_adjust(0.06, 0.75 / height, 0.99, 1 - 0.7 / height, wspace=0.14, hspace=0.25)
     panels = figure.subplots(rows, 2, sharex=True, squeeze=False).flatten()
     errors, scaled = result.error(), result.error() / result.scale
     time = result.steps[:, None] + np.arange(result.recorded.shape[1])
@@ -127,8 +130,10 @@ def plot_open_loop(result: OpenLoop, path: Path, name: str) -> None:
         panel.margins(x=0.01)
     for panel in panels[-2:]:
         panel.set_xlabel("step of the episode; a dot marks where a chunk was predicted", fontsize=9)
-    figure.suptitle(f"{name}, open loop on {result.title}", x=0.01, ha="left", fontsize=12)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower right", ncols=2, frameon=False)
+    figure.suptitle(
+        f"{name}, open loop on {result.title}", x=0.01, y=1 - 0.1 / height, ha="left", va="top", fontsize=12
+    )
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="lower right", ncols=2, frameon=False)
     figure.savefig(path, dpi=110)
 
 
