@@ -1,5 +1,6 @@
 """Names and paths that a stranger's file gives: used only where they stay in its folder."""
 
+import os
 import re
 from pathlib import Path
 
@@ -55,3 +56,8 @@ def safe_name(name: str, what: str = "name") -> str:
             "beginning with a letter or digit."
         )
     return name
+
+
+def user_cache(kind: str) -> Path:
+    """Where what can be made again is kept for this user: a folder in $MME_VLA_CACHE, else in ~/.cache/mme_vla."""
+    return Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / kind

@@ -6,7 +6,6 @@ stands in its `fingerprint.json`, and a folder whose fingerprint is not the expe
 never replaced unless asked to.
 """
 
-import os
 import re
 from collections import OrderedDict
 from hashlib import sha256
@@ -18,7 +17,7 @@ import numpy as np
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError, brief
-from mme_vla.files import Sums, decoding, files_to_hold, read_json, require_file
+from mme_vla.files import Sums, decoding, files_to_hold, read_json, require_file, user_cache
 from mme_vla.memory.history import CachedHistory, FrameScores, StorageSpec
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ class CacheMissingError(UserError):
 
 def default_cache_root() -> Path:
     """Where caches go unless told otherwise: $MME_VLA_CACHE, else ~/.cache/mme_vla."""
-    return Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / "vision"
+    return user_cache("vision")
 
 
 def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: str = "bfloat16") -> dict[str, Any]:

@@ -21,6 +21,7 @@ from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 from mani_skill.sensors.camera import CameraConfig
 
 from mme_vla.envs.meshes import CELL, coarsen, read_stl, stl_bytes
+from mme_vla.files import user_cache
 
 WRISTCAM = "mme_vla_panda_wristcam"
 """Agent id of the Panda with gripper and wrist camera."""
@@ -86,7 +87,7 @@ def description(stock: str, mount_from: str | None = None, visible: bool = True)
     for link in robot.iter("link"):
         for visual in [] if visible else link.findall("visual"):
             link.remove(visual)
-    caches = Path(os.environ.get("MME_VLA_CACHE", Path.home() / ".cache" / "mme_vla")) / "robots"
+    caches = user_cache("robots")
     for mesh in robot.iter("mesh"):
         mesh.set("filename", str(source.parent / mesh.attrib["filename"]))
     for mesh in robot.iterfind("link/visual/geometry/mesh"):

@@ -15,6 +15,7 @@ from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.rendering import keep_renderer
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.shaders import lean_shaders
 
 RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
 """Joint angles at the start of every episode, and the target of the reset action; radians."""
@@ -34,6 +35,8 @@ class Stage(BaseEnv):
     """The robot holds a stick instead of a gripper."""
     spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
     """From where, and to where, the camera for people looks; no policy sees its pictures."""
+
+    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the cameras' settings that were asked for
 
     def __init__(
         self,
@@ -73,6 +76,15 @@ class Stage(BaseEnv):
         super()._setup_scene()
         if self.scene.can_render():
             keep_renderer(self._render_device)
+
+    def _setup_sensors(self, options: dict) -> None:
+        asked = self._custom_sensor_configs
+        lit_by_lamps = self.scene.sub_scenes[0].render_system.cubemap is None
+        if not asked and lit_by_lamps and self._render_device.is_cpu():
+            lean = lean_shaders()
+            self._custom_sensor_configs = {} if lean is None else {"shader_config": lean}
+        super()._setup_sensors(options)
+        self._custom_sensor_configs = asked
 
     def set_up(self) -> None:
         """Put up the table, with nothing on it."""
