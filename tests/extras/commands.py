@@ -18,6 +18,12 @@ from contextlib import redirect_stderr
 
 import sitecustomize
 
+SLOW = (
+    "torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "mme_vla.policy.mme",
+    "mme_vla.training.loop",
+)  # fmt: skip
+"""What most commands import, without any extra; not Hydra, which looks for its plugins as it is imported."""
+
 
 def child(words: list[str], hidden: list[str], printed: int) -> None:
     """Be the command; never returns."""
@@ -62,6 +68,6 @@ def run(words: list[str], hidden: list[str], wait: str) -> tuple[int, str]:
 if __name__ == "__main__":
     asked = json.load(sys.stdin)
     with redirect_stderr(io.StringIO()):
-        for slow in ("torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot"):
+        for slow in SLOW:
             importlib.import_module(slow)
     print(json.dumps([run(*command) for command in asked]))
