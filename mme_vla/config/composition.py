@@ -93,17 +93,17 @@ def compose(
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     words = tuple(several_memories(overrides))
-    if _fixed(trees) and not any("searchpath" in word for word in words):  # which names further trees
+    if _fixed(trees, words):
         return pickle.loads(_composed_once(config_name, words, trees))
     return _composed(config_name, words, trees)
 
 
-def _fixed(trees: Sequence[Path]) -> bool:
-    """Whether only the library's own files are read.
+def _fixed(trees: Sequence[Path], words: Sequence[str]) -> bool:
+    """Whether only the library's own files are read; these words may name further trees.
 
     They do not change while a process runs; a user's may, between two cells of a notebook.
     """
-    return tuple(trees) == (config_dir().resolve(),)
+    return tuple(trees) == (config_dir().resolve(),) and not any("searchpath" in word for word in words)
 
 
 @functools.lru_cache(maxsize=512)
@@ -118,7 +118,8 @@ def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, .
         if not folder.is_dir():
             raise UserError(f"The config folder {str(folder)!r} does not exist.")
     with _own_hydra(directory, extra_dirs) as engine:
-        tree = ConfigTree(engine.config_loader, config_name, _parse(overrides))
+        fixed = _fixed(trees, overrides)
+        tree = ConfigTree(engine.config_loader, config_name, _parse(overrides), fixed)
         try:
             cfg = join_memories(hydra.compose(config_name, list(overrides)))
         except COMPOSITION_ERRORS as error:
@@ -161,7 +162,7 @@ def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> st
     theirs = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
 
     def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        return (_cached_sections if _fixed(searched) else _composed_sections)(config_name, words, searched)
+        return (_cached_sections if _fixed(searched, words) else _composed_sections)(config_name, words, searched)
 
     def parts() -> Sections | None:
         chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from functools import cache
 from typing import Any
 
 import hydra
@@ -20,17 +21,25 @@ _BAD_KEY = re.compile(r"Could not override '(.+)'\.\n|Could not delete from conf
 
 
 class ConfigTree:
-    """The tree under the user's choices of groups, before any of their values. Needs an initialised Hydra."""
+    """The tree under the user's choices of groups, before any of their values. Needs an initialised Hydra.
 
-    def __init__(self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override]) -> None:
+    Args:
+        fixed: only the library's own files are read, which do not change: what they compose to is remembered.
+    """
+
+    def __init__(
+        self, loader: ConfigLoader, config_name: str, overrides: Sequence[Override], fixed: bool = False
+    ) -> None:
         self.loader = loader
         self.config_name = config_name
+        self.fixed = fixed
         self.choices = [o for o in overrides if loader.get_group_options(o.key_or_group)]
         self.values = [o for o in overrides if o not in self.choices]
 
     def defaults(self) -> Any:
         """Compose with the group choices alone, as plain containers."""
-        return OmegaConf.to_container(hydra.compose(self.config_name, [str(o.input_line) for o in self.choices]))
+        words = tuple(str(choice.input_line) for choice in self.choices)
+        return (_remembered if self.fixed else _plain)(self.config_name, words)
 
     def explain(self, error: Exception) -> str:
         """Say what was misspelt, with the near names; Hydra's own words where nothing was."""
@@ -75,6 +84,13 @@ class ConfigTree:
             expected = _expected(default, given)
             if expected and not override.is_delete():
                 raise UserError(f"{override.input_line!r} does not fit: {override.key_or_group!r} is {expected}.")
+
+
+def _plain(config_name: str, words: tuple[str, ...]) -> Any:
+    return OmegaConf.to_container(hydra.compose(config_name, list(words)))
+
+
+_remembered = cache(_plain)
 
 
 def _expected(default: Any, given: Any) -> str:
