@@ -15,7 +15,7 @@ TOWERS = [f"backbone.vision.{tower}.{size}" for tower in ("dino", "siglip") for 
     "width=8", "depth=2", "mlp_dim=16", "num_heads=1")]  # fmt: skip
 SHORT = [
     *TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32", "logger=none",
-    "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=2", "train.open_loop_chunks=1",
+    "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=2", "train.open_loop_chunks=0",
     "train.ema=0.5",
 ]  # fmt: skip
 

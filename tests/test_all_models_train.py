@@ -20,7 +20,7 @@ from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
 from mme_vla.training import data as training_data
 from mme_vla.training.logging import read_metrics
 
-STEPS, WINDOW = 50, 10
+STEPS, WINDOW = 30, 6
 SMALL = [
     "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1",
     "backbone.vision.width=16", "backbone.vision.mlp_dim=16", "policy.augment=false", "logger=none",
