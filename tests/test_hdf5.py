@@ -70,6 +70,13 @@ def test_what_is_no_demonstration_file_is_refused(tmp_path: Path) -> None:
         find_files([tmp_path / "missing"])
 
 
+def test_a_folder_that_is_a_dataset_already_is_called_so(tmp_path: Path) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text("{}")
+    with pytest.raises(UserError, match=r"LeRobot dataset already.*hdf5="):
+        find_files([tmp_path])
+
+
 def test_official_files_are_read(h5_folder: Path) -> None:
     found = {}
     for ref in list_episodes(find_files([h5_folder])):

@@ -22,7 +22,13 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
     for entry in map(Path, inputs):
         found = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
         if not found or not all(path.is_file() for path in found):
-            raise UserError(f"No HDF5 file at {str(entry)!r}: give record_dataset_<Task>.h5 files or their folder.")
+            advice = "give record_dataset_<Task>.h5 files or their folder."
+            if (entry / "meta" / "info.json").is_file():
+                advice = (
+                    "it is a LeRobot dataset already, which data.sources names as it is. What conversion keeps besides, "
+                    "such as keyframes, needs the HDF5 files: `python -m mme_vla.envs.record` writes them with hdf5=…"
+                )
+            raise UserError(f"No HDF5 file at {str(entry)!r}: {advice}")
         files.update(found)
     return sorted(files, key=lambda path: (path.name, str(path)))
 
