@@ -25,7 +25,7 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
             advice = "give record_dataset_<Task>.h5 files or their folder."
             if (entry / "meta" / "info.json").is_file():
                 advice = (
-                    "it is a LeRobot dataset already, which data.sources names as it is. What conversion keeps besides, "
+                    "it is a LeRobot dataset already, named by data.sources as it is. What conversion keeps besides, "
                     "such as keyframes, needs the HDF5 files: `python -m mme_vla.envs.record` writes them with hdf5=…"
                 )
             raise UserError(f"No HDF5 file at {str(entry)!r}: {advice}")
