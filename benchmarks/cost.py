@@ -7,7 +7,6 @@ them as well.
 """
 
 import argparse
-import resource
 import subprocess
 import sys
 
@@ -20,9 +19,10 @@ from mme_vla.config.composition import compose
 from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS, NEURAL, random_batch
+from mme_vla.training.console import resident_gib
 from mme_vla.types import Batch
 
-TERA, MIB = 1e12, 2**20
+TERA = 1e12
 BUDGETS = (64, 128, 256, 512, 1024)
 OF_BUDGETS = ("framesamp_modul", "tokendrop_expert")
 
@@ -91,7 +91,7 @@ def measure_time(models: list[str], batch: int, rounds: int) -> None:
 
 def peak_mib() -> float:
     """Most resident memory this process has had."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / MIB
+    return resident_gib() * 1024
 
 
 def peaks_of(model: str, batch: int) -> None:

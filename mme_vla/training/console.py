@@ -3,6 +3,8 @@
 import resource
 import sys
 from collections.abc import Mapping
+from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
@@ -59,5 +61,14 @@ def memory_gib(device: torch.device) -> float:
     """Most memory used so far: allocated on a GPU, else this process's resident memory."""
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
-    unit = 1 if sys.platform == "darwin" else 1024  # getrusage counts bytes on macOS, KiB on Linux
+    return resident_gib()
+
+
+def resident_gib() -> float:
+    """Most resident memory this process has had, or, where the system does not say so, it or its parent before it."""
+    with suppress(OSError):  # on Linux; getrusage begins with what the parent had when it started this process
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 2**20
+    unit = 1 if sys.platform == "darwin" else 1024  # getrusage counts bytes on macOS, KiB elsewhere
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
