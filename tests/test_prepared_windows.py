@@ -109,9 +109,21 @@ def acted(policy, prepare: bool, chunks: int = 6) -> list[np.ndarray]:
     return found
 
 
-@pytest.mark.parametrize("model", ["ttt_modul", "rmt_context"])
+FULL = {
+    "ttt_modul": {"max_steps": 4, "budget": 64},
+    "rmt_context": {"max_steps": 4, "budget": 64},
+    "actions_modul": {"max_steps": 4, "stride": 16},
+    **{
+        model: {}
+        for model in ("retrieval_modul", "moment_modul", "gist_modul", "learned_topk_modul", "spacetime_modul")
+    },
+}
+"""Windows that six chunks fill, where there is one."""
+
+
+@pytest.mark.parametrize("model", FULL)
 def test_preparing_changes_no_action(model):
-    policy = quick_policy(model, 8, memory={"max_steps": 4, "budget": 64})
+    policy = quick_policy(model, 8, memory=FULL[model])
     assert all(np.array_equal(a, b) for a, b in zip(acted(policy, True), acted(policy, False), strict=True))
 
 

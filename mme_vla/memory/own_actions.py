@@ -128,9 +128,13 @@ class OwnActions(RecurrentMemory):
         return np.zeros(0, np.int64)
 
     def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(OwnRows(history, history.moved, self.d_vision, "actions"), step, rng)
+        return super().recall(self._own(history), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
-        device = self.output.weight.device
-        own = [OwnRows(history, history.moved, self.d_vision, "actions", device) for history in histories]
-        return super().encode(own, streams)
+        return super().encode([self._own(history, self.output.weight.device) for history in histories], streams)
+
+    def prepare(self, history: History, stream: Any) -> bool:
+        return super().prepare(self._own(history, self.output.weight.device), stream)
+
+    def _own(self, history: History, device: torch.device | None = None) -> OwnRows:
+        return OwnRows(history, history.moved, self.d_vision, "actions", device)
