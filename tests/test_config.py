@@ -111,6 +111,22 @@ def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
         check_overrides("demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree)
 
 
+def test_the_same_words_give_the_same_configuration_and_one_of_ones_own_each_time() -> None:
+    one, other = (compose("train", ["model=framesamp_modul", "train.steps=3"]) for _ in range(2))
+    assert one == other
+    one.train.steps = 7
+    one.memory.budget = 64
+    again = compose("train", ["model=framesamp_modul", "train.steps=3"])
+    assert again == other and again.train.steps == 3
+
+
+def test_files_of_ones_own_are_read_again_each_time(tree: Path) -> None:
+    before = compose("demo", directory=tree).seed
+    file = tree / "demo.yaml"
+    file.write_text(file.read_text().replace(f"seed: {before}", f"seed: {before + 1}"))
+    assert compose("demo", directory=tree).seed == before + 1
+
+
 def test_further_folders_add_choices(tree: Path, tmp_path: Path) -> None:
     mine = write_tree(tmp_path / "mine", {"memory/mine.yaml": "{name: mine, budget: 7}"})
     assert compose("demo", ["memory=mine"], directory=tree, extra_dirs=[mine]).memory.budget == 7
