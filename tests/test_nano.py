@@ -183,6 +183,7 @@ def test_a_tasks_own_settings_come_with_its_name_unless_others_are_named(
     assert with_settings(["model=ttt_modul"]) == ["with_memory=ttt_modul"]
     for words in (["task=BinFill"], ["seed=1"], ["task=StopCube", "nano=mine"]):
         assert with_settings(words) == words
+    assert with_settings(["task=StopCube", "nano=null"]) == ["task=StopCube"]
 
 
 def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
