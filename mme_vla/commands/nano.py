@@ -37,7 +37,8 @@ def main() -> None:
 def with_settings(words: Sequence[str]) -> list[str]:
     """The words of a command line, and the choice of the task's file in configs/nano; what is typed counts more.
 
-    `nano=null` does without it. `model=…` would be a choice for a tree that holds one model. Here it names the first of several.
+    `nano=null` does without it. `model=…` would be a choice for a tree that holds one model; here it names the first of
+    several.
     """
     words = [f"with_memory={word.removeprefix('model=')}" if word.startswith("model=") else word for word in words]
     if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
