@@ -1,7 +1,7 @@
 """The renderer, kept for the life of the process.
 
 ManiSkill makes a render system for each scene. All of them share SAPIEN's engine, in which shaders and pipelines are
-compiled when the first picture is taken, for many seconds where software renders; it goes with the last render system
+compiled when the first picture is taken, half a second where software renders; it goes with the last render system
 that holds it. An episode that closes its scene before the next one opens so pays for it again. One more render system,
 never released, keeps it; scenes stay separate, and pictures the same.
 
