@@ -310,6 +310,7 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
     with served, ThreadPoolExecutor(1) as pool:
         busy, idle = served.client(), served.client()
         busy.reset()
+        wait_until(lambda: served.busy == 0)  # the answer to the reset comes before the server rests
         front = np.zeros((100, 64, 64, 3), np.uint8)
         answer = pool.submit(busy.infer, challenge(front, front, np.zeros((100, 8), np.float32), first=True))
         wait_until(lambda: served.busy == 1)
