@@ -101,7 +101,8 @@ def test_a_film_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
 
 def test_equal_frames_make_equal_bytes_and_odd_sides_are_kept(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (4, 33, 45, 3), dtype=np.uint8)
-    assert film_bytes(noise) == film_bytes(noise)
+    held = [np.ones(size, np.uint8) for size in range(1000, 200_000, 5000)]  # the encoder's memory is not always clean
+    assert len({film_bytes(noise) for _ in range(40) if held.pop() is not None}) == 1
     assert len(film_bytes(noise, crf=10)) > len(film_bytes(noise, crf=30))
     (tmp_path / "odd.mp4").write_bytes(film_bytes(noise))
     assert [frame.shape for frame in decoded(tmp_path / "odd.mp4")] == [(33, 45, 3)] * 4
