@@ -1,10 +1,15 @@
-"""How far each dial of `split=stress` goes: does the demonstrator, who knows everything, still solve the test scenes?
+"""How far each dial of `split=stress` goes: who knows everything, does it still solve the test scenes?
 
-`python benchmarks/stress_dials.py --episodes 4 --output benchmarks/stress_dials.csv` (goes on where it was stopped)
+`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (goes on where it was stopped)
+
+Two know everything. The demonstrator moves the arm as it records. The oracle planner is `mme_vla.play`'s: it acts from
+outside, as a policy in an evaluation does, by choices and pixels, and has so many control steps after the video.
 """
 
 import argparse
 import csv
+from collections.abc import Callable
+from dataclasses import astuple
 from pathlib import Path
 
 from mme_vla.envs import metadata
@@ -12,52 +17,87 @@ from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
 from mme_vla.envs.variants import DIALS
+from mme_vla.play import OraclePlayer
+from mme_vla.play.game import MAX_CHOICES, EpisodeId
+from mme_vla.play.players import play
+from mme_vla.play.run import make_session
 
 VALUES = {
     "count": (0, 2, 5, 10), "containers": (0, 2, 5, 10), "swaps": (0, 2, 5, 10), "delay": (0, 100, 400),
     "path": (0, 1, 2, 4), "distractors": (0, 2, 4, 8),
 }  # fmt: skip
-COLUMNS = ("dial", "task", "value", "episode", "difficulty", "outcome", "steps", "video")
+EPISODES = {"count": 4}
+"""The first so many of `test`; of the other dials three."""
+KEY = ("actor", "dial", "task", "value", "episode")
+COLUMNS = (*KEY, "difficulty", "outcome", "steps", "video")
+MAX_STEPS = 3000  # of the oracle planner: ten repetitions more are over the 1,300 of an evaluation
+type Ended = tuple[str, int, int]
+"""How an episode ended, its steps, and those of its video."""
 
 
-def demonstrate(task: str, episode: int, dial: str, value: int) -> tuple[str, str, int, int]:
-    """Difficulty, how a demonstration without pictures ended, its steps, and those of its video."""
+def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
+    """A demonstration without pictures."""
     spec = metadata.episode(task, "test", episode)
-    try:
-        env = make_task(task, render=False, seed=spec.seed, difficulty=spec.difficulty, stress={dial: value})
-    except SceneError:
-        return spec.difficulty, "no scene", 0, 0
+    env = make_task(task, render=False, seed=spec.seed, difficulty=spec.difficulty, stress={dial: value})
     try:
         done = Recorder(env, render=False).record()
     finally:
         env.close()
-    return spec.difficulty, "success" if done.success else "failure", done.stored, done.video
+    return "success" if done.success else "failure", done.stored, done.video
+
+
+def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
+    """The oracle planner's choices in the environment that policies meet, without pictures."""
+    spec = metadata.episode(task, f"stress:{dial}={value}", episode)
+    which = EpisodeId(*astuple(spec))
+    session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, pictures=False)
+    try:
+        play(session, OraclePlayer())
+        video = len(session.reveals[0].frames) - 1
+    finally:
+        session.close()
+    return "failure" if session.status == "fail" else session.status, video + session.steps, video
+
+
+ACTORS: dict[str, Callable[[str, str, int, int], Ended]] = {"demonstrator": demonstrator, "oracle": oracle}
+
+
+def measure(actor: str, dial: str, task: str, value: int, episode: int) -> tuple[str | int, ...]:
+    """A row of the table."""
+    key = (actor, dial, task, value, episode, metadata.episode(task, "test", episode).difficulty)
+    try:
+        return *key, *ACTORS[actor](dial, task, value, episode)
+    except SceneError:
+        return *key, "no scene", 0, 0
 
 
 def main() -> None:
-    """Demonstrate what the table does not hold yet."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--episodes", type=int, default=4)
-    parser.add_argument("--dials", nargs="+", default=list(DIALS))
+    """Measure what the table does not hold yet."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--actors", nargs="+", default=list(ACTORS), choices=list(ACTORS))
+    parser.add_argument("--dials", nargs="+", default=list(DIALS), choices=list(DIALS))
     parser.add_argument("--output", type=Path, required=True)
     args = parser.parse_args()
-    there = args.output.is_file()
-    done = set()
+    there, done = args.output.is_file(), set()
     if there:
         with args.output.open() as file:
-            done = {(r["dial"], r["task"], int(r["value"]), int(r["episode"])) for r in csv.DictReader(file)}
+            done = {tuple(row[name] for name in KEY) for row in csv.DictReader(file)}
+    wanted = [
+        (actor, dial, task, value, episode)
+        for actor in args.actors
+        for dial in args.dials
+        for episode in range(EPISODES.get(dial, 3))
+        for value in VALUES[dial]
+        for task in DIALS[dial]
+    ]
     with args.output.open("a", newline="") as file:
         writer = csv.writer(file)
         if not there:
             writer.writerow(COLUMNS)
-        for dial in args.dials:
-            for episode in range(args.episodes):
-                for value in VALUES[dial]:
-                    for task in DIALS[dial]:
-                        if (dial, task, value, episode) not in done:
-                            difficulty, outcome, steps, video = demonstrate(task, episode, dial, value)
-                            writer.writerow([dial, task, value, episode, difficulty, outcome, steps, video])
-                            file.flush()
+        for key in wanted:
+            if tuple(map(str, key)) not in done:
+                writer.writerow(measure(*key))
+                file.flush()
 
 
 if __name__ == "__main__":
