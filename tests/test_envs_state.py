@@ -39,16 +39,19 @@ def same(one: Any, other: Any) -> bool:
     return bool(np.array_equal(one, other)) if isinstance(one, np.ndarray) else bool(one == other)
 
 
-# A task with a video and scripted motion, and one whose choices are planned motions that end in a grasp.
+# A task with a video and scripted motion, and one whose choices are planned motions that end in a grasp; a tally of its
+# twin goes down.
 CASES = [
-    ("VideoUnmaskSwap", "joint_angle", [None] * 12, [None] * 8),
-    ("PickXtimes", "multi_choice", [{"choice": "a", "point": [128, 128]}], [{"choice": "b"}, {"choice": "c"}]),
+    ("VideoUnmaskSwap", "test", "joint_angle", [None] * 12, [None] * 8),
+    ("PickXtimes", "twin", "multi_choice", [{"choice": "a", "point": [94, 110]}], [{"choice": "b"}, {"choice": "c"}]),
 ]
 
 
-@pytest.mark.parametrize(("task", "space", "before", "after"), CASES)
-def test_a_restored_episode_goes_on_to_the_last_bit(task: str, space: str, before: list[Any], after: list[Any]) -> None:
-    env = make_env(task, "test", 3, space, render=False, reward="subtask")
+@pytest.mark.parametrize(("task", "split", "space", "before", "after"), CASES)
+def test_a_restored_episode_goes_on_to_the_last_bit(
+    task: str, split: str, space: str, before: list[Any], after: list[Any]
+) -> None:
+    env = make_env(task, split, 3, space, render=False, reward="subtask")
     assert isinstance(env, RoboMMEEnv)
     first, last = [[joints(env, k) if a is None else a for k, a in enumerate(some)] for some in (before, after)]
     env.reset()
@@ -62,7 +65,7 @@ def test_a_restored_episode_goes_on_to_the_last_bit(task: str, space: str, befor
     assert np.array_equal(env.task.get_state().cpu().numpy(), reached[5])
     assert same(go_on(env, last), expected) and frames
     env.close()
-    fresh = make_env(task, "test", 3, space, render=False, reward="subtask")
+    fresh = make_env(task, split, 3, space, render=False, reward="subtask")
     assert isinstance(fresh, RoboMMEEnv)
     fresh.restore_state(pickle.loads(pickle.dumps(state)))
     assert same(go_on(fresh, last), expected), "another environment, in another process for all it knows"
@@ -102,11 +105,16 @@ def test_a_state_is_kept_when_the_episode_goes_on_and_fits_its_own_scene_only() 
     action[:] = 0  # what was given may be used again
     assert state.actions == () and len(moved.actions) == 1 and moved.actions[0].any()
     env.close()
-    other = make_env("PickXtimes", "test", 1, render=False)
-    assert isinstance(other, RoboMMEEnv)
-    with pytest.raises(UserError, match=r"another environment: seed \d+ \(here \d+\)"):
-        other.restore_state(state)
-    other.close()
+    for split, episode, differs in (
+        ("test", 1, r"seed \d+ \(here \d+\)"),
+        ("twin", 0, r"in_view False \(here True\)"),
+        ("stress:count=2", 0, r"stress {} \(here {'count': 2}\)"),
+    ):
+        other = make_env("PickXtimes", split, episode, render=False)
+        assert isinstance(other, RoboMMEEnv)
+        with pytest.raises(UserError, match=f"another environment: {differs}"):
+            other.restore_state(state)
+        other.close()
 
 
 # Rewards --------------------------------------------------------------------------------------------------------------

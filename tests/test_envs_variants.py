@@ -1,4 +1,4 @@
-"""Variants of the test split: at zero the official scenes, beyond it the same scenes with more; and the twins."""
+"""Variants of the test split: at zero the official scenes, beyond it the same scenes with more."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from mme_vla.envs.language import number, ordinal
 from mme_vla.envs.make import load_tasks, make_env
 from mme_vla.envs.task import Task
 from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.envs.variants import DIALS, TWINS, read_variant
+from mme_vla.envs.variants import DIALS, read_variant
 from mme_vla.errors import UserError
 from mme_vla.registry import TASKS
 
@@ -74,29 +74,10 @@ def test_what_a_dial_turns_is_there_as_often_as_it_says() -> None:
         env.close()
 
 
-def test_the_tables_of_dials_and_twins_are_what_the_tasks_say() -> None:
+def test_the_table_of_dials_is_what_the_tasks_say() -> None:
     load_tasks(*TASK_NAMES)
     for task in TASK_NAMES:
         assert TASKS[task].dials == {dial for dial, tasks in DIALS.items() if task in tasks}, task
-    for task in TASK_NAMES:
-        told = {"MoveCube", "PatternLock"}  # in words
-        assert (TASKS[task].cues is not Task.cues or task in told) == (task in TWINS), task
-
-
-@pytest.mark.parametrize("task", TWINS)
-def test_in_a_twin_the_fact_is_in_view_and_nothing_else_is_changed(task: str) -> None:
-    plain, twin = built(task), built(task, in_view=True)
-    for env in (plain, twin):
-        wait(env, 40)
-    before, after = scene(plain), scene(twin)
-    assert all(np.array_equal(before[name], after[name]) for name in before if name != "texts")
-    discs = [disc.position for disc in twin._cue_discs]
-    assert len(discs) == len(twin.cues()) and not plain._cue_discs
-    for disc, (thing, _) in zip(discs, twin.cues(), strict=True):
-        assert np.allclose(disc[:2], thing.position[:2], atol=1e-3) and 0 < disc[2] < 0.01
-    assert discs or plain.goals()[0] != twin.goals()[0]
-    plain.close()
-    twin.close()
 
 
 def test_an_environment_of_a_variant_is_made_by_its_split() -> None:
@@ -114,7 +95,6 @@ def test_an_environment_of_a_variant_is_made_by_its_split() -> None:
         ("PickXtimes", "stress", "say which dial is turned how far, as stress:count=2"),
         ("PickXtimes", "stress:counts=2", "there is no dial 'counts'. Did you mean 'count'"),
         ("PickXtimes", "stress:swaps=2", "PickXtimes has no dial 'swaps'; it has count"),
-        ("BinFill", "twin", "BinFill has no twin"),
         ("BinFill", "tset", "Unknown split 'tset'. Did you mean 'test'?"),
     ],
 )

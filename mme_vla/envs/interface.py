@@ -310,7 +310,7 @@ class RoboMMEEnv(gymnasium.Env):
     def state_of(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState:
         """This environment's episode after these actions."""
         task = self._open_task()
-        scene = type(task).__name__, task.seed, task.difficulty, task.recovery
+        scene = type(task).__name__, task.seed, task.difficulty, task.recovery, task.in_view, task.stress
         return EpisodeState(*scene, self._space.name, self.max_steps, options, tuple(actions))
 
     def _reward(self, run: _Run) -> torch.Tensor:

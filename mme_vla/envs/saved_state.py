@@ -18,7 +18,7 @@ from mme_vla.errors import UserError
 class EpisodeState:
     """A state that `RoboMMEEnv.save_state` made; it can be pickled, and restored in another process.
 
-    task, seed, difficulty, recovery: the scene. action_space, max_steps: of the environment.
+    task, seed, difficulty, recovery, in_view, stress: the scene. action_space, max_steps: of the environment.
     options: of the reset. actions: all that were given to `step` since.
     """
 
@@ -26,6 +26,8 @@ class EpisodeState:
     seed: int
     difficulty: str
     recovery: str | None
+    in_view: bool
+    stress: dict[str, int]
     action_space: str
     max_steps: int
     options: dict[str, Any]

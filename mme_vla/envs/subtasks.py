@@ -80,6 +80,11 @@ class Progress:
         return None if self.succeeded else self.subtasks[self.index]
 
     @property
+    def to_come(self) -> Sequence[SubTask]:
+        """The sub-tasks that are not done, the current one first."""
+        return self.subtasks[self.index :]
+
+    @property
     def shown(self) -> SubTask:
         """The sub-task whose text is reported online: the current one, and at the end the last one."""
         return self.subtasks[min(self.index, len(self.subtasks) - 1)]

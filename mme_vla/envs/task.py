@@ -10,10 +10,9 @@ from typing import Any, ClassVar
 import torch
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import build_cue, show_cue
+from mme_vla.envs.scene.cues import Cue, build_cue, show_cue
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.stage import Stage
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError, did_you_mean
 
@@ -29,7 +28,7 @@ class Task(Stage):
         difficulty: `easy`, `medium` or `hard`; by default seed % 3 decides.
         recovery: `z` or `xy` draws the pick that a recovery demonstration fails once, and how.
         stress: how far dials are turned (`variants.DIALS`); at 0 the scene is the benchmark's.
-        in_view: the fact that is to be remembered stays in view (`variants.TWINS`).
+        in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
         second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
         robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's own words for `recovery`.
 
@@ -73,7 +72,9 @@ class Task(Stage):
             if dial not in self.dials or turned < 0:
                 raise UserError(f"{type(self).__name__} cannot turn {dial!r} by {turned}: its dials are "
                                 f"{', '.join(sorted(self.dials)) or 'none'}, and turn up only.")  # fmt: skip
-        self._stress, self.in_view = dict(stress or {}), in_view
+        self.in_view = in_view
+        self.stress = {dial: turned for dial, turned in (stress or {}).items() if turned}
+        """Dials that are turned, and how far."""
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
         self.recording = False
@@ -87,7 +88,7 @@ class Task(Stage):
 
     def turned(self, dial: str) -> int:
         """How far a dial is turned; 0 as in the benchmark."""
-        return self._stress.get(dial, 0)
+        return self.stress.get(dial, 0)
 
     # What a task supplies -----------------------------------------------------------------------------------------
 
@@ -119,8 +120,11 @@ class Task(Stage):
     def after_step(self, k: int) -> None:
         """Scripted changes after a step's physics, evaluation and observation; `k` steps have been done."""
 
-    def cues(self) -> Sequence[tuple[Thing, str]]:
-        """With `in_view`: things that a disc of a colour lies under all the time, known once the scene is built."""
+    def cues(self) -> Sequence[Cue]:
+        """With `in_view`: the discs that show what is to be remembered, asked for once the scene is built.
+
+        Where they lie is asked for at each step, and when an episode begins.
+        """
         return ()
 
     def failure(self) -> bool:
@@ -141,8 +145,8 @@ class Task(Stage):
             draws = Draws(self.seed)
         self.build(draws)
         self.draws, self._drawn = draws, draws.state()
-        colours = [colour for _, colour in self.cues()] if self.in_view else []
-        self._cue_discs = [build_cue(self, f"cue_{i}", colour) for i, colour in enumerate(colours)]
+        cues = self.cues() if self.in_view else ()
+        self._cues = [(build_cue(self, f"cue_{i}", cue), cue) for i, cue in enumerate(cues)]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.tidy(env_idx)
@@ -179,9 +183,8 @@ class Task(Stage):
         self._show_cues()
 
     def _show_cues(self) -> None:
-        if self._cue_discs:
-            for disc, (thing, _) in zip(self._cue_discs, self.cues(), strict=True):
-                show_cue(disc, thing)
+        for disc, cue in self._cues:
+            show_cue(disc, cue)
 
     def evaluate(self) -> dict[str, torch.Tensor]:
         """Move the pointer over the sub-tasks; success and failure, each bool [1]."""

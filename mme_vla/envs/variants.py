@@ -31,16 +31,6 @@ what is shown and the execution. path: discs more on the way. distractors: more 
 SESSIONS = "sessions"
 """The dial that turns no scene: so many unrelated episodes come before one's own, in the same memory. All tasks have
 it; an evaluation shows them."""
-TWINS = (
-    "VideoUnmask", "ButtonUnmask", "VideoUnmaskSwap", "ButtonUnmaskSwap", "PickHighlight", "VideoRepick",
-    "VideoPlaceButton", "VideoPlaceOrder", "MoveCube", "InsertPeg", "PatternLock",
-)  # fmt: skip
-"""Tasks of which there is a twin. Of VideoRepick the cube is in view, and how often it was picked up so far is not.
-
-The others have none: BinFill, PickXtimes, SwingXtimes and StopCube ask for a count of what was done, and a tally in
-view would also tell when a step is over; RouteStick's way comes over the same places again, so that neither a disc nor
-words say where on it one is.
-"""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 
 
@@ -68,12 +58,10 @@ class Variant:
         """Make sure that a task of the benchmark can be varied so.
 
         Raises:
-            UserError: it has no twin, or not this dial.
+            UserError: it is another task, or has not this dial.
         """
         if task not in TASK_NAMES:
             raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
-        if self.twin and task not in TWINS:
-            raise UserError(f"{task} has no twin with the needed fact in view; these have: {', '.join(TWINS)}.")
         if self.dial and self.dial != SESSIONS and task not in DIALS[self.dial]:
             own = [dial for dial, tasks in DIALS.items() if task in tasks]
             raise UserError(

@@ -2,11 +2,13 @@
 
 import math
 from collections import Counter
+from itertools import islice
 
 import sapien
 
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.language import number, ordinal
+from mme_vla.envs.scene.cues import Cue, row, tally
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Appear
 from mme_vla.envs.scene.objects import Cube, H, build_board, build_button, build_cube
@@ -79,6 +81,16 @@ class BinFill(Task):
             for i, cube in enumerate(cubes)
             if self.streaming and i
         ]
+
+    def cues(self) -> list[Cue]:
+        """A disc for each cube that is still to be put into the bin, of its colour."""
+        places = iter(row(self.goal.total()))
+
+        def of_colour(colour: str) -> list[Cue]:
+            some = list(islice(places, self.goal[colour]))
+            return tally(some, lambda: self.goal[colour] - self.filled[colour], colour)
+
+        return [cue for colour in COLOURS for cue in of_colour(colour)]
 
     def before_physics(self, k: int) -> None:
         for stream in self._streams:

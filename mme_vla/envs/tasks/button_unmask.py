@@ -1,12 +1,12 @@
 """ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
 
 from mme_vla.envs.choices import Choice
+from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Cover
 from mme_vla.envs.scene.objects import build_button
 from mme_vla.envs.scene.placement import draw_button
 from mme_vla.envs.scene.predicates import pressed
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -35,8 +35,8 @@ class ButtonUnmask(Task):
         add_hidden_cubes(self, self.colours, self.containers)
         add_containers(self, draws, self.turned("containers"), [self.button], self.containers)
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
+    def cues(self) -> list[Cue]:
+        return [under(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
 
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers)

@@ -12,6 +12,7 @@ from mme_vla.envs.choices import Choice
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.peg_skills import PegEnd
 from mme_vla.envs.robot.robots import ROBOT_BASE
+from mme_vla.envs.scene.cues import Cue, on_table
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Highlight, Mark, build_mark
 from mme_vla.envs.scene.objects import build_aperture_box, build_highlight, build_peg
@@ -85,8 +86,8 @@ class InsertPeg(Task):
                 return place
         raise SceneError(f"InsertPeg, seed {self.seed}: a peg finds no place.")
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(self.ends(getattr(self, "end", ENDS[0]))[0], "white")]
+    def cues(self) -> list[Cue]:
+        return [Cue("white", lambda: on_table(self.ends(self.end)[0].position))]
 
     def after_step(self, k: int) -> None:
         self.mark.update(k, touched=self._inserted(self.end, self.side))

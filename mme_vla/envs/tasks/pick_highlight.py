@@ -2,12 +2,12 @@
 
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.language import ordinal
+from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Highlight
 from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_highlight
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -44,8 +44,8 @@ class PickHighlight(Task):
                 raise SceneError(f"PickHighlight, seed {self.seed}: distractor {i} finds no place.")
             self.cubes.append(self.add(build_cube(self, f"distractor_{i}", colour, *place)))
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(cube, "white") for cube in self.goal_cubes]
+    def cues(self) -> list[Cue]:
+        return [under(cube) for cube in self.goal_cubes]
 
     def start_episode(self, draws: Draws) -> None:
         pairs = zip(self._discs, self.goal_cubes, strict=True)

@@ -2,6 +2,7 @@
 
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.language import number, ordinal
+from mme_vla.envs.scene.cues import Cue, row, tally
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_disc
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
@@ -43,6 +44,12 @@ class PickXtimes(Task):
             raise SceneError(f"PickXtimes, seed {self.seed}: the target finds no place.")
         self.target = self.add(build_disc(self, "target", TARGET_RADIUS, TARGET_THICKNESS, "purple", xy))
         self.cube = self.cubes[draws.integer(0, len(self.cubes))]
+
+    def cues(self) -> list[Cue]:
+        def left() -> int:
+            return sum(step.choice == "b" for step in self.progress.to_come)
+
+        return tally(row(self.repetitions), left)
 
     def subtasks(self) -> list[SubTask]:
         steps = []

@@ -1,11 +1,14 @@
 """RouteStick (Imitation): the video winds around obstacles from disc to disc; follow the same route."""
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from mme_vla.envs.choices import Choice
+from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.scene.cues import Cue, Place, on_table
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
@@ -24,6 +27,8 @@ MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
 VISIT, VISIT_HEIGHT = 0.03, 0.15
 MARK_RADIUS, MARK_STEPS = 0.02004, 40
 HOME_STEPS = 200
+CUE_RADIUS, DOT_RADIUS = 0.04, 0.01
+DOTS = range(8, 40, 7)  # of an arc's 45 points
 Turn = Literal["clockwise", "counterclockwise"]
 SIDES: tuple[tuple[str, Turn], ...] = (
     ("left", "clockwise"), ("right", "clockwise"), ("left", "counterclockwise"), ("right", "counterclockwise"),
@@ -64,6 +69,21 @@ class RouteStick(Task):
             route.append(nearby[draws.integer(0, len(nearby))])
         self.route = [self.discs[i] for i in route]
         self.turns: list[Turn] = ["clockwise" if draws.coin() else "counterclockwise" for _ in range(moves)]
+
+    def cues(self) -> list[Cue]:
+        """Of the next move: a disc under its target, and smaller ones along its arc."""
+
+        def point(i: int) -> Callable[[], Place | None]:
+            def place() -> Place | None:
+                move = len(self.turns) - len(self.progress.to_come)
+                if not 0 <= move < len(self.turns):  # in the video, or at the end
+                    return None
+                start, end = (disc.position for disc in self.route[move : move + 2])
+                return on_table(arc(start, end, self.turns[move])[i])
+
+            return place
+
+        return [Cue("yellow", point(-1), CUE_RADIUS), *(Cue("yellow", point(i), DOT_RADIUS) for i in DOTS)]
 
     def start_episode(self, draws: Draws) -> None:
         self.marks = [Mark(m, d.position, MARK_STEPS) for m, d in zip(self._marks, self.discs, strict=True)]

@@ -8,6 +8,7 @@ import sapien
 
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.language import ordinal
+from mme_vla.envs.scene.cues import Cue, row, tally
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import smoothstep
 from mme_vla.envs.scene.objects import build_button, build_disc, build_moving_cube
@@ -63,6 +64,15 @@ class StopCube(Task):
         side = 2 * smoothstep(steps / self.interval) - 1
         xy = self.target.position[:2] + self._reach * (side if turn % 2 == 0 else -side)
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
+
+    def cues(self) -> list[Cue]:
+        """The visits until the cube is to be stopped, that one included; a disc goes where the cube turns round."""
+
+        def left() -> int:
+            now = self.steps_done if self.stopped_at is None else self.stopped_at
+            return self.visit - now // self.interval
+
+        return tally(row(PASSES + self.turned("count")), left)
 
     def before_physics(self, k: int) -> None:
         if self.stopped_at is None and pressed(self.button):

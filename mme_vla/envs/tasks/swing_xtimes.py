@@ -2,6 +2,7 @@
 
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.language import number, ordinal
+from mme_vla.envs.scene.cues import TALLY_SPACING, Cue, tally
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Mark, build_mark
 from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
@@ -80,6 +81,15 @@ class SwingXtimes(Task):
         self.swings = [Swings(self.cube, target) for target in (self.right, self.left)]
         targets = (self.right, self.left)
         self.marks = [Mark(d, t.position, MARK_STEPS) for d, t in zip(self._marks, targets, strict=True)]
+
+    def cues(self) -> list[Cue]:
+        """A tally for each target, on its side: which one is next is to be seen as well."""
+
+        def visits(target: Disc, side: int) -> list[Cue]:
+            places = [side * TALLY_SPACING * (i + 1) for i in range(self.repetitions)]
+            return tally(places, lambda: sum(target in step.targets for step in self.progress.to_come))
+
+        return [*visits(self.right, -1), *visits(self.left, 1)]
 
     def after_step(self, k: int) -> None:
         for mark, swings in zip(self.marks, self.swings, strict=True):

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING
 from mme_vla.envs.choices import Choice
 from mme_vla.envs.language import number, ordinal
 from mme_vla.envs.scene.anchors import ANCHOR_HALF, rotated_anchors, swaps_in_turn
+from mme_vla.envs.scene.cues import Cue, row, tally, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
 from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
 from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -74,8 +74,11 @@ class VideoRepick(Task):
         for swap in self.swaps:
             swap.apply(k)
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(self.cube, "white")]
+    def cues(self) -> list[Cue]:
+        def left() -> int:
+            return sum(step.choice == "b" and not step.video for step in self.progress.to_come)
+
+        return [under(self.cube), *tally(row(self.repetitions), left)]
 
     def failure(self) -> bool:
         """Notes whether the swaps may begin, one step after their stage is entered; the rules belong to the stages."""

@@ -1,10 +1,10 @@
 """VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
 
 from mme_vla.envs.choices import Choice
+from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, Cover
 from mme_vla.envs.scene.predicates import StaticFor
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
@@ -32,8 +32,8 @@ class VideoUnmask(Task):
         add_hidden_cubes(self, self.colours, self.containers)
         add_containers(self, draws, self.turned("containers"), [], self.containers)
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
+    def cues(self) -> list[Cue]:
+        return [under(container, colour) for colour, container in zip(self.colours, self.containers, strict=False)]
 
     def start_episode(self, draws: Draws) -> None:
         self.cover = Cover(self.containers)

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 from mme_vla.envs.scene.anchors import ANCHOR_HALF, Point, swaps_in_turn
+from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
 from mme_vla.envs.scene.objects import Container, H, build_container
 from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_container
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.families.containers import add_hidden_cubes
 
@@ -50,8 +50,8 @@ class UnmaskSwap(Task):
             self.initiators.append(self.containers[draws.integer(0, len(anchors))])
         self.swap_count = len(self.initiators)
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(container, colour) for colour, container in zip(self.colours, self.over_cubes, strict=True)]
+    def cues(self) -> list[Cue]:
+        return [under(container, colour) for colour, container in zip(self.colours, self.over_cubes, strict=True)]
 
     @property
     def swapped_after(self) -> int:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 import sapien
 
 from mme_vla.envs.choices import Choice
+from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Swap
 from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
@@ -19,7 +20,6 @@ from mme_vla.envs.scene.predicates import (
     pressed,
     reset_reached,
 )
-from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.task import Task
 
@@ -96,8 +96,8 @@ class VideoPlace(Task):
         if self._swap is not None:
             self._swap.apply(k)
 
-    def cues(self) -> list[tuple[Thing, str]]:
-        return [(self.goal_target, "white")]
+    def cues(self) -> list[Cue]:
+        return [under(self.goal_target)]
 
     def failure(self) -> bool:
         """Notes whether the swap may begin, one step after its stage is entered; the rules belong to the stages."""
