@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
+from multiprocessing import forkserver
 from pathlib import Path
 
 from conftest import REPOSITORY
@@ -76,6 +77,8 @@ def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: 
         variables = {"HIDDEN_MODULES": " ".join(hidden), "PYTHONPATH": os.pathsep.join([extras, str(REPOSITORY)])}
         command = [sys.executable, "-W", "ignore", *([] if words[0].endswith(".py") else ["-m"]), *words]
         os.execve(sys.executable, command, os.environ | variables)
+    # Its workers are forked from where it was; Python 3.12 would import everything once more for them.
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign, attr-defined]
     sys.path.insert(0, str(cwd))
     sys.argv = list(words)
     if words[0].endswith(".py"):
