@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.types import MemoryTokens
 
 FUSIONS, CONSOLIDATIONS = ("gate", "add"), ("tome", "fifo")
 LONGEST = 10_000.0  # of the time code's periods, in units of 2π
@@ -54,90 +55,69 @@ class TimeCode(nn.Module):
 
 
 class RetrievalBlock(nn.Module):
-    """Attention of one head as wide as the tokens, then an MLP; a norm after each."""
+    """Attention of one head as wide as the tokens, then an MLP; a norm after each. What is read is `read` wide."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, read: int | None = None) -> None:
         super().__init__()
-        self.query, self.key, self.value = (nn.Linear(width, width) for _ in range(3))
+        self.query, self.key, self.value = (nn.Linear(given or width, width) for given in (width, read, read))
         self.attention_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width)
         self.mlp_in, self.mlp_out = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
     def forward(self, query: Tensor, keys: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
-        """Queries [b, n, d] read keys and values [b, m, d]; mask [b, 1, m] is False on padding."""
+        """Queries [b, n, d] read keys and values [b, m, read]; mask [b, 1, m] is False on padding."""
         q, k, v = self.query(query), self.key(keys), self.value(values)
         x = self.attention_norm(query + functional.scaled_dot_product_attention(q, k, v, attn_mask=mask))
         return self.mlp_norm(x + self.mlp_out(functional.gelu(self.mlp_in(x))))
 
 
-class MemoryBank(nn.Module):
-    """A bank of at most `length` moments, each n tokens of width d."""
+class Retrieval(nn.Module):
+    """How tokens of now, of width d, read entries of the past and are fused with the answer.
+
+    The entries are a bank's own (`MemoryBank`), or the tokens of any memory (`recall`).
+    """
 
     def __init__(
         self,
         width: int,
-        length: int = 16,
         retrieval_layers: int = 2,
         time_code: bool = True,
         fusion: str = "gate",
-        consolidation: str = "tome",
-        store_fused: bool = False,
+        read: int | None = None,
     ) -> None:
-        """Build an empty bank.
+        """Build it.
 
         Args:
-            width: d. length: most moments it holds.
-            retrieval_layers: blocks the current tokens read the bank through.
+            width: d. read: width of an entry, where it is another.
+            retrieval_layers: blocks the current tokens read the entries through.
             time_code: whether keys carry their moment's time.
             fusion: how current and retrieved tokens become one: `gate` (learned, each number its own) or `add` (mean).
-            consolidation: what becomes of a moment too many: `tome` makes the two most alike neighbours one, `fifo`
-                drops the oldest.
-            store_fused: store the fused tokens instead of the current ones.
 
         Raises:
             UserError: an unknown choice, or a size that is not positive.
         """
         super().__init__()
-        for name, value in (("length", length), ("retrieval_layers", retrieval_layers)):
-            if value < 1:
-                raise UserError(f"bank.{name}={value} must be at least 1.")
+        if retrieval_layers < 1:
+            raise UserError(f"bank.retrieval_layers={retrieval_layers} must be at least 1.")
         if fusion not in FUSIONS:
             raise UserError(f"bank.fusion={fusion!r}. {did_you_mean(str(fusion), FUSIONS)}")
-        if consolidation not in CONSOLIDATIONS:
-            raise UserError(f"bank.consolidation={consolidation!r}. {did_you_mean(str(consolidation), CONSOLIDATIONS)}")
-        self.width, self.length = width, length
-        self.consolidation, self.store_fused = consolidation, store_fused
-        self.blocks = nn.ModuleList(RetrievalBlock(width) for _ in range(retrieval_layers))
+        self.width = width
+        self.blocks = nn.ModuleList(RetrievalBlock(width, read) for _ in range(retrieval_layers))
         self.gate = nn.Linear(2 * width, width) if fusion == "gate" else None
-        self.time = TimeCode(width) if time_code else None
+        self.time = TimeCode(read or width) if time_code else None
         if self.gate is not None:
             nn.init.normal_(self.gate.weight, std=GATE_STD)
             nn.init.normal_(self.gate.bias, std=GATE_STD)
 
-    def init_state(self, tokens: int) -> BankState:
-        """An empty bank for moments of so many tokens."""
-        weight = next(self.parameters())
-        times = torch.zeros(0, dtype=torch.int64, device=weight.device)
-        return BankState(weight.new_zeros(0, tokens, self.width), times)
-
-    def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
-        """What the banks of b episodes answer to their current tokens [b, n, d]; an empty one answers with these."""
-        lengths = [len(state) for state in states]
-        longest = max(lengths)
-        if not longest:
-            return tokens
-        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)  # b t n d
-        times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
-        held = torch.arange(longest, device=tokens.device) < torch.tensor(lengths, device=tokens.device)[:, None]
-        return self.ask(tokens, entries, times, None if min(lengths) == longest else held)
-
-    def ask(self, tokens: Tensor, entries: Tensor, times: Tensor, held: Tensor | None = None) -> Tensor:
-        """What entries [b, t, n, d] at times [b, t] answer to tokens [b, n, d].
+    def ask(self, tokens: Tensor, entries: Tensor, times: Tensor | None = None, held: Tensor | None = None) -> Tensor:
+        """What entries [b, t, n, d] at times [b, t] answer to tokens [b, k, d].
 
         Args:
+            times: for the time code, where there is one.
             held: [b, t] bool, False where there is no entry; a row without any answers with its tokens.
         """
         keys = entries
         if self.time is not None:
+            assert times is not None
             keys = entries + self.time(times.flatten()).to(tokens).unflatten(0, times.shape)[:, :, None]
         empty = mask = None
         if held is not None:
@@ -156,6 +136,61 @@ class MemoryBank(nn.Module):
             return (tokens + retrieved) / 2
         share = torch.sigmoid(self.gate(torch.cat([tokens, retrieved], -1)))
         return share * tokens + (1 - share) * retrieved
+
+    def recall(self, memory: MemoryTokens, tokens: Tensor) -> Tensor:
+        """Fused tokens [b, k, d], from the current ones and a memory's tokens [b, n, read] in place of entries."""
+        # Tokens where the mask is False are undefined: a weight of 0 alone would let a nan through.
+        entries = memory.tokens.masked_fill(~memory.mask[..., None], 0).to(tokens)
+        return self.fuse(tokens, self.ask(tokens, entries[:, :, None], held=memory.mask))
+
+
+class MemoryBank(Retrieval):
+    """A bank of at most `length` moments, each n tokens of width d: what is written, merged, and so retrieved."""
+
+    def __init__(
+        self,
+        width: int,
+        length: int = 16,
+        retrieval_layers: int = 2,
+        time_code: bool = True,
+        fusion: str = "gate",
+        consolidation: str = "tome",
+        store_fused: bool = False,
+    ) -> None:
+        """Build an empty bank.
+
+        Args:
+            width, retrieval_layers, time_code, fusion: as for `Retrieval`. length: most moments it holds.
+            consolidation: what becomes of a moment too many: `tome` makes the two most alike neighbours one, `fifo`
+                drops the oldest.
+            store_fused: store the fused tokens instead of the current ones.
+
+        Raises:
+            UserError: an unknown choice, or a size that is not positive.
+        """
+        if length < 1:
+            raise UserError(f"bank.length={length} must be at least 1.")
+        if consolidation not in CONSOLIDATIONS:
+            raise UserError(f"bank.consolidation={consolidation!r}. {did_you_mean(str(consolidation), CONSOLIDATIONS)}")
+        super().__init__(width, retrieval_layers, time_code, fusion)
+        self.length, self.consolidation, self.store_fused = length, consolidation, store_fused
+
+    def init_state(self, tokens: int) -> BankState:
+        """An empty bank for moments of so many tokens."""
+        weight = next(self.parameters())
+        times = torch.zeros(0, dtype=torch.int64, device=weight.device)
+        return BankState(weight.new_zeros(0, tokens, self.width), times)
+
+    def retrieve(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
+        """What the banks of b episodes answer to their current tokens [b, n, d]; an empty one answers with these."""
+        lengths = [len(state) for state in states]
+        longest = max(lengths)
+        if not longest:
+            return tokens
+        entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)  # b t n d
+        times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
+        held = torch.arange(longest, device=tokens.device) < torch.tensor(lengths, device=tokens.device)[:, None]
+        return self.ask(tokens, entries, times, None if min(lengths) == longest else held)
 
     def read(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
         """Fused tokens [b, n, d] of b episodes, from the current ones and their banks."""
