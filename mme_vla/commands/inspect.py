@@ -158,7 +158,7 @@ def build_memory(cfg: DictConfig) -> "Memory":
 
     chosen: Any = OmegaConf.to_container(cfg, resolve=True)
     backbone = shape_of(chosen["backbone"])
-    return mme.build_memory(chosen["memory"], backbone, backbone.token_width)
+    return mme.build_memory(chosen["memory"], backbone.vision_width, backbone.grid, backbone.token_width)
 
 
 def draw_memory(

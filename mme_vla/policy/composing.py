@@ -3,21 +3,23 @@
 from collections.abc import Mapping, Set
 from typing import Any
 
-from mme_vla.backbone.base import Backbone
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration, doors_of
 from mme_vla.memory.base import Memory
 from mme_vla.registry import MEMORIES
 
 
-def build_memory(section: Mapping[str, Any], backbone: Backbone, width: int) -> Memory:
-    """The memory of a configuration for this backbone's vision tokens; its own tokens are `width` wide.
+def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: int) -> Memory:
+    """The memory of a configuration.
+
+    Args:
+        d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
 
     Raises:
-        UserError: an unknown memory or option, or a grid to which the backbone's cannot be pooled.
+        UserError: an unknown memory or option, or a grid to which a view's cannot be pooled.
     """
-    memory: Memory = MEMORIES.build(section, d_vision=backbone.vision_width, width=width)
-    memory.check_grid(backbone.grid)
+    memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
+    memory.check_grid(grid)
     return memory
 
 

@@ -117,7 +117,7 @@ class MMEPolicy(Policy):
             backbone.draw_experts(list(experts))
         memory: Memory | None = None
         if config.get("memory"):
-            memory = build_memory(config["memory"], backbone, integration.memory_width)
+            memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
         check_integrated(config, integration, memory, backbone_cls.hosts)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
@@ -360,19 +360,12 @@ class MMEPolicy(Policy):
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        storage, width = self.require_memory().storage, self.backbone.vision_width
-
-        def pooled(some: np.ndarray | Tensor) -> Tensor:
-            images = self.require_processor().memory_images(some, device=self.device)
-            with self.autocast():
-                return self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
-
-        empty = torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
-        return encode_frames(frames, pooled, empty, batch_size)
+        return encode_frames(self, frames, self.backbone.pooled_tokens, self.backbone.vision_width, batch_size)
 
     def vision_fingerprint(self) -> str:
         """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        return tower_fingerprint(self.backbone.vision, self.compute_dtype)
+        pictures = "" if self.processor is None else self.processor.memory_pictures
+        return tower_fingerprint(self.backbone.vision, self.compute_dtype, pictures)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""

@@ -2,26 +2,61 @@
 
 import hashlib
 from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-Pooled = Callable[[np.ndarray | Tensor], Tensor]
-"""Some frames [n, H, W, 3] uint8 → their pooled tokens [n, grid², d_vision]."""
+if TYPE_CHECKING:
+    from mme_vla.memory.base import Memory
+
+Pooled = Callable[[Tensor, int, str], Tensor]
+"""Pictures as the tower takes them, the side of the grid and the pooling → tokens [n, grid², d_vision]."""
+
+
+class Seeing(Protocol):
+    """What is asked of such a policy."""
+
+    history_dtype: torch.dtype
+
+    @property
+    def device(self) -> torch.device: ...
+
+    def autocast(self) -> AbstractContextManager[Any]: ...
+
+    def require_memory(self) -> "Memory": ...
+
+    def require_processor(self) -> Any: ...
 
 
 @torch.no_grad()
-def encode_frames(frames: np.ndarray | Tensor, pooled: Pooled, empty: Tensor, batch_size: int) -> Tensor:
-    """Frames [n, H, W, 3] uint8 in batches; `empty` [0, grid², d_vision] says dtype and device of the result."""
-    encoded = [pooled(frames[start : start + batch_size]).to(empty) for start in range(0, len(frames), batch_size)]
-    return torch.cat(encoded) if encoded else empty
+def encode_frames(
+    policy: Seeing, frames: np.ndarray | Tensor, pooled: Pooled, d_vision: int, batch_size: int
+) -> Tensor:
+    """Memory-view frames [n, H, W, 3] uint8, in batches → tokens [n, grid², d_vision] as the memory stores them."""
+    storage, device = policy.require_memory().storage, policy.device
+    empty = torch.zeros(0, storage.grid**2, d_vision, dtype=policy.history_dtype, device=device)
+    encoded = [empty]
+    for start in range(0, len(frames), batch_size):
+        images = policy.require_processor().memory_images(frames[start : start + batch_size], device=device)
+        with policy.autocast():
+            encoded.append(pooled(images, storage.grid, storage.pooling).to(empty))
+    return torch.cat(encoded)
 
 
-def tower_fingerprint(tower: nn.Module, dtype: torch.dtype) -> str:
-    """A hash of a tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
+def tower_fingerprint(tower: nn.Module, dtype: torch.dtype, *beside: str) -> str:
+    """A hash of what a cache of tokens depends on.
+
+    Args:
+        tower: whose weights count. dtype: that it runs in.
+        beside: what else its pictures go through; nothing where it says nothing.
+    """
     digest = hashlib.sha256(str(dtype).encode())
     for name, tensor in sorted(tower.state_dict().items()):
         digest.update(name.encode())
         digest.update(tensor.detach().float().cpu().contiguous().numpy().tobytes())
+    for words in filter(None, beside):
+        digest.update(words.encode())
     return digest.hexdigest()

@@ -159,6 +159,11 @@ class PolicyProcessor:
         raise NotImplementedError
 
     @property
+    def memory_pictures(self) -> str:
+        """What a setting lets memory pictures go through besides, which a cache of their tokens depends on."""
+        return ""
+
+    @property
     def words_fingerprint(self) -> str | None:
         """Equal for two processors exactly if words mean the same numbers to both; None where that needs no check."""
         return None

@@ -58,6 +58,11 @@ class OpenVlaProcessor(Processor):
         resized = torch.from_numpy(np.require(self._resized(array), requirements=["C", "W"]))
         return to_unit_range(resized.to(device) if device is not None else resized).movedim(-1, 1)
 
+    @property
+    def memory_pictures(self) -> str:
+        """Whether they are JPEG in between."""
+        return "jpeg" if self.jpeg else ""
+
     def _resized(self, frames: np.ndarray) -> np.ndarray:
         return lanczos(jpeg_round_trip(frames) if self.jpeg else frames, self.image_size)
 

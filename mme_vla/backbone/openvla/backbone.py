@@ -14,7 +14,6 @@ from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.head import ActionHead, StateToken
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.sizes import OpenVlaConfig
-from mme_vla.backbone.pi05.siglip import pool_grid
 from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch
@@ -83,7 +82,7 @@ class OpenVlaBackbone(Backbone):
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         """Fused tokens [n, grid², d_vision] as memories store them."""
-        return pool_grid(self.encode_images(images), grid, pooling)
+        return self.vlm.pooled_tokens(images, grid, pooling)
 
     def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
         """Blocks `begin`, `images`, `state` (where it is read) and `prompt`, in sequence order.

@@ -9,6 +9,7 @@ from mme_vla.backbone.layers.recomputing import Recompute, checkpoint_options
 from mme_vla.backbone.layers.rope import rotation
 from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig
 from mme_vla.backbone.openvla.vision import OPENVLA, FusedVision, Standard
+from mme_vla.backbone.pi05.siglip import pool_grid
 
 MAX_POSITIONS = 2048  # Llama 2's; rotary angles know no end, and nothing here depends on it
 
@@ -48,6 +49,10 @@ class Prismatic(nn.Module):
         frozen = not any(p.requires_grad for p in self.vision.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
             return self.vision(self.vision.standardised(images))
+
+    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
+        """Fused tokens [n, grid², d_vision] as memories store them."""
+        return pool_grid(self.encode_images(images), grid, pooling)
 
     def embed(self, ids: Tensor) -> Tensor:
         """Embeddings [..., d] of token ids."""

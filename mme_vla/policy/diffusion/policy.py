@@ -20,13 +20,13 @@ from mme_vla.errors import UserError, brief
 from mme_vla.integration.feature_wise import PooledIntegration
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.composing import check_past
+from mme_vla.policy.composing import build_memory, check_past
 from mme_vla.policy.diffusion.processing import DiffusionBatch, DiffusionProcessor
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.registry import INTEGRATIONS, MEMORIES, POLICIES
+from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
@@ -106,7 +106,8 @@ class DiffusionPolicy(Policy):
         network = DiffusionNetwork(sizes, len(robot.cameras), robot.state.width, feature, integration is not None)
         memory: Memory | None = None
         if integration is not None:
-            memory = MEMORIES.build(config["memory"], d_vision=sizes.memory_width, width=integration.memory_width)
+            grid = sizes.memory_tower.image_size // sizes.memory_tower.patch_size
+            memory = build_memory(config["memory"], sizes.memory_width, grid, integration.memory_width)
             check_past(config, memory, frozenset())
         if processor is not None and not isinstance(processor, DiffusionProcessor):
             raise UserError("Diffusion Policy needs its own processor: set processor=dp, or dp_tiny to try things out.")
@@ -261,16 +262,7 @@ class DiffusionPolicy(Policy):
 
     def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
         """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        storage = self.require_memory().storage
-
-        def pooled(some: np.ndarray | Tensor) -> Tensor:
-            images = self.require_processor().memory_images(some, device=self.device)
-            with self.autocast():
-                return self.backbone.pooled_tokens(images, storage.grid, storage.pooling)
-
-        width = self.sizes.memory_width
-        empty = torch.zeros(0, storage.grid**2, width, dtype=self.history_dtype, device=self.device)
-        return encode_frames(frames, pooled, empty, batch_size)
+        return encode_frames(self, frames, self.backbone.pooled_tokens, self.sizes.memory_width, batch_size)
 
     def vision_fingerprint(self) -> str:
         """A hash of the memory's vision tower and the dtype it runs in: what a cache of its tokens depends on."""
