@@ -35,9 +35,9 @@ ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "memoryvla": memoryvla_adapter,
 }
 
-# What a memory adds to π0.5, as our names, the released leaves and LeRobot's own memory tell.
+# What a memory adds to a policy, as our names, the released leaves, LeRobot's own memory and MemoryVLA's banks tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
-_MEMORY_LEAF = re.compile(rf"(^|/)mem_|_mem(/|$)|^{HISTORY}\.")
+_MEMORY_LEAF = re.compile(rf"(^|/)mem_|_mem(/|$)|_mem_bank\.|^{HISTORY}\.")
 
 
 def load_weights(
@@ -140,7 +140,8 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
     if found.format == "ours":
         theirs = merge_state(found.tensors(), found.config.get("adapters"))
         _check_tokenizer(policy, found.folder)
-        left = sorted(name for name in set(theirs) - set(state) if _OF_MEMORY.search(name))
+        strange = set(theirs) - set(state)
+        left = sorted(name for name in strange if _OF_MEMORY.search(name) or _part(policy, name) == "memory")
         ours = {name: tensor for name, tensor in theirs.items() if name not in left}
         check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
     else:
@@ -167,6 +168,11 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
     check_values(ours, str(source))
     policy.load_state_dict(ours, strict=False)
     return Start(sorted(ours), sorted(set(state) - set(ours)), left)
+
+
+def _part(policy: Policy, name: str) -> str | None:
+    """The part of a policy that another's parameter would belong to; None where it has none such."""
+    return next((part for part, pattern in policy.parts().items() if re.match(pattern, name)), None)
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:

@@ -208,7 +208,8 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         lerobot = any(name.startswith(LEROBOT_PREFIX) for name in names)
         described = Source("lerobot", folder).config.get("type") is not None
         return Source("lerobot" if lerobot or described else "openpi", folder, files)
-    if any(name.startswith("backbone.") for name in names):
+    # Not every kind of policy has a backbone among its modules; each has one in its configuration.
+    if any(name.startswith("backbone.") for name in names) or "backbone" in Source("ours", folder).config:
         return Source("ours", folder, files)
     if is_openvla(names):
         return Source("openvla", folder, files)
@@ -216,7 +217,7 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
         return Source("released", folder, files)
     few = listed(sorted(names), 3) or "none at all"
     raise UserError(
-        f"{files[0]} is not a π0.5 policy: its tensors are called {few}. Known: {'; '.join(FORMATS.values())}."
+        f"{files[0]} is no policy of a known kind: its tensors are called {few}. Known: {'; '.join(FORMATS.values())}."
     )
 
 
