@@ -92,13 +92,7 @@ def test_pictures_are_changed_by_given_draws_alone_whatever_stands_beside_them()
     assert drawn[0]["changes"].shape == (2, 4, 6)
     first, again, other = (policy(batch, each)[0] for each in drawn)
     assert torch.equal(first, again) and not torch.equal(first, other)
-    halves = [
-        policy(
-            GroupBatch(**{k: v[i : i + 1] for k, v in vars(batch).items()}),
-            {k: v[i : i + 1] for k, v in drawn[0].items()},
-        )
-        for i in range(2)
-    ]
+    halves = [policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in drawn[0].items()}) for i in range(2)]
     apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
     assert abs(apart - first) < abs(other - first) / 20
     assert policy.eval().picture_draws(2, torch.Generator()) == {}
@@ -200,10 +194,10 @@ def test_it_counts_on_meta_without_anything_to_show() -> None:
 
 
 def test_what_it_has_no_place_for_is_refused_in_words() -> None:
-    with pytest.raises(UserError, match="banks of its own"):
-        build_policy("memoryvla", memory="framesamp", integration="context")
-    with pytest.raises(UserError, match="group_size"):
+    with pytest.raises(UserError, match="group_size=1: MemoryVLA's banks"):
         build_policy("memoryvla", processor={"group_size": 1})
+    with pytest.raises(UserError, match="group_size must be a positive"):
+        build_policy("memoryvla", processor={"group_size": 0})
 
 
 def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:

@@ -41,12 +41,8 @@ class GroupDataset(TrainingDataset):
 
     def _group(self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
-        moments = []
-        for step in steps:
-            subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
-            moments.append(self.processor.item(self._sample(step, subgoal)))
         return {
-            "moments": moments,
+            "moments": [self.seen(step, rng) for step in steps],
             "times": frames.astype(np.int64),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,

@@ -114,5 +114,6 @@ def check_frozen(policy: Policy, freeze_vision: bool) -> None:
     if policy.memory is not None and not freeze_vision:
         raise UserError(
             "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "
-            "before: at test time it would see other tokens than in training. Keep it frozen, or use model=pi05."
+            "before: at test time it would see other tokens than in training. Keep it frozen "
+            "(finetune.freeze_vision=true), or train without a memory."
         )

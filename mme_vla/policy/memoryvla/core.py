@@ -1,4 +1,4 @@
-"""MemoryVLA behind its VLM: perceptual tokens, two banks, and the diffusion head that answers."""
+"""MemoryVLA behind its VLM: perceptual tokens, what is read of the past, and the diffusion head that answers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,12 +11,14 @@ from mme_vla.backbone.memoryvla.diffusion import Schedule
 from mme_vla.backbone.memoryvla.dit import Dit, DitConfig
 from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig
 from mme_vla.errors import UserError
-from mme_vla.memory.bank import BankState, MemoryBank
+from mme_vla.integration.base import required
+from mme_vla.memory.bank import BankState, MemoryBank, Retrieval
+from mme_vla.types import MemoryTokens
 
 
 @dataclass(frozen=True)
 class BankConfig:
-    """Both banks' options; see `MemoryBank`."""
+    """Both banks' options; see `MemoryBank`. A memory in their place is read by as many layers and the same fusion."""
 
     length: int = 16
     retrieval_layers: int = 2
@@ -69,25 +71,106 @@ class BankStates:
     count: int = 0
 
 
-class MemoryVlaCore(nn.Module):
-    """From one cognition token and the vision features of each moment to a chunk of actions.
+class Core(nn.Module):
+    """From cognition and perceptual tokens to a chunk of actions; a subclass says what of the past they are fused with.
 
     Legend: m moments · p patches · widths: c of a vision feature, d of the language model, e of a perceptual token.
     """
 
-    def __init__(
-        self,
-        config: MemoryVlaConfig,
-        cognition_bank: MemoryBank,
-        perceptual_bank: MemoryBank,
-    ) -> None:
+    def __init__(self, config: MemoryVlaConfig, **past: Retrieval) -> None:
         super().__init__()
-        d, e = cognition_bank.width, perceptual_bank.width
         self.config, self.patches = config, config.vision.grid**2
+        d, e = (module.width for module in past.values())
         self.compression = Compression(config.vision.width, config.compression_width, e)
-        self.cognition_bank, self.perceptual_bank = cognition_bank, perceptual_bank
+        for name, module in past.items():
+            self.add_module(name, module)
         self.head = Dit(config.head, config.action_dim, config.horizon, d, e)
         self.schedule = Schedule.cosine()
+
+    def through(
+        self,
+        cognition: Tensor,
+        features: Tensor,
+        times: Tensor,
+        sequences: Sequence[Tensor],
+        memory: MemoryTokens | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """What the head reads of each of m moments: cognition and perceptual tokens, fused with the past.
+
+        Args:
+            cognition: [m, 1, d]. features: [m, p, c].
+            times: [m]. sequences: places of the moments that share a bank, in the order of time. Banks read these.
+            memory: tokens [m, n, e] of each moment's own past, where they stand in the banks' place.
+        """
+        raise NotImplementedError
+
+    def noise_error(
+        self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
+    ) -> Tensor:
+        """The head's error [n, h] on chunks [n, h, a], noised as the draws say."""
+        noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
+        drop = draws["drop"] < self.config.dropout
+        found = self.head(noised, draws["steps"], cognition, perceptual, drop)
+        return (found.float() - draws["noise"].float()).square().mean(-1)
+
+    def copies_error(
+        self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
+    ) -> Tensor:
+        """`noise_error` [r·m, h] on the whole batch of m moments r times over, each time with its own draws."""
+        repeats = len(draws["noise"]) // len(actions)
+        cognition, perceptual, actions = (x.repeat(repeats, 1, 1) for x in (cognition, perceptual, actions))
+        return self.noise_error(actions, cognition, perceptual, draws)
+
+    def sample(self, noise: Tensor, cognition: Tensor, perceptual: Tensor, steps: int | None = None) -> Tensor:
+        """The chunk [b, h, a] that DDIM with guidance makes of noise; nothing is clipped."""
+
+        def predict(x: Tensor, step: int) -> Tensor:
+            times = torch.full((len(x),), step, device=x.device)
+            return self.head.guided(x, times, cognition, perceptual, self.config.guidance)
+
+        return self.schedule.ddim(noise, steps or self.config.ddim_steps, predict)[-1]
+
+
+class RecallingCore(Core):
+    """A memory of the library stands where the banks' entries stood: the same retrieval reads its tokens.
+
+    Its tokens are as wide as perceptual ones; nothing is written.
+    """
+
+    cognition_retrieval: Retrieval
+    perceptual_retrieval: Retrieval
+
+    def __init__(self, config: MemoryVlaConfig) -> None:
+        widths, of_bank = (config.vlm.width, config.perceptual_width), config.bank
+        # Without a time code: each token of a memory says itself when and where it was, if it knows.
+        cognition, perceptual = (
+            Retrieval(width, of_bank.retrieval_layers, False, of_bank.fusion, config.perceptual_width)
+            for width in widths
+        )
+        super().__init__(config, cognition_retrieval=cognition, perceptual_retrieval=perceptual)
+
+    def through(
+        self,
+        cognition: Tensor,
+        features: Tensor,
+        times: Tensor,
+        sequences: Sequence[Tensor],
+        memory: MemoryTokens | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """See `Core.through`; each moment reads its own memory tokens."""
+        past = required(memory)
+        read = self.cognition_retrieval.recall(past, cognition)
+        return read, self.perceptual_retrieval.recall(past, self.compression(features))
+
+
+class MemoryVlaCore(Core):
+    """The original: two banks of its own, that are read and written moment by moment."""
+
+    cognition_bank: MemoryBank
+    perceptual_bank: MemoryBank
+
+    def __init__(self, config: MemoryVlaConfig, cognition_bank: MemoryBank, perceptual_bank: MemoryBank) -> None:
+        super().__init__(config, cognition_bank=cognition_bank, perceptual_bank=perceptual_bank)
 
     def init_state(self) -> BankStates:
         """Both banks empty."""
@@ -111,20 +194,20 @@ class MemoryVlaCore(nn.Module):
             sequences: places of the moments that share a bank, in the order of time.
             draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform; the whole batch r times over.
         """
-        read = self.cognition_bank.run(cognition, times, sequences)[0]
-        seen = self.perceptual_bank.run(self.compression(features), times, sequences)[0]
-        repeats = len(draws["noise"]) // len(actions)
-        read, seen, actions = (x.repeat(repeats, 1, 1) for x in (read, seen, actions))
-        return self.noise_error(actions, read, seen, draws)
+        read, seen = self.through(cognition, features, times, sequences)
+        return self.copies_error(actions, read, seen, draws)
 
-    def noise_error(
-        self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
-    ) -> Tensor:
-        """The head's error [n, h] on chunks [n, h, a], noised as the draws say."""
-        noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
-        drop = draws["drop"] < self.config.dropout
-        found = self.head(noised, draws["steps"], cognition, perceptual, drop)
-        return (found.float() - draws["noise"].float()).square().mean(-1)
+    def through(
+        self,
+        cognition: Tensor,
+        features: Tensor,
+        times: Tensor,
+        sequences: Sequence[Tensor],
+        memory: MemoryTokens | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """See `Core.through`; each sequence begins with empty banks, which take its moments one after the other."""
+        read = self.cognition_bank.run(cognition, times, sequences)[0]
+        return read, self.perceptual_bank.run(self.compression(features), times, sequences)[0]
 
     # Acting
 
@@ -145,14 +228,13 @@ class MemoryVlaCore(nn.Module):
             state.count + 1,
         )
 
-    def sample(self, noise: Tensor, cognition: Tensor, perceptual: Tensor, steps: int | None = None) -> Tensor:
-        """The chunk [b, h, a] that DDIM with guidance makes of noise; nothing is clipped."""
 
-        def predict(x: Tensor, step: int) -> Tensor:
-            times = torch.full((len(x),), step, device=x.device)
-            return self.head.guided(x, times, cognition, perceptual, self.config.guidance)
-
-        return self.schedule.ddim(noise, steps or self.config.ddim_steps, predict)[-1]
+def build_core(config: MemoryVlaConfig, recalls: bool) -> Core:
+    """A fresh core that recalls through a memory, or has banks of its own."""
+    if recalls:
+        return RecallingCore(config)
+    widths = (config.vlm.width, config.perceptual_width)
+    return MemoryVlaCore(config, *(MemoryBank(width, **vars(config.bank)) for width in widths))
 
 
 def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:

@@ -12,7 +12,6 @@ from torch import Tensor
 from mme_vla.memory.bank import BankState
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.policy.memoryvla.core import BankStates, MemoryVlaCore
-from mme_vla.policy.memoryvla.processing import MemoryVlaProcessor
 from mme_vla.policy.written import Written
 
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
@@ -21,9 +20,8 @@ VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, bu
 class Writer(Host, Protocol):
     """What such an episode asks of its policy besides."""
 
-    core: MemoryVlaCore
-
-    def require_processor(self) -> MemoryVlaProcessor: ...
+    @property
+    def banked(self) -> MemoryVlaCore: ...
 
     def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates: ...
 
@@ -38,7 +36,7 @@ class MemoryVlaEpisode(Episode):
     def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
         super().__init__(policy, goal, seed)
         self._writer = policy
-        self.banks: BankStates = policy.core.init_state()
+        self.banks: BankStates = policy.banked.init_state()
         self.asked: tuple[Tensor, Tensor] | None = None
         """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
         self._due: np.ndarray | None = None
@@ -52,7 +50,7 @@ class MemoryVlaEpisode(Episode):
         states: np.ndarray | None = None,
     ) -> None:
         if self.asked is not None:
-            self.banks = self._writer.core.store(self.banks, *self.asked)
+            self.banks = self._writer.banked.store(self.banks, *self.asked)
             self.asked = None
         moments = []
         pictures = dict(zip(range(len(demo)) if drawn is None else drawn.tolist(), frames, strict=True))
@@ -92,11 +90,6 @@ class MemoryVlaEpisode(Episode):
         """See `Writes`."""
         assert isinstance(twin, MemoryVlaEpisode)
         self.asked = twin.asked
-
-    @property
-    def moment(self) -> Tensor:
-        """The current picture [3, s, s] uint8 of the camera that the policy looks through."""
-        return self._writer.require_processor().seen(self.images)
 
 
 def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:

@@ -1,4 +1,4 @@
-"""`MemoryVlaPolicy`: a VLM's cognition token and vision features, two memory banks, a diffusion head."""
+"""`MemoryVlaPolicy`: a VLM's cognition token and vision features, two banks or any memory, a diffusion head."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+import mme_vla.memory  # noqa: F401  (importing the room registers what it ships)
 from mme_vla.backbone.base import Draws, map_draws, stack_draws
-from mme_vla.backbone.layers.attention import additive_mask
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.vision import IMAGENET
@@ -17,18 +17,22 @@ from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.bank import MemoryBank
+from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.composing import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
-from mme_vla.policy.memoryvla.core import BankStates, MemoryVlaConfig, MemoryVlaCore, cognition_token
+from mme_vla.policy.memoryvla.core import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core
 from mme_vla.policy.memoryvla.episode import MemoryVlaEpisode, words
+from mme_vla.policy.memoryvla.moments import read_moments
 from mme_vla.policy.memoryvla.processing import GroupBatch, MemoryVlaProcessor
+from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.openvla_pictures import augment, centre_cut, draw_changes
 from mme_vla.processing.pictures import to_unit_range
 from mme_vla.registry import POLICIES
+from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @POLICIES.register("memoryvla")
@@ -37,16 +41,16 @@ class MemoryVlaPolicy(Policy):
     bank of past moments that is read, fused and written; a diffusion transformer answers.
 
     Training sees groups of moments of one episode, each group in banks of its own; acting writes moment by moment.
+    A memory of the library may stand in the banks' place: each moment then reads its own history's tokens.
     """
 
-    memory = None
     heads = ("core",)
     adapted = ("attn.qkv", "attn.proj", "q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj")
     unadaptable = r"^core\."
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vlm\.vision\.",
         "vlm": r"vlm\.",
-        "memory": r"core\.(cognition_bank|perceptual_bank|compression)\.",
+        "memory": r"memory\.|core\.((cognition|perceptual)_(bank|retrieval)|compression)\.",
         "action": "",
     }
 
@@ -55,7 +59,8 @@ class MemoryVlaPolicy(Policy):
     def __init__(
         self,
         vlm: Prismatic,
-        core: MemoryVlaCore,
+        core: Core,
+        memory: Memory | None = None,
         processor: MemoryVlaProcessor | None = None,
         config: Mapping[str, Any] | None = None,
         *,
@@ -66,16 +71,18 @@ class MemoryVlaPolicy(Policy):
         """Put the parts together.
 
         Args:
+            core: with banks, or for a memory (`build_core`).
             processor: needed for episodes and data; the network alone runs on ready batches without it.
             config: what `from_config` was given; saved with the weights.
             compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
-            history_dtype: unused here; banks hold what the network computes.
+            history_dtype: dtype of stored vision tokens; banks hold what the network computes.
             augment: crop and colour pictures while training.
         """
         super().__init__()
-        self.vlm, self.core, self.processor = vlm, core, processor
+        self.vlm, self.core, self.memory, self.processor = vlm, core, memory, processor
         self.config, self.sizes = dict(config or {}), core.config
         self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
+        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
         self.horizon, self.action_dim = core.config.horizon, core.config.action_dim
         self.sample_steps = core.config.ddim_steps
@@ -84,26 +91,38 @@ class MemoryVlaPolicy(Policy):
     def from_config(
         cls, config: Mapping[str, Any], processor: PolicyProcessor | None = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `policy`.
+        """Build from plain sections `backbone`, `embodiment`, `memory`, `policy`.
 
         Raises:
-            UserError: an unknown option, sizes that do not fit together, or a memory beside its own banks.
+            UserError: an unknown option, sizes that do not fit together, an integration, or a memory that gives past
+                views.
         """
         section = {key: value for key, value in config["backbone"].items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, section, "backbone")
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
-        if config.get("memory") or config.get("integration"):
-            raise UserError("MemoryVLA has banks of its own (backbone.bank): leave memory and integration at none.")
+        if config.get("integration"):
+            raise UserError(
+                f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}: its own retrieval "
+                "reads a memory, in place of its banks. Set integration=none."
+            )
         if processor is not None and not isinstance(processor, MemoryVlaProcessor):
             raise UserError("MemoryVLA needs its own processor: set processor=memoryvla, or memoryvla_tiny to try it.")
+        if processor is not None and processor.group_size == 1 and not config.get("memory"):
+            raise UserError(
+                "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
+                "or more, or a memory in place of the banks (memory=framesamp)."
+            )
         with nullcontext() if fresh_backbone else torch.device("meta"):
             vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
-            banks = (MemoryBank(width, **vars(sizes.bank)) for width in (sizes.vlm.width, sizes.perceptual_width))
-            core = MemoryVlaCore(sizes, *banks)
+            core = build_core(sizes, recalls=bool(config.get("memory")))
         if not fresh_backbone:
             for module in (vlm, core):
                 module.to_empty(device=torch.get_default_device())
-        return cls(vlm, core, processor, config, **policy_options(cls, config))
+        memory: Memory | None = None
+        if config.get("memory"):
+            memory = build_memory(config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width)
+            check_past(config, memory, frozenset())
+        return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
 
     def autocast(self) -> torch.autocast:
         """The context all network code runs in."""
@@ -111,25 +130,6 @@ class MemoryVlaPolicy(Policy):
         return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     # Moments
-
-    def moments(self, pictures: Tensor, prompt: Tensor, prompt_mask: Tensor) -> tuple[Tensor, Tensor]:
-        """Cognition token [n, 1, d] and vision features [n, p, c] of moments.
-
-        Args:
-            pictures: [n, 3, s, s] in [−1, 1]. prompt, prompt_mask: [n, l].
-        """
-        features = self.vlm.encode_images(pictures)
-        embedded, patches = self.vlm.embed(prompt), self.vlm.projector(features)
-        tokens = torch.cat([embedded[:, :1], patches.to(embedded), embedded[:, 1:]], 1)
-        seen = torch.cat(
-            [prompt_mask[:, :1], torch.ones_like(patches[..., 0], dtype=torch.bool), prompt_mask[:, 1:]], 1
-        )
-        n = tokens.shape[1]
-        causal = torch.ones(n, n, dtype=torch.bool, device=tokens.device).tril()
-        mask = additive_mask(causal & seen[:, None, :], tokens.dtype)
-        places = torch.arange(n, device=tokens.device).expand(len(tokens), -1)
-        hidden = self.vlm.read(tokens, mask, places)
-        return cognition_token(hidden, features.shape[1], prompt_mask.sum(1)), features
 
     def _of_batch(self, batch: GroupBatch, changes: Tensor | None = None) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Moments of a batch without its padding, and the places of each group among them.
@@ -144,9 +144,22 @@ class MemoryVlaPolicy(Policy):
             shown = augment(pictures, changes[:, : batch.valid.shape[1]][batch.valid])
         with self.autocast():
             told = (batch.prompt[batch.valid], batch.prompt_mask[batch.valid])
-            cognition, features = self.moments(to_unit_range(shown), *told)
+            cognition, features = read_moments(self.vlm, to_unit_range(shown), *told)
         counts = batch.valid.sum(1).tolist()
         return cognition, features, list(torch.arange(sum(counts)).split(counts))
+
+    @property
+    def banked(self) -> MemoryVlaCore:
+        """The core, where it has banks of its own."""
+        assert isinstance(self.core, MemoryVlaCore)
+        return self.core
+
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """Memory tokens of selections, or None for a policy that has its banks."""
+        if self.memory is None or history is None:
+            return None
+        with self.autocast():
+            return self.memory(history)
 
     # Training
 
@@ -189,12 +202,13 @@ class MemoryVlaPolicy(Policy):
             return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
 
         drawn = map_draws(given, lambda value: whole_batch_over(value.to(self.device)))
+        memory = self.encode_memory(batch.histories())
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
-            actions, times = batch.actions[batch.valid], batch.times[batch.valid]
-            losses = self.core.loss(cognition, features, actions, times, groups, drawn)
-        loss = losses.mean()
-        return loss, {"loss": loss.detach()}
+            read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
+            loss = self.core.copies_error(batch.actions[batch.valid], read, seen, drawn).mean()
+        reported = {} if memory is None else memory.metrics
+        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
     def recompute(self, wanted: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
@@ -211,6 +225,8 @@ class MemoryVlaPolicy(Policy):
         towers, layers = (self.vlm.vision.dino, self.vlm.vision.siglip), self.vlm.language.model.layers
         for module in (*towers, *layers, *self.core.head.blocks):
             module.compile(**options)
+        if self.memory is not None:
+            self.memory.compile(**options)
 
     # Sampling
 
@@ -220,41 +236,54 @@ class MemoryVlaPolicy(Policy):
 
     @torch.no_grad()
     def sample_actions(
-        self, batch: GroupBatch, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+        self,
+        batch: GroupBatch,
+        draws: Mapping[str, Tensor] | None = None,
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
     ) -> Tensor:
-        """A normalised chunk [g, h, a] for the last moment of every group, through the moments before it."""
+        """A normalised chunk [g, h, a] for the last moment of every group: through those before it, or its own memory.
+
+        Args:
+            memory: memory tokens of the last moments, encoded beforehand.
+        """
         if draws is None:
             draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.images))])
+        if self.memory is not None:
+            batch = batch.last()
+            memory = self.encode_memory(batch.history) if memory is None else memory
         cognition, features, groups = self._of_batch(batch)
         with self.autocast():
-            times = batch.times[batch.valid]
-            read, _ = self.core.cognition_bank.run(cognition, times, groups)
-            seen, _ = self.core.perceptual_bank.run(self.core.compression(features), times, groups)
+            read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
             last = [int(group[-1]) for group in groups]
             return self.core.sample(draws["noise"].to(self.device), read[last], seen[last], steps)
 
     # Episodes
 
-    def start_episode(self, goal: str, seed: int = 0) -> MemoryVlaEpisode:
-        """Begin an episode with empty banks."""
-        return MemoryVlaEpisode(self, goal, seed)
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode with empty banks, or an empty memory."""
+        return MemoryVlaEpisode(self, goal, seed) if self.memory is None else super().start_episode(goal, seed)
 
     def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
-        """The current moments of running episodes, each a group of one."""
-        pictures = torch.stack([_own(episode).moment for episode in episodes])
+        """The current moments of running episodes, each a group of one; only banks know what number theirs has."""
+        pictures = self.require_processor().seen(torch.stack([episode.images for episode in episodes]))
         ids, masks = words([episode.prompt for episode in episodes])
-        times = torch.tensor([_own(episode).banks.count for episode in episodes])
+        times = torch.tensor([0 if self.memory is not None else _own(episode).banks.count for episode in episodes])
         valid = torch.ones(len(episodes), 1, dtype=torch.bool)
         return GroupBatch(pictures[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
 
     def answer(
         self, batch: GroupBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        """A chunk for what `observation` saw, through the episodes' banks, which it leaves as they are."""
+        """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""
+        if self.memory is not None:
+            with torch.no_grad(), self.autocast():
+                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+            return self.sample_actions(batch, draws, steps, memory)
         with torch.no_grad():
             cognition, features, _ = self._of_batch(batch)
             with self.autocast():
-                read, seen = self.core.look([_own(episode).banks for episode in episodes], cognition, features)
+                read, seen = self.banked.look([_own(episode).banks for episode in episodes], cognition, features)
                 chunk = self.core.sample(draws["noise"].to(self.device), read, seen, steps)
         for i, episode in enumerate(episodes):
             _own(episode).asked = (cognition[i], features[i])
@@ -267,10 +296,30 @@ class MemoryVlaPolicy(Policy):
         pictures = processor.resized(frames).to(self.device)
         ids, mask = (part.to(self.device).expand(len(frames), -1) for part in prompt)
         with self.autocast():
-            cognition, features = self.moments(to_unit_range(centre_cut(pictures)), ids, mask)
+            cognition, features = read_moments(self.vlm, to_unit_range(centre_cut(pictures)), ids, mask)
             for i in range(len(frames)):
-                banks = self.core.store(banks, cognition[i], features[i])
+                banks = self.banked.store(banks, cognition[i], features[i])
         return banks
+
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        if self.memory is None or not episode.frames_seen:
+            return False
+        with self.autocast():
+            return self.memory.prepare(episode.required_history(), episode.stream)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """What the memory reads; banks may be shown any frame."""
+        return None if self.memory is None else self.memory.frames_read(steps, exec_start)
+
+    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
+        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
+        return encode_frames(self, frames, self.vlm.pooled_tokens, self.sizes.vision.width, batch_size)
+
+    def vision_fingerprint(self) -> str:
+        """A hash of the towers, the dtype they run in, and what a memory's pictures go through before them."""
+        pictures = "" if self.processor is None else self.processor.memory_pictures
+        return tower_fingerprint(self.vlm.vision, self.compute_dtype, pictures, str(self.vlm.vision.dino_standard))
 
     def require_processor(self) -> MemoryVlaProcessor:
         """Return the processor, or say what it takes to have one."""
@@ -297,7 +346,10 @@ class MemoryVlaPolicy(Policy):
     # Costs and parts
 
     def full_batch(self, device: torch.device | str = "cpu") -> GroupBatch:
-        """A group of one moment without content, with the longest prompt; where it is, is known on meta too."""
+        """A group of one moment without content, with the longest prompt and a full memory.
+
+        Where the moment is, is known on meta too.
+        """
         size, length = self.sizes.vision.image_size, int(self.config["processor"]["prompt_length"])
         length += self.embodiment.action.options_length
         known = "cpu" if torch.device(device).type == "meta" else device
@@ -308,6 +360,7 @@ class MemoryVlaPolicy(Policy):
             times=torch.zeros(1, 1, dtype=torch.int64, device=known),
             valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
+            history=None if self.memory is None else self.memory.full_history(self.sizes.vision.width, device),
         )
 
     def see_empty_frame(self) -> None:
@@ -316,7 +369,7 @@ class MemoryVlaPolicy(Policy):
         self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
     def parts(self) -> Mapping[str, str]:
-        """Towers; projector and language model; banks and compression; the head."""
+        """Towers; projector and language model; memory or banks, retrieval and compression; the head."""
         return self.PARTS
 
 

@@ -1,7 +1,7 @@
 """What stands between raw data and MemoryVLA: one camera, words that end, clipped quantiles, groups of one episode."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -11,12 +11,13 @@ from torch import Tensor
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
+from mme_vla.memory.base import stack_history
 from mme_vla.policy.memoryvla.core import MemoryVlaConfig
 from mme_vla.processing.base import Counted, Sample
 from mme_vla.processing.clipped_quantiles import ClippedQuantiles
 from mme_vla.processing.openvla import OpenVlaProcessor
 from mme_vla.registry import PROCESSORS
-from mme_vla.types import TensorStruct
+from mme_vla.types import HistoryTokens, TensorStruct
 
 
 @dataclass
@@ -25,6 +26,8 @@ class GroupBatch(TensorStruct):
 
     images: [g, m, 3, s, s] uint8. prompt: [g, m, l] ids; prompt_mask: [g, m, l] bool. times: [g, m] int64.
     valid: [g, m] bool; False on padding. actions: [g, m, h, a] normalised; None when sampling.
+    history: a memory's selections [g, m, n, …] of all moments, or [g, n, …] of each group's last one alone; None where
+        banks remember.
     """
 
     images: Tensor
@@ -33,6 +36,22 @@ class GroupBatch(TensorStruct):
     times: Tensor
     valid: Tensor
     actions: Tensor | None = None
+    history: HistoryTokens | None = None
+
+    def histories(self) -> HistoryTokens | None:
+        """The selections of all moments without padding, one after the other, [k, n, …]."""
+        return self._histories(self.valid)
+
+    def last(self) -> "GroupBatch":
+        """The last moments, each a group of one, with a history [g, n, …]."""
+        here = self.valid & (self.valid.cumsum(1) == self.valid.sum(1, keepdim=True))
+        alone = replace(self, history=None)._map(lambda x: x[here][:, None])
+        return replace(alone, history=self._histories(here))
+
+    def _histories(self, chosen: Tensor) -> HistoryTokens | None:
+        if self.history is None or self.history.mask.ndim == 2:
+            return self.history
+        return self.history.rows(chosen)
 
 
 @PROCESSORS.register("memoryvla")
@@ -48,11 +67,11 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings.
 
         Raises:
-            UserError: also where that is not a whole number above 1.
+            UserError: also where that is not a positive whole number.
         """
         size = config.get("group_size", cls.group_size)
-        if isinstance(size, bool) or not isinstance(size, int) or size < 2:
-            raise UserError(f"processor.group_size must be a whole number from 2 on, not {brief(size)}.")
+        if isinstance(size, bool) or not isinstance(size, int) or size < 1:
+            raise UserError(f"processor.group_size must be a positive whole number, not {brief(size)}.")
         built = super().from_config({key: value for key, value in config.items() if key != "group_size"})
         built.group_size = size
         return built
@@ -121,24 +140,31 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> GroupBatch:  # type: ignore[override]
-        """Groups side by side, the shorter ones filled up with their last moment."""
-        longest = max(len(item["moments"]) for item in items)
-
-        def rows(item: dict[str, Any]) -> list[int]:
-            return np.minimum(np.arange(longest), len(item["moments"]) - 1).tolist()
+        """Groups side by side, the shorter ones filled up with their last moment; a single step is a group of one."""
+        groups = [item.get("moments", [item]) for item in items]
+        times = [torch.as_tensor(item.get("times", item["place"][-1:])) for item in items]
+        longest = max(map(len, groups))
+        rows = [np.minimum(np.arange(longest), len(group) - 1).tolist() for group in groups]
 
         def stack(name: str) -> Tensor:
-            return torch.stack([torch.stack([item["moments"][i][name] for i in rows(item)]) for item in items])
+            return torch.stack(
+                [torch.stack([group[i][name] for i in at]) for group, at in zip(groups, rows, strict=True)]
+            )
 
+        history = None
+        if "history" in groups[0][0]:
+            every = [group[i]["history"] for group, at in zip(groups, rows, strict=True) for i in at]
+            history = stack_history(every)._map(lambda x: x.unflatten(0, (len(groups), longest)))
         mask = stack("prompt_mask")
         length = int(mask.sum(-1).max())
         return GroupBatch(
             images=stack("images"),
             prompt=stack("prompt")[..., :length],
             prompt_mask=mask[..., :length],
-            times=torch.stack([torch.as_tensor(item["times"])[rows(item)] for item in items]),
-            valid=torch.stack([torch.arange(longest) < len(item["moments"]) for item in items]),
+            times=torch.stack([of[at] for of, at in zip(times, rows, strict=True)]),
+            valid=torch.stack([torch.arange(longest) < len(group) for group in groups]),
             actions=stack("actions"),
+            history=history,
         )
 
     def to_config(self) -> dict[str, Any]:
