@@ -26,6 +26,7 @@ from mme_vla.evaluation.probe.offline import OfflineSettings, probe_offline
 from mme_vla.evaluation.probe.recordings import all_recordings
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.memoryvla.core import MemoryVlaCore, RecallingCore
 from mme_vla.policy.memoryvla.policy import MemoryVlaPolicy
@@ -254,6 +255,18 @@ def test_a_cache_is_of_the_pictures_that_its_tower_saw(policy: MemoryVlaPolicy) 
     plain = recalling(processor={"jpeg": False})
     assert torch.equal(policy.vlm.vision.dino.cls_token, plain.vlm.vision.dino.cls_token)
     assert policy.vision_fingerprint() == recalling().vision_fingerprint() != plain.vision_fingerprint()
+
+
+@pytest.mark.parametrize(("model", "words"), [("memoryvla", {}), ("memoryvla", {"memory": "ttt"}), ("openvla_oft", {})])
+def test_what_a_checkpoint_to_start_from_lacks_is_drawn(model: str, words: dict[str, Any]) -> None:
+    """Training does not draw what `init_from` will replace: openvla-7b has neither heads nor banks."""
+    torch.use_deterministic_algorithms(True)  # memory that nobody has written is nan then
+    try:
+        policy = build_from_config(compose("policy", policy_words(model, words)), fresh_backbone=False)
+    finally:
+        torch.use_deterministic_algorithms(False)
+    waiting = {policy.part_of(name) for name, value in policy.state_dict().items() if value.isnan().any()}
+    assert waiting == {"vision", "vlm"}
 
 
 def test_it_starts_from_a_policy_with_banks_whose_banks_stay_behind(tmp_path: Path) -> None:

@@ -109,7 +109,10 @@ class Backbone(nn.Module):
         super().__init__()
 
     def draw_experts(self, names: Sequence[str]) -> None:
-        """Give the experts that an integration asked for fresh weights; all others wait for a checkpoint."""
+        """Give fresh weights to what a checkpoint to start from may lack; all others wait for it.
+
+        Such are the experts that an integration asked for, and heads of this backbone's own.
+        """
         if names:
             raise NotImplementedError(f"{type(self).__name__} hosts no further experts.")
 

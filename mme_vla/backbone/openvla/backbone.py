@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from mme_vla.backbone.base import Backbone, Inject
 from mme_vla.backbone.layers.attention import additive_mask
@@ -68,6 +68,14 @@ class OpenVlaBackbone(Backbone):
         self.state_token = StateToken(config.state_dim, width) if config.state_dim else None
         self.head = ActionHead(width, config.action_dim)
         self.heads = ("head",) if self.state_token is None else ("state_token", "head")
+
+    def draw_experts(self, names: Sequence[str]) -> None:
+        """Draw the head and the state's token, which OpenVLA itself has nothing of."""
+        super().draw_experts(names)
+        for name in self.heads:
+            for module in self.get_submodule(name).modules():
+                if isinstance(module, nn.Linear | nn.LayerNorm):
+                    module.reset_parameters()
 
     @property
     def vision(self) -> Any:  # type: ignore[override]

@@ -114,10 +114,11 @@ class MemoryVlaPolicy(Policy):
             )
         with nullcontext() if fresh_backbone else torch.device("meta"):
             vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
-            core = build_core(sizes, recalls=bool(config.get("memory")))
         if not fresh_backbone:
-            for module in (vlm, core):
-                module.to_empty(device=torch.get_default_device())
+            vlm.to_empty(device=torch.get_default_device())
+        core = build_core(
+            sizes, recalls=bool(config.get("memory"))
+        )  # drawn in any case: OpenVLA, to start from, has none
         memory: Memory | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width)
