@@ -116,9 +116,8 @@ class MemoryVlaPolicy(Policy):
             vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
         if not fresh_backbone:
             vlm.to_empty(device=torch.get_default_device())
-        core = build_core(
-            sizes, recalls=bool(config.get("memory"))
-        )  # drawn in any case: OpenVLA, to start from, has none
+        # Drawn in any case: OpenVLA, to start from, has none.
+        core = build_core(sizes, recalls=bool(config.get("memory")))
         memory: Memory | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width)
