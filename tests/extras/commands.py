@@ -15,8 +15,11 @@ import tempfile
 import time
 import traceback
 from contextlib import redirect_stderr
+from multiprocessing import forkserver
 
 import sitecustomize
+
+from mme_vla.envs.vector import processes
 
 SLOW = (
     "torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "mme_vla.policy.mme",
@@ -25,14 +28,33 @@ SLOW = (
 """What most commands import, without any extra; not Hydra, which looks for its plugins as it is imported."""
 
 
+SIMULATOR = "mani_skill"
+
+
+def hide(modules: list[str]) -> None:
+    """Let these modules not exist, here and in processes started from here."""
+    sitecustomize.Selective.hidden = frozenset(modules)
+    os.environ["HIDDEN_MODULES"] = " ".join(modules)
+
+
+def have_simulator(hidden: list[str]) -> None:
+    """Import it, where all but its own extra is hidden, and start the process that simulating ones are forked from."""
+    hide(hidden)
+    processes.simulating_processes()
+    forkserver.ensure_running()
+    for module in processes.PRELOADED:
+        importlib.import_module(module)
+
+
 def child(words: list[str], hidden: list[str], printed: int) -> None:
     """Be the command; never returns."""
     code: object = 0
     try:
         os.dup2(printed, 1)
         os.dup2(printed, 2)
-        sitecustomize.Selective.hidden = frozenset(hidden)
-        os.environ["HIDDEN_MODULES"] = " ".join(hidden)
+        hide(hidden)
+        if SIMULATOR not in hidden:
+            forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign, attr-defined]
         sys.argv = list(words)
         runpy.run_module(words[0], run_name="__main__", alter_sys=True)
     except SystemExit as error:
@@ -70,4 +92,10 @@ if __name__ == "__main__":
     with redirect_stderr(io.StringIO()):
         for slow in SLOW:
             importlib.import_module(slow)
-    print(json.dumps([run(*command) for command in asked]))
+    ended = {}
+    for simulates in (False, True):
+        some = [i for i, (_, hidden, _) in enumerate(asked) if (SIMULATOR not in hidden) == simulates]
+        if simulates and some:
+            have_simulator(max((asked[i][1] for i in some), key=len))
+        ended |= {i: run(*asked[i]) for i in some}
+    print(json.dumps([ended[i] for i in range(len(asked))]))
