@@ -1,13 +1,13 @@
 """Every file of `benchmarks/` and `examples/` that is meant to be run imports what it uses and has a `--help`."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
+
+import forked
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
-# One process for all files: importing PyTorch is most of the time.
+# One process for all files, which has imported PyTorch: that is most of the time.
 ALL = """
 import contextlib, io, json, runpy, sys, traceback
 ended = {}
@@ -26,7 +26,7 @@ print(json.dumps(ended))
 """
 
 
-def test_every_benchmark_and_example_imports_and_has_help() -> None:
+def test_every_benchmark_and_example_imports_and_has_help(tmp_path: Path) -> None:
     files = sorted(
         str(file)
         for folder in ("benchmarks", "examples")
@@ -34,9 +34,9 @@ def test_every_benchmark_and_example_imports_and_has_help() -> None:
         if '__name__ == "__main__"' in file.read_text()
     )
     assert any(file.endswith("subgoal_cost.py") for file in files)
-    done = subprocess.run(
-        [sys.executable, "-c", ALL, json.dumps(files)], cwd=REPOSITORY, capture_output=True, text=True, timeout=280
-    )
+    all_of_them = tmp_path / "all.py"
+    all_of_them.write_text(ALL)
+    done = forked.run(str(all_of_them), json.dumps(files))
     assert done.returncode == 0, done.stderr
     ended = json.loads(done.stdout.splitlines()[-1])
     assert {Path(file).name: code for file, (code, _) in ended.items() if code != 0} == {}
