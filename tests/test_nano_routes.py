@@ -19,7 +19,7 @@ from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy
 
-ROWS = {"framesamp": 69, "pi05": 1, "planner": 100}
+ROWS = {"framesamp": 73, "pi05": 3, "planner": 100}
 DECISIONS = np.array([20, 40, 60, 80, 100])
 
 
@@ -103,4 +103,4 @@ def test_the_pages_figures_of_routes_follow_from_the_records() -> None:
     assert len(records) == 300 and {model: len(found) for model, found in won.items()} == ROWS
     assert won["pi05"] < won["framesamp"]
     page = (REPOSITORY / "docs" / "nano.md").read_text()
-    assert "| **69 %** (59 … 77) | 50/50 | 15/25 | 4/25 |" in page and "| 1 % (0 … 5) | 1/50 | 0/25 | 0/25 |" in page
+    assert "| **73 %** (64 … 81) | 50/50 | 19/25 | 4/25 |" in page and "| 3 % (1 … 8) | 3/50 | 0/25 | 0/25 |" in page
