@@ -3,7 +3,9 @@
 import gc
 import os
 import sys
+from multiprocessing import forkserver
 from pathlib import Path
+from typing import Any
 
 # Tests are run side by side (`pytest -n auto`): one thread each, as many tests as there are cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -43,8 +45,24 @@ def _imports_left_out_of_collections() -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Files in their order: pytest-xdist would begin with those of many tests, and end with the longest single ones."""
+    """Files in their order: pytest-xdist would begin with those of many tests, and end with the longest single ones.
+
+    Test workers have one process in common that commands and simulating processes are forked from.
+    """
     config.option.loadscopereorder = False
+    given = getattr(config, "workerinput", {}).get("forkserver")
+    if given is not None:
+        server: Any = forkserver._forkserver
+        server._forkserver_address, server._forkserver_alive_fd = given, os.open(os.devnull, os.O_RDONLY)
+        server.ensure_running = lambda: None  # the process that started the test workers did
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Before a test worker starts: tell it where that process listens."""
+    processes.simulating_processes()
+    forkserver.ensure_running()
+    node.workerinput["forkserver"] = forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
 
 
 _MEMORY_OF_A_WORKER = 3 * 2**30

@@ -78,7 +78,7 @@ def _be(words: Sequence[str], cwd: Path, hidden: Sequence[str], out: Path, err: 
         command = [sys.executable, "-W", "ignore", *([] if words[0].endswith(".py") else ["-m"]), *words]
         os.execve(sys.executable, command, os.environ | variables)
     # Its workers are forked from where it was; Python 3.12 would import everything once more for them.
-    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign, attr-defined]
+    forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]
     sys.path.insert(0, str(cwd))
     sys.argv = list(words)
     if words[0].endswith(".py"):

@@ -54,7 +54,7 @@ def child(words: list[str], hidden: list[str], printed: int) -> None:
         os.dup2(printed, 2)
         hide(hidden)
         if SIMULATOR not in hidden:
-            forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign, attr-defined]
+            forkserver._forkserver.ensure_running = lambda: None  # type: ignore[method-assign]
         sys.argv = list(words)
         runpy.run_module(words[0], run_name="__main__", alter_sys=True)
     except SystemExit as error:
@@ -92,7 +92,7 @@ if __name__ == "__main__":
     with redirect_stderr(io.StringIO()):
         for slow in SLOW:
             importlib.import_module(slow)
-    ended = {}
+    ended: dict[int, tuple[int, str]] = {}
     for simulates in (False, True):
         some = [i for i, (_, hidden, _) in enumerate(asked) if (SIMULATOR not in hidden) == simulates]
         if simulates and some:
