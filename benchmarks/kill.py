@@ -63,12 +63,14 @@ def attack(
     first: int = 1,
     only: Sequence[str] = (),
     thin: bool = False,
+    skip: int = 0,
 ) -> Outcome:
     """Kill a command before every so manieth of its changes from number `first` on, each time in a new folder.
 
     Args:
         only: kinds of change to kill before, such as `rename`; empty: all.
         thin: of successive writes to one file take the first, the middle and the last one alone.
+        skip: leave out so many, which an earlier attack had time for.
     """
     command, begun, found = COMMANDS[name], time.monotonic(), Outcome(name)
     inputs, log = base / f"{name}-inputs", base / f"{name}.log"
@@ -81,7 +83,7 @@ def attack(
     numbers = [n for n in chosen if n >= first and (not only or changes[n - 1].split()[0] in only)]
     numbers = numbers[::every]
     random.Random(0).shuffle(numbers)  # so that what there is time for is spread over the run
-    for number in numbers:
+    for number in numbers[skip:]:
         if time.monotonic() > until:
             break
         folder.mkdir()
@@ -169,6 +171,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=(), help="kinds of operation, such as rename (default: all)")
     parser.add_argument("--thin", action="store_true", help="three of the successive writes to one file, not all")
     parser.add_argument("--minutes", type=float, default=60, help="stop killing after so long (default: 60)")
+    parser.add_argument("--skip", type=int, default=0, help="go on after so many kills of an earlier attack")
     parser.add_argument("--json", type=Path, help="write the outcomes here")
     given = parser.parse_args()
     if unknown := set(given.commands) - set(COMMANDS):
@@ -178,7 +181,7 @@ def main() -> None:
     print("|---|" + "---:|" * 7)
     with tempfile.TemporaryDirectory() as base:
         for name in given.commands:
-            o = attack(name, given.every, Path(base).resolve(), until, given.first, given.only, given.thin)
+            o = attack(name, given.every, Path(base).resolve(), until, given.first, given.only, given.thin, given.skip)
             outcomes.append(o)
             numbers = (o.changes, o.kills, o.refused, o.wrong, o.left, o.outlived, o.seconds)
             print(f"| {name} | " + " | ".join(map(str, numbers)) + " |", flush=True)
