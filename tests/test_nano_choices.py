@@ -46,7 +46,8 @@ def test_a_row_by_choices_is_of_a_hundred_scenes_of_one_difficulty(task: str, le
     ],
 )
 def test_the_figures_of_rows_by_choices_follow_from_the_records(task: str, model: str) -> None:
-    records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / task / model]))
+    read = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / task / model]))
+    records = {record.episode: record for record in read}.values()  # one that ended in an error was tried twice
     page = (REPOSITORY / "docs" / "nano.md").read_text()
     (row,) = [line for line in page.splitlines() if line.startswith(f"| {task}, ") and f"choices | `{model}`" in line]
     done = sum(record.success for record in records)
