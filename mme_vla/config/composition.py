@@ -121,7 +121,7 @@ def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, .
         fixed = _fixed(trees, overrides)
         tree = ConfigTree(engine.config_loader, config_name, _parse(overrides), fixed)
         try:
-            cfg = join_memories(hydra.compose(config_name, list(overrides)))
+            cfg = join_memories(tree.composed(overrides))
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()

@@ -9,6 +9,7 @@ import hashlib
 import json
 import re
 from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +44,25 @@ def decisive(cfg: DictConfig) -> Sections:
 
 def may_remember(model: Path, memory: str | None) -> bool:
     """Whether a model's file may compose to this memory: a look at two files, where composing takes 60 ms a model."""
-    described = OmegaConf.to_container(OmegaConf.load(model))
+    described = _read(model)
     if not isinstance(described, dict) or "name" in (described.get("memory") or {}):
         return True
     chosen = [one["/memory"] for one in described.get("defaults") or () if isinstance(one, dict) and "/memory" in one]
     file = model.parent.parent / "memory" / f"{chosen[0]}.yaml" if chosen else None
     if file is None or not file.is_file():
         return True
-    name = OmegaConf.to_container(OmegaConf.load(file))
+    name = _read(file)
     return not isinstance(name, dict) or name.get("name") == memory
+
+
+def _read(file: Path) -> Any:
+    return _parsed(file, file.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=256)
+def _parsed(file: Path, changed: int) -> Any:
+    """A YAML file as it was when it was last changed; every name with differences asks for all models."""
+    return OmegaConf.to_container(OmegaConf.load(file))
 
 
 def variant_name(

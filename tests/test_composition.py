@@ -1,0 +1,42 @@
+"""Choices of the library's own files are composed once, and values set on them: as Hydra itself would have done."""
+
+from pathlib import Path
+
+import pytest
+
+from mme_vla import UserError
+from mme_vla.config.composition import compose
+
+MEMORY = ["model=framesamp_modul", "memory.budget=5"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [*MEMORY, "memory={budget:4}", "train.lr=1", "train.lr=2"],
+        [*MEMORY, "+memory.extra=2", "~memory.extra", "++train.more=1", "backbone.depth=1"],
+        ["model=framesamp_modul", "backbone=tiny", "~memory", "name=${seed}"],
+        ["model=pi05", "memory=[framesamp,ttt]", "integration=expert"],
+        ["model=ttt_expert", "memory.chunk=2", "memory.max_steps=3"],
+    ],
+)
+def test_values_are_set_as_hydra_sets_them(words: list[str], tmp_path: Path) -> None:
+    compose("train", words[:1])  # remembered from now on
+    quick = compose("train", words)
+    assert quick == compose("train", words, extra_dirs=[tmp_path])  # with a folder more Hydra composes anew
+    assert quick != compose("train", words[:1])
+
+
+@pytest.mark.parametrize("word", ["train.lrr=3", "+train.lr=3", "~train.lrr", "train.lr@x=3", "seed=1,2", "~model=pi0"])
+def test_what_does_not_fit_is_said_in_the_same_words(word: str, tmp_path: Path) -> None:
+    said = []
+    for folders in ([], [tmp_path]):
+        with pytest.raises(UserError) as refused:
+            compose("train", [*MEMORY, word], extra_dirs=folders)
+        said.append(str(refused.value))
+    assert said[0] == said[1]
+
+
+def test_what_is_remembered_is_not_what_is_handed_out() -> None:
+    compose("train", MEMORY).memory.budget = 6
+    assert compose("train", MEMORY).memory.budget == 5 == compose("train", [*MEMORY, "seed=1"]).memory.budget
