@@ -188,11 +188,12 @@ def _composed_sections(
     config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
 ) -> tuple[str, Sections] | None:
     """Name and decisive keys of a composition; None where these words do not compose."""
-    with _own_hydra(trees[0], trees[1:]):
+    with _own_hydra(trees[0], trees[1:]) as engine:
         try:
-            cfg = join_memories(hydra.compose(config_name, list(overrides)))
+            tree = ConfigTree(engine.config_loader, config_name, _parse(overrides), _fixed(trees, overrides))
+            cfg = join_memories(tree.composed(overrides))
             return str(cfg.name), decisive(cfg)
-        except COMPOSITION_ERRORS:
+        except (*COMPOSITION_ERRORS, UserError):
             return None
 
 
