@@ -1,8 +1,15 @@
-"""What the processes of test_sharded_training.py do: `python sharded_runs.py <what> <folder>` in each of them."""
+"""What the processes of test_sharded_training.py do: `python sharded_runs.py <folder>` runs all, one after the other.
 
+They are forks of one that has imported and composed what they need, which takes longer than what they do.
+"""
+
+import copy
+import importlib
 import json
+import multiprocessing
 import os
 import signal
+import socket
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -26,8 +33,11 @@ from mme_vla.training.optim import clip_gradients, make_optimizer
 from mme_vla.training.parallel import ParallelSettings, gathered, is_sharded, shard, whole_number
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
+from mme_vla.training.shards import shard_files
 from mme_vla.training.validation import Validation
 
+RUNS = [(2, "train,stop,policies,die"), (1, "go_on"), (3, "resume"), (1, "whole")]
+"""How many processes do what one after the other; starting them takes longer than what they do, so few do much."""
 MODELS = ("tokendrop_expert", "diffusion_policy", "openvla_oft_tokendrop_context", "memoryvla", "sam2act_plus")
 SHARDED = {"parallel": {"strategy": "fsdp"}}
 BATCH = 6  # of two and of three processes
@@ -116,26 +126,26 @@ def update_of(model: Policy, batch: Any, draws: dict[str, Tensor]) -> tuple[floa
 
 def compare(name: str, dtype: str) -> dict[str, Any]:
     """One update of a model alone and shared, and a chunk that it then answers with."""
-
-    def built() -> Policy:
-        made = build_policy(name, policy={"compute_dtype": dtype, "augment": False})
-        if hasattr(made, "backbone") and hasattr(made, "integration"):
-            open_gates(made)  # type: ignore[arg-type]
-        apply_finetuning(made)  # type: ignore[arg-type]
-        made.recompute(True)
-        return made.train()
-
-    alone, shared = built(), built()
+    alone = build_policy(name, policy={"compute_dtype": dtype, "augment": False})
+    if hasattr(alone, "backbone") and hasattr(alone, "integration"):
+        open_gates(alone)  # type: ignore[arg-type]
+    apply_finetuning(alone)
+    alone.recompute(True)
+    alone.train()
+    shared = copy.deepcopy(alone)
     shard(shared, ParallelSettings("fsdp").mesh("cpu"), shared.compute_dtype)
     batch = alone.full_batch()
     draws = alone.loss_draws(1, torch.Generator().manual_seed(1))
-    results = {"alone": update_of(alone, batch, draws), "shared": update_of(shared, batch, draws)}
     start = alone.sample_draws(torch.Generator().manual_seed(2))
     asked = {key: value[None] for key, value in start.items()}
-    for one, again in ((alone.eval(), None), (shared.eval(), shared.train)):
-        with gathered(one):
-            chunk = one.sample_actions(batch, asked, steps=2)
-        results["alone chunk" if again is None else "shared chunk"] = chunk.float().abs().mean().item()
+    results: dict[str, Any] = {}
+    for which, model in (("alone", alone), ("shared", shared)):
+        if model is alone and distributed.get_rank():
+            continue  # the first process's is enough
+        results[which] = update_of(model, batch, draws)
+        with gathered(model.eval()):
+            chunk = model.sample_actions(batch, asked, steps=2)
+        results[f"{which} chunk"] = chunk.float().abs().mean().item()
     with torch.no_grad():  # sampling left it as it was
         torch.manual_seed(3)
         loss, _ = shared.train()(batch, draws)
@@ -147,6 +157,18 @@ def policies(folder: Path) -> dict[str, Any]:
     return {**{name: compare(name, "float32") for name in MODELS}, "framesamp_modul bfloat16": low}
 
 
+def go_on(folder: Path) -> dict[str, Any]:
+    """One process goes on, from the parts of two."""
+    parts = len(shard_files(resolve_checkpoint(folder / "run")))
+    return {"parts": parts, "finished": finish_run(trainer(folder / "run", 6, resumed=True))}
+
+
+def whole(folder: Path) -> dict[str, Any]:
+    job = trainer(folder / "whole", 8)
+    assert finish_run(job)
+    return validation_losses(job)
+
+
 def resume(folder: Path) -> dict[str, Any]:
     job = trainer(folder / "run", 8, resumed=True, accumulate=2, **SHARDED)  # gradients travel with the last piece
     assert finish_run(job)
@@ -154,19 +176,50 @@ def resume(folder: Path) -> dict[str, Any]:
 
 
 DONE: dict[str, Callable[[Path], Any]] = {
-    "train": train, "stop": stop, "die": die, "policies": policies, "resume": resume,
+    "train": train, "stop": stop, "die": die, "policies": policies, "go_on": go_on, "resume": resume, "whole": whole,
 }  # fmt: skip
 
 
-def main(what: list[str], folder: Path) -> None:
-    torch.set_num_threads(1)
-    Accelerator(cpu=True)  # joins the others
-    for name in what:
+def rank(number: int, processes: int, port: int, what: str, folder: Path) -> None:
+    """One of the processes, as torchrun starts them, without its half a minute of patience."""
+    if processes > 1:
+        shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port, "WORLD_SIZE": processes, "RANK": number}
+        shared |= {"LOCAL_WORLD_SIZE": processes, "LOCAL_RANK": number}
+        os.environ.update({key: str(value) for key, value in shared.items()})
+        Accelerator(cpu=True)  # joins the others
+    for name in what.split(","):
         answer = DONE[name](folder)
-        if distributed.get_rank() == 0:
+        if number == 0:
             (folder / f"{name}.json").write_text(json.dumps(answer))
-    distributed.destroy_process_group()
+    if processes > 1:
+        distributed.destroy_process_group()
+
+
+def prepare() -> None:
+    """Import and compose what the processes would each for themselves."""
+    for module in ("diffusers", "torchvision", "timm", "transformers.models.llama.modeling_llama"):
+        importlib.import_module(module)
+    for name in (*MODELS, "framesamp_modul"):
+        build_policy(name, device="meta", policy={"compute_dtype": "float32", "augment": False})
+
+
+def main(folder: Path) -> None:
+    torch.set_num_threads(1)
+    prepare()
+    fork = multiprocessing.get_context("fork")
+    ended = {}
+    for count, what in RUNS:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        started = [fork.Process(target=rank, args=(number, count, port, what, folder)) for number in range(count)]
+        for process in started:
+            process.start()
+        for process in started:
+            process.join()
+        ended[what] = [process.exitcode for process in started]
+    (folder / "ended.json").write_text(json.dumps(ended))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1].split(","), Path(sys.argv[2]))
+    main(Path(sys.argv[1]))

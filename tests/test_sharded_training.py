@@ -1,7 +1,6 @@
 """Processes that share the weights: they learn what one process learns, whoever saves, resumes, stops or dies."""
 
 import json
-import socket
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import forked
 import pytest
 import sharded_runs
 import torch
-from sharded_runs import finish_run, trainer, validation_losses
+from sharded_runs import RUNS, trainer
 
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
@@ -24,27 +23,6 @@ CLOSE = 2e-6
 """Largest relative difference of losses that are added up in another order."""
 
 
-def start(processes: int, what: str, folder: Path) -> list[forked.Command]:
-    """As torchrun starts them, without its half a minute of patience."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    shared = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": str(processes),
-              "LOCAL_WORLD_SIZE": str(processes), "OMP_NUM_THREADS": "1"}  # fmt: skip
-    file = str(Path(sharded_runs.__file__))
-    return [
-        forked.Command(file, what, str(folder), env=shared | {"RANK": str(rank), "LOCAL_RANK": str(rank)})
-        for rank in range(processes)
-    ]
-
-
-def run(processes: int, what: str, folder: Path, ends: tuple[int, ...] = ()) -> None:
-    """Have processes do one thing after the other; each ends with 0, or as it is said in `ends`."""
-    ended = [command.finish(500) for command in start(processes, what, folder)]
-    said = "\n".join(done.stdout + done.stderr for done in ended)
-    assert tuple(done.returncode for done in ended) == (ends or (0,) * processes), said[-3000:]
-
-
 def answer(folder: Path, what: str) -> Any:
     return json.loads((folder / f"{what}.json").read_text())
 
@@ -57,16 +35,14 @@ def losses(folder: Path, name: str = "train/loss") -> list[float]:
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two processes to step 4, one to 6, three to 8; two that are stopped, and two of which one is killed.
 
-    Starting a process takes longer than what it does, so the same two do all of theirs. Beside them one that did all 8.
+    Beside them one that did all 8.
     """
     folder = tmp_path_factory.mktemp("shared")
-    run(2, "train,stop,policies,die", folder, ends=(1, -9))
-    assert len(shard_files(resolve_checkpoint(folder / "run"))) == 2
-    assert finish_run(trainer(folder / "run", 6, resumed=True))
-    run(3, "resume", folder)
-    whole = trainer(folder / "whole", 8)
-    assert finish_run(whole)
-    (folder / "alone.json").write_text(json.dumps(validation_losses(whole)))
+    done = forked.run(str(Path(sharded_runs.__file__)), str(folder), env={"OMP_NUM_THREADS": "1"}, timeout=500)
+    ended = answer(folder, "ended") if done.returncode == 0 else {}
+    codes = [(1, -9) if "die" in what else (0,) * processes for processes, what in RUNS]
+    assert [tuple(code) for code in ended.values()] == codes, (done.stdout + done.stderr)[-3000:]
+    assert answer(folder, "go_on") == {"parts": 2, "finished": True}
     return folder
 
 
@@ -80,7 +56,7 @@ def test_two_then_one_then_three_processes_learn_what_one_learns(folder: Path) -
 
 
 def test_the_averages_are_what_is_validated_and_saved(folder: Path) -> None:
-    shared, alone = answer(folder, "resume"), answer(folder, "alone")
+    shared, alone = answer(folder, "resume"), answer(folder, "whole")
     assert shared == pytest.approx(alone, rel=CLOSE)
     assert abs(shared["raw"] - shared["average"]) > 1e-3
     parts = Policy.from_pretrained(resolve_checkpoint(folder / "run")).state_dict()
@@ -102,7 +78,7 @@ def test_a_stop_signal_to_one_process_saves_what_all_hold(folder: Path) -> None:
 
 
 def test_a_killed_process_ends_the_others(folder: Path) -> None:
-    """Of the fixture's two the second killed itself; the first then ended with an error, which `run` compared."""
+    """Of the fixture's two the second killed itself; the first then ended with an error, which it compared."""
     assert answer(folder, "policies")
     assert not (folder / "die.json").exists()
     assert not checkpoints_in(folder / "killed" / "checkpoints")
