@@ -19,6 +19,7 @@ from mme_vla.policy.openvla import OpenVlaPolicy
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import random_batch
 
+TOWER = {"width": 8, "depth": 2, "mlp_dim": 16, "num_heads": 1}
 SMALL = ["train.batch_size=2", "backbone.vision.image_size=32", "backbone.vision.patch_size=2"]
 
 
@@ -38,7 +39,8 @@ def test_it_trains_by_the_command_and_resumes_where_it_stopped(extra: tuple[str,
 
 
 def test_with_a_memory_it_answers_by_what_it_remembers() -> None:
-    policy = build_policy("openvla_oft_framesamp_context").train()
+    small = {"image_size": 32, "patch_size": 2} | dict.fromkeys(("dino", "siglip"), TOWER)
+    policy = build_policy("openvla_oft_framesamp_context", backbone={"vision": small}, memory={"budget": 64}).train()
     assert isinstance(policy, OpenVlaPolicy)
     policy.augment = False
     batch = random_batch(policy, 2, valid=64)
@@ -49,7 +51,7 @@ def test_with_a_memory_it_answers_by_what_it_remembers() -> None:
     }
     answers = torch.tensor([1.0, -1.0])[:, None, None].expand_as(batch.actions)
     batch = replace(batch, **alike, actions=answers, proprio=torch.zeros(2, policy.embodiment.state.width))
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=2e-3)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=4e-3)
     for _ in range(80):
         optimizer.zero_grad()
         loss, _ = policy(batch)
