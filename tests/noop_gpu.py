@@ -26,6 +26,19 @@ def _lacking() -> str:
     return "" if all(folder.is_dir() for folder in HEADERS) else "this PyTorch brings no CUDA 13 headers"
 
 
+_EACH = """
+import importlib, os, runpy, sys
+script, *jobs = sys.argv[1:]
+runpy.run_path(script)
+for name in ("timm", "torch._dynamo"):
+    importlib.import_module(name)
+for job in jobs:
+    if (child := os.fork()) == 0:
+        sys.argv = [script, *job.split()]
+        runpy.run_path(script, run_name="__main__")
+    if os.waitpid(child, 0)[1]:
+        sys.exit(1)
+"""
 needs_noop_gpu = pytest.mark.skipif(bool(_lacking()), reason=_lacking() or "it is at hand")
 
 
@@ -46,6 +59,11 @@ class NoopGpu:
         )
         assert told.returncode == 0, told.stderr[-2000:]
         return told.stdout
+
+    def run_each(self, script: Path, *jobs: str) -> list[str]:
+        """The line of JSON that a script prints for each of these words; what it imports is imported once."""
+        printed = self.run("-c", _EACH, str(script), *jobs).splitlines()
+        return [line for line in printed if line.startswith("{")]
 
 
 @pytest.fixture(scope="module")
