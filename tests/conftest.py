@@ -17,7 +17,7 @@ from mme_vla.envs.vector import processes
 REPOSITORY = Path(__file__).resolve().parent.parent
 
 # What commands import besides: `forked.py` runs them in the same way as workers.
-processes.PRELOADED += ["lerobot.datasets.lerobot_dataset", "matplotlib.pyplot"]
+processes.PRELOADED += ["lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.training.loop"]
 
 
 def _folder(variable: str, default: Path, what: str) -> Path:
