@@ -70,12 +70,12 @@ _MEMORY_OF_A_WORKER = 3 * 2**30
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """`-n auto`: three workers for two cores, as tests wait a quarter of their time for disks and processes."""
+    """`-n auto`: two workers for each core, as tests wait for disks, processes and each other's end."""
     if "PYTEST_XDIST_AUTO_NUM_WORKERS" in os.environ:
         return None
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return max(1, min(cores * 3 // 2, memory // _MEMORY_OF_A_WORKER))
+    return max(1, min(cores * 2, memory // _MEMORY_OF_A_WORKER))
 
 
 @pytest.fixture(autouse=True)
