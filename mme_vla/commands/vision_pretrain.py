@@ -9,7 +9,9 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli, compose, log_to_terminal
+from mme_vla.errors import UserError
 
+logger = logging.getLogger("mme_vla.nano")
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 LEVELS = ("easy", "medium", "hard")
 
@@ -20,7 +22,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.envs.make import require_simulator
 
     require_simulator()
-    log_to_terminal(logging.getLogger("mme_vla.nano"))
+    log_to_terminal(logger)
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
     print(run({str(key): value for key, value in config.items()}))
@@ -32,6 +34,7 @@ def run(config: Mapping[str, Any]) -> Path:
 
     from mme_vla.data.progress import progress
     from mme_vla.envs.episodes import choose_tasks
+    from mme_vla.envs.scene.placement import SceneError
     from mme_vla.nano.pretraining import PretrainSettings, fresh_tower, pretrain
     from mme_vla.nano.scenes import record_scenes
 
@@ -42,13 +45,14 @@ def run(config: Mapping[str, Any]) -> Path:
     files = []
     with progress("scenes", len(wanted)) as advance:
         for task, number in wanted:
-            files.append(
-                record_scenes(
-                    folder / "scenes", task, config["first_seed"] + number, LEVELS[number % len(LEVELS)],
-                    config["arrangements"], sizes.image_size,
-                )
-            )  # fmt: skip
+            scene = task, config["first_seed"] + number, LEVELS[number % len(LEVELS)]
+            try:
+                files.append(record_scenes(folder / "scenes", *scene, config["arrangements"], sizes.image_size))
+            except SceneError as error:  # of the benchmark's own rule, which tries so many times
+                logger.info("left out: %s", error)
             advance(1)
+    if not files:
+        raise UserError(f"None of the {len(wanted)} scenes can be built: change first_seed={config['first_seed']}.")
     settings = PretrainSettings(
         **{key: config[key] for key in ("steps", "batch_size", "lr", "held_out", "save_every", "seed")}
     )
