@@ -14,6 +14,7 @@ from rich.console import Console
 from rollout_scripted_env import make_scripted_env
 from rollout_stand_ins import InlineEnvs, roll
 from serving_fakes import Served, challenge
+from test_memoryvla_policy import reached
 
 from mme_vla import UserError, build_policy
 from mme_vla.commands.inspect import show_checkpoint
@@ -31,7 +32,7 @@ from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.memoryvla.core import MemoryVlaCore, RecallingCore
 from mme_vla.policy.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.tensor_files import load_tensors
-from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames, unit_stats
+from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames
 from mme_vla.training.data import check_frozen, prepare_data
 from mme_vla.types import HistoryTokens
 from mme_vla.weights.load import transfer
@@ -39,15 +40,7 @@ from mme_vla.weights.writers import WRITERS
 
 
 def recalling(memory: Any = "framesamp", **options: Any) -> MemoryVlaPolicy:
-    """A tiny policy in which everything that is read reaches the chunk."""
-    policy = build_policy("memoryvla", memory=memory, backbone={"head": {"depth": 1}}, **options)
-    assert isinstance(policy, MemoryVlaPolicy)
-    policy.require_processor().stats = unit_stats(policy.embodiment)
-    generator = torch.Generator().manual_seed(0)
-    for name, parameter in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
-        if name.endswith(("head.output.weight", "in_proj_weight")):
-            torch.nn.init.normal_(parameter, std=0.3, generator=generator)
-    return policy
+    return reached(memory=memory, backbone={"head": {"depth": 1}}, **options)
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,8 +21,9 @@ from mme_vla.testing.small import unit_stats
 SMALL = {"vision": {"image_size": 28}}
 
 
-def tiny() -> MemoryVlaPolicy:
-    policy = build_policy("memoryvla", backbone={**SMALL}, processor={"group_size": 4})
+def reached(**options: Any) -> MemoryVlaPolicy:
+    """A small policy in which everything that is read reaches the chunk."""
+    policy = build_policy("memoryvla", **options)
     assert isinstance(policy, MemoryVlaPolicy)
     policy.require_processor().stats = unit_stats(policy.embodiment)
     generator = torch.Generator().manual_seed(0)
@@ -29,6 +31,10 @@ def tiny() -> MemoryVlaPolicy:
         if name.endswith(("head.output.weight", "in_proj_weight")):
             torch.nn.init.normal_(parameter, std=0.3, generator=generator)
     return policy
+
+
+def tiny() -> MemoryVlaPolicy:
+    return reached(backbone={**SMALL}, processor={"group_size": 4})
 
 
 def frames(count: int, seed: int = 0) -> dict[str, np.ndarray]:
