@@ -8,7 +8,6 @@ this process and all its threads, so that other work on the machine does not cou
 """
 
 import argparse
-import gc
 import tempfile
 import time
 from collections.abc import Callable
@@ -155,7 +154,6 @@ def main() -> None:
     args = parser.parse_args()
     print(f"{args.task} · {args.steps + 1} steps · {machine()}\n")
     episode(small_policy("pi05"), "pi05", Job(args.task, "test", 1), 2, "needed")  # shaders and imports: once a process
-    gc.freeze()  # the simulator collects garbage per scene; a worker process has no policy to walk through then
     if not args.no_episodes:
         episodes(args.models, args.task, args.steps)
     if not args.no_record:

@@ -1,6 +1,5 @@
 """Fixtures that find the data beside the repository, and skip clearly where it is absent."""
 
-import gc
 import os
 import sys
 from multiprocessing import forkserver
@@ -16,6 +15,10 @@ from mme_vla.envs.vector import processes
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
+# Hundreds of processes import the library: told not to write what they compile, each would compile it anew.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # What commands import besides: `forked.py` runs them in the same way as workers.
 processes.PRELOADED += ["lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.training.loop"]
 
@@ -25,23 +28,6 @@ def _folder(variable: str, default: Path, what: str) -> Path:
     if not folder.is_dir():
         pytest.skip(f"{what} not found at {folder}; set {variable} to a folder of that layout to run this test")
     return folder
-
-
-_MANY_MODULES = 300
-_modules_frozen = 0
-
-
-@pytest.fixture(autouse=True, scope="module")
-def _imports_left_out_of_collections() -> None:
-    """ManiSkill collects garbage for every scene it builds, which takes half a second with all that tests import.
-
-    A file's tests begin with what earlier files imported left out, as workers do with what they are forked with.
-    """
-    global _modules_frozen
-    if len(sys.modules) > _modules_frozen + _MANY_MODULES:
-        gc.collect()
-        gc.freeze()
-        _modules_frozen = len(sys.modules)
 
 
 def pytest_configure(config: pytest.Config) -> None:

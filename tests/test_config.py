@@ -12,6 +12,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins
+from mme_vla.config.naming import found_name
+from mme_vla.config.words import join_memories
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
@@ -160,6 +162,12 @@ def test_plugins_are_imported_from_the_current_folder(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize("model", MODELS)
 def test_every_model_of_the_library_composes(model: str) -> None:
     assert compose("policy", [f"model={model}"]).name == model
+
+
+@pytest.mark.parametrize("model", MODELS[::6])
+def test_a_models_name_is_the_one_that_comparing_all_models_would_find(model: str) -> None:
+    cfg = compose("train", [f"model={model}", "train.steps=2"])
+    assert found_name(join_memories(cfg.copy()), "train", (config_dir().resolve(),)) == model
 
 
 def test_a_misspelt_model_of_the_library_is_answered() -> None:

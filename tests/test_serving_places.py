@@ -90,11 +90,11 @@ def test_a_websocket_that_is_let_go_hears_why(policy):
 
 
 def test_a_silent_websocket_is_closed_and_its_episode_freed(policy):
-    with Served(policy, limits=Limits(idle_s=0.4)) as served:
+    with Served(policy, limits=Limits(idle_s=2)) as served:
         client, steady = served.client(), served.client()
         client.infer(challenge(*course()[0], first=True))
-        until = time.monotonic() + 1.2
-        while time.monotonic() < until:
+        until = time.monotonic() + 30
+        while served.server.stats.connections > 1 and time.monotonic() < until:
             steady.reset()
             time.sleep(0.05)
         assert served.server.stats.connections == 1
@@ -133,7 +133,7 @@ def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
     with Served(policy, limits=Limits(receive_s=1)) as served:
         held = idle(served, 1, b"")
         held += idle(served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")  # answered, and then it dawdles
-        until = time.monotonic() + 3
+        until = time.monotonic() + 30
         while time.monotonic() < until and served.server.connections.open:
             for raw in held:
                 with suppress(OSError):

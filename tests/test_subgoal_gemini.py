@@ -3,6 +3,7 @@
 import json
 import logging
 import sys
+import threading
 import time
 
 import pytest
@@ -99,14 +100,13 @@ def test_a_passing_error_is_tried_again_with_growing_pauses():
 
 
 def test_a_slow_answer_is_given_up():
-    def slow():
-        time.sleep(5)
-
-    client = Client(slow, says("press"))
+    over = threading.Event()
+    client = Client(lambda: over.wait(30), says("press"))
     api = Api(Settings(timeout=0.05, backoff=0, requests_per_minute=None), Usage(), client)
     began = time.monotonic()
     assert "press" in api.ask("s", [("user", ["q"])]).text
-    assert time.monotonic() - began < 2 and api.usage.retries == 1
+    assert time.monotonic() - began < 20 and api.usage.retries == 1
+    over.set()
 
 
 def test_questions_keep_to_the_rate():
@@ -165,14 +165,15 @@ def test_tokens_and_cost_are_counted_thoughts_included():
 
 
 def test_episodes_are_asked_side_by_side():
-    def slow():
-        time.sleep(0.2)
+    all_are_asked = threading.Barrier(4, timeout=30)
+
+    def answer():
+        all_are_asked.wait()
         return says("a")
 
-    predictor, _ = predictor_of(*[slow] * 4)
-    began = time.monotonic()
+    predictor, _ = predictor_of(*[answer] * 4)
     assert [s.text for s in predictor.predict([started(predictor) for _ in range(4)])] == ["a"] * 4
-    assert time.monotonic() - began < 0.6 and predictor.usage.calls == 4
+    assert predictor.usage.calls == 4
 
 
 def test_without_key_or_package_it_says_what_is_missing(monkeypatch):

@@ -1,6 +1,7 @@
 """From the section `backbone` of a configuration to the class it names, its sizes and its shape."""
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -26,6 +27,17 @@ def shape_of(section: Mapping[str, Any]) -> Backbone:
     Raises:
         UserError: an unknown backbone or size.
     """
-    kind, sizes = read_backbone(section)
+    found: tuple[Any, Any] = read_backbone(section)
+    try:
+        hash(found)
+    except TypeError:  # somebody's dataclass that can be changed
+        return _shape(*found)
+    return _remembered(*found)
+
+
+def _shape(kind: type[Backbone], sizes: Any) -> Backbone:
     with torch.device("meta"):
         return kind(sizes)
+
+
+_remembered = lru_cache(maxsize=32)(_shape)

@@ -5,72 +5,32 @@ work starts, and come back as one `UserError` with the near names.
 """
 
 import functools
-import importlib
 import logging
 import os
 import pickle
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from importlib.machinery import ModuleSpec
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
-from types import ModuleType
 
 import hydra
-from hydra import version
-from hydra._internal.hydra import Hydra
-from hydra._internal.utils import create_config_search_path, get_args_parser
-from hydra.core.config_search_path import SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
-from hydra.core.utils import JobRuntime
-from hydra.errors import HydraException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config import plugins
 from mme_vla.config.endings import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
+from mme_vla.config.hydra_engine import VERSION_BASE, is_fixed, own_hydra, parse
+from mme_vla.config.hydra_engine import config_dir as config_dir
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
-from mme_vla.config.variant import POLICY, Sections, decisive, may_remember, variant_name
-from mme_vla.config.words import join_memories, literal, several_memories
+from mme_vla.config.naming import remember_name, true_name
+from mme_vla.config.words import join_memories, several_memories
 from mme_vla.errors import UserError
-
-VERSION_BASE = "1.3"
-
-
-def _keep_hydra_to_installed_plugins() -> None:
-    """Hide a folder `hydra_plugins` of the current directory, which Hydra would import, from Hydra's search.
-
-    `python -m` puts the current directory on the path, and somebody else's folder is a place one may stand in.
-    """
-    here = Path.cwd().resolve()
-    before = list(sys.path)
-    sys.path[:] = [place for place in sys.path if Path(place).resolve() != here]
-    try:
-        found = importlib.import_module("hydra_plugins")
-        # A plain list: a namespace's own path would follow sys.path again.
-        found.__path__ = [place for place in found.__path__ if Path(place).resolve().parent != here]
-    except ModuleNotFoundError:
-        found = ModuleType("hydra_plugins")
-        found.__spec__ = ModuleSpec("hydra_plugins", None, is_package=True)
-        found.__path__ = []
-        sys.modules["hydra_plugins"] = found
-    finally:
-        sys.path[:] = before
-
-
-_keep_hydra_to_installed_plugins()
-
-
-def config_dir() -> Path:
-    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the repository's."""
-    package = Path(__file__).resolve().parents[1]
-    shipped = package / "configs"
-    return shipped if shipped.is_dir() else package.parent / "configs"
 
 
 def compose(
@@ -93,17 +53,9 @@ def compose(
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     words = tuple(several_memories(overrides))
-    if _fixed(trees, words):
+    if is_fixed(trees, words):
         return pickle.loads(_composed_once(config_name, words, trees))
     return _composed(config_name, words, trees)
-
-
-def _fixed(trees: Sequence[Path], words: Sequence[str]) -> bool:
-    """Whether only the library's own files are read; these words may name further trees.
-
-    They do not change while a process runs; a user's may, between two cells of a notebook.
-    """
-    return tuple(trees) == (config_dir().resolve(),) and not any("searchpath" in word for word in words)
 
 
 @functools.lru_cache(maxsize=512)
@@ -117,15 +69,16 @@ def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, .
     for folder in trees:
         if not folder.is_dir():
             raise UserError(f"The config folder {str(folder)!r} does not exist.")
-    with _own_hydra(directory, extra_dirs) as engine:
-        fixed = _fixed(trees, overrides)
-        tree = ConfigTree(engine.config_loader, config_name, _parse(overrides), fixed)
+    with own_hydra(directory, extra_dirs) as engine:
+        tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
         try:
             cfg = join_memories(tree.composed(overrides))
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
-    name_variant(cfg, config_name, directory, extra_dirs)
+    if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
+        remember_name(cfg, tree)
+        cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
 
 
@@ -141,63 +94,11 @@ def check_overrides(
     Raises:
         UserError: as `compose`.
     """
-    columns = [_choices(override) for override in _parse(overrides)]
+    columns = [_choices(override) for override in parse(overrides)]
     for row in zip_longest(*columns) if columns else [()]:
         # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
         chosen = [column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column]
         compose(config_name, chosen, directory=directory, extra_dirs=extra_dirs)
-
-
-def name_variant(cfg: DictConfig, config_name: str, directory: Path, extra_dirs: Sequence[Path] = ()) -> None:
-    """Set `name` to what the composition is (`mme_vla.config.variant`); a tree without models has no such name."""
-    if {"name", "memory"} <= set(cfg):
-        trees = (directory.resolve(), *(folder.resolve() for folder in extra_dirs))
-        cfg.name = _true_name(cfg, config_name, trees)
-
-
-def _true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    cfg, given = join_memories(cfg.copy()), str(cfg.name)
-    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
-    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
-    theirs = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
-
-    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        return (_cached_sections if _fixed(searched, words) else _composed_sections)(config_name, words, searched)
-
-    def parts() -> Sections | None:
-        chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
-        words = [f"{group}={section.name if section else 'none'}" for group, section in chosen.items()]
-        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
-            words.insert(0, f"model={given}")
-        if "members" in (chosen.get("memory") or {}):
-            words.append(f"memory.members={literal(OmegaConf.to_container(chosen['memory'].members, resolve=True))}")
-        found = composed(tuple(words), trees)
-        return None if found is None else found[1]
-
-    sections = decisive(cfg)
-
-    def reference(model: str) -> tuple[str, Sections] | None:
-        if model in theirs and not may_remember(trees[0] / "model" / f"{model}.yaml", sections.get("memory.name")):
-            return None
-        return composed((f"model={model}",), trees[:1] if model in theirs else trees)
-
-    return variant_name(str(cfg.name), sections, mine | theirs, reference, parts)
-
-
-def _composed_sections(
-    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
-) -> tuple[str, Sections] | None:
-    """Name and decisive keys of a composition; None where these words do not compose."""
-    with _own_hydra(trees[0], trees[1:]) as engine:
-        try:
-            tree = ConfigTree(engine.config_loader, config_name, _parse(overrides), _fixed(trees, overrides))
-            cfg = join_memories(tree.composed(overrides))
-            return str(cfg.name), decisive(cfg)
-        except (*COMPOSITION_ERRORS, UserError):
-            return None
-
-
-_cached_sections = functools.cache(_composed_sections)
 
 
 def _name_under_hydra(*, _root_: DictConfig) -> str:
@@ -209,7 +110,7 @@ def _name_under_hydra(*, _root_: DictConfig) -> str:
     # A job's main tree is asked first, whatever the order in which Hydra searches.
     main = [Path(s.path) for s in running.runtime.config_sources if s.provider == "main" and s.schema == "file"]
     ordered = tuple(dict.fromkeys(tree.resolve() for tree in (*main, *trees)))
-    return _true_name(_root_, str(running.job.config_name), ordered) if ordered else str(_root_.name)
+    return true_name(_root_, str(running.job.config_name), ordered) if ordered else str(_root_.name)
 
 
 OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
@@ -294,7 +195,7 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
 
     def chosen(overrides: Sequence[str]) -> dict[str, str]:
         compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
-        with _own_hydra(trees[0], trees[1:]):
+        with own_hydra(trees[0], trees[1:]):
             cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
             taken = cfg.hydra.runtime.choices.items()
             words = {group: "null" if name is None else str(name) for group, name in taken}
@@ -312,7 +213,7 @@ def _show(text: str) -> None:
 
 def known_keys(config_name: str, tree: Path) -> list[str]:
     """Every dotted key of a command's configuration as it is by default."""
-    with _own_hydra(tree, []):
+    with own_hydra(tree, []):
         return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
 
 
@@ -324,38 +225,6 @@ def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
     logger.handlers = [handler]
     logger.propagate = False
     warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
-
-
-@contextmanager
-def _own_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
-    """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
-    base = version.VersionBase.instance()
-    outer, outer_base = GlobalHydra.instance().hydra, base.version_base
-    GlobalHydra.instance().clear()
-    search_path = create_config_search_path(str(directory))
-    for folder in extra_dirs:
-        search_path.prepend("command-line", f"file://{folder.resolve()}", anchor=SearchPathQuery(provider="schema"))
-    try:
-        version.setbase(VERSION_BASE)
-        name = JobRuntime.instance().get("name")  # a sweep's next job is still to be called by it
-        yield Hydra.create_main_hydra2(task_name=name, config_search_path=search_path)
-    finally:
-        GlobalHydra.instance().hydra = outer
-        base.version_base = outer_base
-
-
-def _parse(overrides: Sequence[str]) -> list[Override]:
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-        for override in parsed:
-            if not override.key_or_group:
-                raise OverrideParseException(str(override.input_line), "the key is missing")
-    except OverrideParseException as error:
-        raise UserError(
-            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. "
-            "Write key=value, +key=value to add a key, ~key to remove one; quote values with special characters."
-        ) from error
-    return parsed
 
 
 def _choices(override: Override) -> list[str]:

@@ -4,7 +4,6 @@ import gc
 
 import mme_vla.envs.task  # noqa: F401
 
-# ManiSkill collects garbage whenever it builds a scene. With all that is imported here that takes 0.4 s, four fifths of
-# the time of an episode's start without a picture; left out of it, 2 ms. It also keeps the memory shared.
+# What a collection does not walk through stays shared between the processes.
 gc.collect()
 gc.freeze()

@@ -1,0 +1,105 @@
+"""Hydra as the library runs it: its own tree, a user's trees beside it, and no plugin that is not installed."""
+
+import importlib
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType
+
+from hydra import version
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.utils import JobRuntime
+from hydra.errors import OverrideParseException
+
+from mme_vla.config.repository import remembered_files
+from mme_vla.errors import UserError
+
+VERSION_BASE = "1.3"
+
+
+def _keep_hydra_to_installed_plugins() -> None:
+    """Hide a folder `hydra_plugins` of the current directory, which Hydra would import, from Hydra's search.
+
+    `python -m` puts the current directory on the path, and somebody else's folder is a place one may stand in.
+    """
+    here = Path.cwd().resolve()
+    before = list(sys.path)
+    sys.path[:] = [place for place in sys.path if Path(place).resolve() != here]
+    try:
+        found = importlib.import_module("hydra_plugins")
+        # A plain list: a namespace's own path would follow sys.path again.
+        found.__path__ = [place for place in found.__path__ if Path(place).resolve().parent != here]
+    except ModuleNotFoundError:
+        found = ModuleType("hydra_plugins")
+        found.__spec__ = ModuleSpec("hydra_plugins", None, is_package=True)
+        found.__path__ = []
+        sys.modules["hydra_plugins"] = found
+    finally:
+        sys.path[:] = before
+
+
+_keep_hydra_to_installed_plugins()
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the repository's."""
+    package = Path(__file__).resolve().parents[1]
+    shipped = package / "configs"
+    return shipped if shipped.is_dir() else package.parent / "configs"
+
+
+def is_fixed(trees: Sequence[Path], words: Sequence[str]) -> bool:
+    """Whether only the library's own files are read; these words may name further trees.
+
+    They do not change while a process runs; a user's may, between two cells of a notebook.
+    """
+    return tuple(trees) == (config_dir().resolve(),) and not any("searchpath" in word for word in words)
+
+
+@contextmanager
+def own_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
+    """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
+    base = version.VersionBase.instance()
+    outer, outer_base = GlobalHydra.instance().hydra, base.version_base
+    GlobalHydra.instance().clear()
+    search_path = create_config_search_path(str(directory))
+    for folder in extra_dirs:
+        search_path.prepend("command-line", f"file://{folder.resolve()}", anchor=SearchPathQuery(provider="schema"))
+    try:
+        version.setbase(VERSION_BASE)
+        name = JobRuntime.instance().get("name")  # a sweep's next job is still to be called by it
+        engine = Hydra.create_main_hydra2(task_name=name, config_search_path=search_path)
+        if is_fixed((directory, *extra_dirs), ()):
+            assert isinstance(engine.config_loader, ConfigLoaderImpl)
+            engine.config_loader.repository = remembered_files(directory)
+        yield engine
+    finally:
+        GlobalHydra.instance().hydra = outer
+        base.version_base = outer_base
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """Overrides under Hydra's grammar.
+
+    Raises:
+        UserError: one that it cannot read, or without a key.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        for override in parsed:
+            if not override.key_or_group:
+                raise OverrideParseException(str(override.input_line), "the key is missing")
+    except OverrideParseException as error:
+        raise UserError(
+            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. "
+            "Write key=value, +key=value to add a key, ~key to remove one; quote values with special characters."
+        ) from error
+    return parsed
