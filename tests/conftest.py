@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Sequence
 from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+from forked_workers import Collected
 
 from mme_vla.envs.vector import processes
 
@@ -41,6 +43,24 @@ def pytest_configure(config: pytest.Config) -> None:
         server: Any = forkserver._forkserver
         server._forkserver_address, server._forkserver_alive_fd = given, os.open(os.devnull, os.O_RDONLY)
         server.ensure_running = lambda: None  # the process that started the test workers did
+
+
+FIRST = ("test_extras.py", "test_wheel.py", "test_nano_end_to_end.py", "test_kill.py")
+"""Files that take longest; begun last, they would be waited for."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.path.name not in FIRST)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_setupnodes(config: pytest.Config, specs: Sequence[Any]) -> None:
+    """Before the test workers start: start the process that they are forked from."""
+    if sys.platform == "linux" and all(spec.popen and not spec.python for spec in specs):
+        collected = Collected(config.args, config.invocation_params.dir)
+        config.add_cleanup(collected.end)
+        for spec in specs:
+            spec.python = collected.python
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,7 +1,9 @@
 """The environment's contract: lists, infos, statuses, step counting, the conditioning video, errors."""
 
+import gc
 import json
 import sys
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -34,6 +36,18 @@ def make_unrendered() -> Iterator[MakeEnv]:
     yield build
     for env in made:
         env.close()
+
+
+def test_a_closed_environment_gives_its_scene_up_at_once(make_unrendered) -> None:
+    env = make_unrendered()
+    env.reset()
+    scene = weakref.ref(env._task.scene.sub_scenes[0])
+    gc.disable()
+    try:
+        env.close()
+        assert scene() is None
+    finally:
+        gc.enable()
 
 
 def official_steps(h5_folder: Path, task: str) -> tuple[int, list[Any], list[Any], Any]:

@@ -117,6 +117,25 @@ def test_groups_of_a_batch_and_their_padding_do_not_meet() -> None:
         torch.testing.assert_close(together[i : i + 1], alone, rtol=1e-4, atol=1e-5)
 
 
+@torch.no_grad()
+def test_actions_repeated_past_the_end_count_only_where_they_are_asked_to(monkeypatch) -> None:
+    policy = tiny()
+    data, collate = groups(policy), policy.require_processor().collate
+    plain = collate([data[0], data.observation(data.steps - 1)])
+    data.mask_padding = True
+    batch = collate([data[0], data.observation(data.steps - 1)])
+    assert plain.action_mask is None and batch.action_mask.shape == batch.actions.shape[:3]
+    counted = batch.action_mask[batch.valid].tile(policy.sizes.repeats, 1)
+    assert 0 < counted.sum() < counted.numel()
+    losses = torch.rand(counted.shape, generator=torch.Generator().manual_seed(0))
+    monkeypatch.setattr(policy.core, "copies_error", lambda *_: losses)
+    torch.testing.assert_close(policy(plain)[0], losses.mean())
+    expected = torch.stack(
+        [row[seen].mean() if seen.any() else row.new_zeros(()) for row, seen in zip(losses, counted, strict=True)]
+    )
+    torch.testing.assert_close(policy(batch)[0], expected.mean())
+
+
 def test_acting_twice_at_one_frame_writes_once_and_gives_the_same_chunk() -> None:
     policy = tiny()
     episode = policy.start_episode("press the button", seed=3)

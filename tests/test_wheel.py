@@ -13,9 +13,17 @@ import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 TRAIN = [
-    "-m", "mme_vla.train", "model=tokendrop_expert", "train.steps=3", "train.val_samples=2", "train.open_loop_chunks=1",
+    "model=tokendrop_expert", "train.steps=3", "train.val_samples=2", "train.open_loop_chunks=1",
     "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "hydra.run.dir=run",
 ]  # fmt: skip
+USE = """
+import runpy
+import mme_vla
+
+print(mme_vla.__file__)
+print(type(mme_vla.build_policy("tokendrop_expert")).__name__, flush=True)
+runpy.run_module("mme_vla.train", run_name="__main__", alter_sys=True)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -63,15 +71,11 @@ def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> N
     assert {"pyproject.toml", "README.md", "LICENSE", "constraints.txt", "tests/test_wheel.py"} <= packed
 
 
-def test_a_policy_builds_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
-    code = "import mme_vla; print(mme_vla.__file__); print(type(mme_vla.build_policy('tokendrop_expert')).__name__)"
-    module, kind = run([str(installed), "-c", code], cwd=tmp_path).splitlines()
+def test_a_policy_builds_and_trains_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
+    (tmp_path / "use.py").write_text(USE)
+    module, kind = run([str(installed), "use.py", *TRAIN], cwd=tmp_path).splitlines()[:2]
     assert Path(module).is_relative_to(installed.parent.parent)
     assert kind == "MMEPolicy"
-
-
-def test_training_runs_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
-    run([str(installed), *TRAIN], cwd=tmp_path)
     assert list((tmp_path / "run").rglob("*.safetensors"))
 
 

@@ -190,19 +190,18 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        item = self.seen(step, rng) | {
+        return self.seen(step, rng) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
             "place": (step.source, step.episode, step.index),
         }
-        if self.mask_padding:
-            item["action_mask"] = torch.from_numpy(step.recorded)
-        return item
 
     def seen(self, step: Step, rng: np.random.Generator) -> dict[str, Any]:
         """What the network reads and learns of a step, with what its memory selects: its `history` and `past`."""
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
         item = self.processor.item(self._sample(step, subgoal))
+        if self.mask_padding:
+            item["action_mask"] = torch.from_numpy(step.recorded)
         if self.memory is not None:
             history = self.caches[step.source].history(step.episode)
             if self.memory.reads_motion:

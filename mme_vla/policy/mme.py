@@ -27,6 +27,7 @@ from mme_vla.policy.composing import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.graphs import CapturedSampling
 from mme_vla.policy.kinds import policy_options
+from mme_vla.policy.masking import masked_mean
 from mme_vla.policy.promises import promised_overlap
 from mme_vla.policy.seeing import encode_frames, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
@@ -166,12 +167,7 @@ class MMEPolicy(Policy):
         with self.autocast():
             memory = self.encode_memory(self._marked(batch)) if memory is None else memory
             losses = self.backbone.loss(batch, views, self._inject(memory), drawn)  # b h
-        if batch.action_mask is None:
-            loss = losses.mean()
-        else:
-            # Per sample first: then it does not matter which samples are computed together.
-            counted = batch.action_mask.to(losses.dtype)
-            loss = ((losses * counted).sum(1) / counted.sum(1).clamp(min=1)).mean()
+        loss = masked_mean(losses, batch.action_mask)
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 

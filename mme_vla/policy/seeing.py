@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
+    from mme_vla.policy.episode import Episode
 
 Pooled = Callable[[Tensor, int, str], Tensor]
 """Pictures as the tower takes them, the side of the grid and the pooling → tokens [n, grid², d_vision]."""
@@ -20,6 +21,7 @@ class Seeing(Protocol):
     """What is asked of such a policy."""
 
     history_dtype: torch.dtype
+    memory: "Memory | None"
 
     @property
     def device(self) -> torch.device: ...
@@ -44,6 +46,14 @@ def encode_frames(
         with policy.autocast():
             encoded.append(pooled(images, storage.grid, storage.pooling).to(empty))
     return torch.cat(encoded)
+
+
+def prepare(policy: Seeing, episode: "Episode") -> bool:
+    """`Policy.prepare` where the memory reads the episode's own history."""
+    if policy.memory is None or not episode.frames_seen:
+        return False
+    with policy.autocast():
+        return policy.memory.prepare(episode.required_history(), episode.stream)
 
 
 def tower_fingerprint(tower: nn.Module, dtype: torch.dtype, *beside: str) -> str:

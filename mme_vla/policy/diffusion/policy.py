@@ -24,7 +24,8 @@ from mme_vla.policy.composing import build_memory, check_past
 from mme_vla.policy.diffusion.processing import DiffusionBatch, DiffusionProcessor
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
-from mme_vla.policy.seeing import encode_frames, tower_fingerprint
+from mme_vla.policy.masking import masked_mean
+from mme_vla.policy.seeing import encode_frames, prepare, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -147,11 +148,7 @@ class DiffusionPolicy(Policy):
             noisy = ddpm.add_noise(self._schedule(), batch.actions, drawn["noise"], drawn["step"])
             predicted = self.backbone.unet(noisy, drawn["step"], condition)
         losses = (predicted.float() - drawn["noise"]).square().mean(-1)  # b h
-        if batch.action_mask is None:
-            loss = losses.mean()
-        else:
-            counted = batch.action_mask.to(losses.dtype)
-            loss = ((losses * counted).sum(1) / counted.sum(1).clamp(min=1)).mean()
+        loss = masked_mean(losses, batch.action_mask)
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
@@ -248,10 +245,7 @@ class DiffusionPolicy(Policy):
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
-        if self.memory is None or not episode.frames_seen:
-            return False
-        with self.autocast():
-            return self.memory.prepare(episode.required_history(), episode.stream)
+        return prepare(self, episode)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""

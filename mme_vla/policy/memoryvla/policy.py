@@ -22,11 +22,12 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.composing import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.kinds import policy_options
+from mme_vla.policy.masking import masked_mean
 from mme_vla.policy.memoryvla.core import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core
 from mme_vla.policy.memoryvla.episode import MemoryVlaEpisode, words
 from mme_vla.policy.memoryvla.moments import read_moments
 from mme_vla.policy.memoryvla.processing import GroupBatch, MemoryVlaProcessor
-from mme_vla.policy.seeing import encode_frames, tower_fingerprint
+from mme_vla.policy.seeing import encode_frames, prepare, tower_fingerprint
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.openvla_pictures import augment, centre_cut, draw_changes
@@ -206,7 +207,12 @@ class MemoryVlaPolicy(Policy):
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
             read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
-            loss = self.core.copies_error(batch.actions[batch.valid], read, seen, drawn).mean()
+            losses = self.core.copies_error(batch.actions[batch.valid], read, seen, drawn)  # r·m h
+        counted = None
+        if batch.action_mask is not None:
+            of_moments = batch.action_mask[batch.valid]
+            counted = of_moments.repeat(len(losses) // len(of_moments), 1)
+        loss = masked_mean(losses, counted)
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
@@ -303,10 +309,7 @@ class MemoryVlaPolicy(Policy):
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
-        if self.memory is None or not episode.frames_seen:
-            return False
-        with self.autocast():
-            return self.memory.prepare(episode.required_history(), episode.stream)
+        return prepare(self, episode)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """What the memory reads; banks may be shown any frame."""

@@ -26,6 +26,7 @@ class GroupBatch(TensorStruct):
 
     images: [g, m, 3, s, s] uint8. prompt: [g, m, l] ids; prompt_mask: [g, m, l] bool. times: [g, m] int64.
     valid: [g, m] bool; False on padding. actions: [g, m, h, a] normalised; None when sampling.
+    action_mask: [g, m, h] bool; None counts all actions.
     history: a memory's selections [g, m, n, …] of all moments, or [g, n, …] of each group's last one alone; None where
         banks remember.
     """
@@ -36,6 +37,7 @@ class GroupBatch(TensorStruct):
     times: Tensor
     valid: Tensor
     actions: Tensor | None = None
+    action_mask: Tensor | None = None
     history: HistoryTokens | None = None
 
     def histories(self) -> HistoryTokens | None:
@@ -164,6 +166,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
             times=torch.stack([of[at] for of, at in zip(times, rows, strict=True)]),
             valid=torch.stack([torch.arange(longest) < len(group) for group in groups]),
             actions=stack("actions"),
+            action_mask=stack("action_mask") if "action_mask" in groups[0][0] else None,
             history=history,
         )
 
