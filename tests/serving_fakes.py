@@ -60,7 +60,7 @@ class Served:
         return Client(f"ws://127.0.0.1:{self.server.port}", **{"timeout": 60, **options})
 
 
-def wait_until(true: Callable[[], bool], seconds: float = 10) -> None:
+def wait_until(true: Callable[[], bool], seconds: float = 30) -> None:
     waited = threading.Event()
     for _ in range(int(seconds / 0.02)):
         if true():

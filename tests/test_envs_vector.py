@@ -83,17 +83,17 @@ def test_a_long_video_arrives_whole_and_in_order(envs: VecEnv) -> None:
 
 
 def test_whoever_is_ready_comes_first(envs: VecEnv) -> None:
-    envs.send(0, 2.0)
+    envs.send(0, 4.0)
     envs.send(1, 0.0)
     assert only(envs.recv()).worker == 1
     assert envs.recv(timeout=0.05) == []
     assert only(envs.recv()).worker == 0
 
 
-@pytest.mark.parametrize(("action", "words"), [("die", "exit code 3"), ("hang", "gave no result within 1 s")])
+@pytest.mark.parametrize(("action", "words"), [("die", "exit code 3"), ("hang", "gave no result within 4 s")])
 def test_a_lost_worker_is_reported_and_replaced_while_others_go_on(envs: VecEnv, action: str, words: str) -> None:
     envs.send(1, "go")
-    envs.timeout = 1.0
+    envs.timeout = 4.0
     envs.send(0, action)
     replies = collect(envs, 2)
     assert replies[1].info["steps"] == 1

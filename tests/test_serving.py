@@ -251,7 +251,7 @@ def test_a_full_server_says_so_and_has_room_again_later(policy):
 
 
 def test_a_client_that_takes_no_answers_is_cut_off_and_delays_nobody(policy):
-    with Served(policy, limits=Limits(send_s=0.5)) as served:
+    with Served(policy, limits=Limits(send_s=2)) as served:
         for listening in served.server._uvicorn.servers[0].sockets:
             listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)  # so that little has to go unread
         slow = socket.create_connection(served.address)
