@@ -21,6 +21,7 @@ from mme_vla.data.hdf5 import all_have_choices, all_have_poses, any_chosen_frame
 from mme_vla.data.hdf5_episode import POSE_STATE, SUBGOALS, RawEpisode
 from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.data.keyframes import file_of, write_keyframes
+from mme_vla.data.merging import episodes_without_statistics
 from mme_vla.data.progress import progress
 from mme_vla.data.quiet import quiet_libraries
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
@@ -316,7 +317,8 @@ def _merge(parts: Sequence[Path], merged: Path, plan: dict[str, Any]) -> None:
     from lerobot.datasets.aggregate import aggregate_datasets
 
     sides = [read_json(part / SIDE_FILE, "the facts of a converted episode") for part in parts]
-    aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
+    with episodes_without_statistics():
+        aggregate_datasets([part.name for part in parts], "local/robomme", list(parts), merged)
     for video in merged.glob("videos/**/*.mp4"):
         video.chmod(0o644)  # LeRobot joins videos in private temporary files
     for i, part in enumerate(parts):

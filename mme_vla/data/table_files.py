@@ -85,11 +85,10 @@ def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> 
         UserError: a table is damaged, lacks a column, or holds another kind of values in it.
     """
     from datasets import Dataset, Features
-    from lerobot.datasets.feature_utils import get_hf_features_from_features
     from lerobot.utils.utils import SuppressProgressBars
 
     with decoding(root / "meta" / "info.json", "a description of features", REMEDY):
-        wanted = Features(get_hf_features_from_features({name: features[name] for name in columns}))
+        wanted = Features({name: _kind(**features[name]) for name in columns})
     large = any(features[name]["dtype"] == "image" for name in columns)
     files = parquet_files(root, "data")
     for file in files:
@@ -97,6 +96,19 @@ def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> 
     with decoding(root / "data", "tables of frames", REMEDY), nullcontext() if large else SuppressProgressBars():
         table = Dataset.from_parquet([str(file) for file in files], columns=list(columns), features=wanted)
     return table.with_format("arrow")
+
+
+def _kind(dtype: str, shape: tuple[int, ...], **_: Any) -> Any:
+    """What `datasets` calls such a feature. LeRobot could say it, at the price of four seconds for importing it."""
+    import datasets
+
+    if dtype == "image":
+        return datasets.Image()
+    if shape == (1,):
+        return datasets.Value(dtype)
+    if len(shape) == 1:
+        return datasets.List(datasets.Value(dtype), length=shape[0])
+    return getattr(datasets, f"Array{len(shape)}D")(shape=shape, dtype=dtype)
 
 
 def check_vectors(root: Path, table: Any, name: str, width: int) -> None:

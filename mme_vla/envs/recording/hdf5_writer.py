@@ -60,7 +60,8 @@ class EpisodeWriter:
             encoding = "ascii" if name in _BYTES else "utf-8"
             group.create_dataset(path, data=value.encode(encoding), dtype=h5py.string_dtype(encoding))
         elif isinstance(value, np.ndarray) and value.ndim == 3:
-            group.create_dataset(path, data=value, compression="lzf")
+            # One chunk: the dozens that h5py would make of it double the time that storing a step takes.
+            group.create_dataset(path, data=value, compression="lzf", chunks=value.shape)
         else:
             group[path] = value
 
