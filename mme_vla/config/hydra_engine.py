@@ -4,6 +4,7 @@ import importlib
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -86,6 +87,9 @@ def own_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
         base.version_base = outer_base
 
 
+_parser = cache(OverridesParser.create)
+
+
 def parse(overrides: Sequence[str]) -> list[Override]:
     """Overrides under Hydra's grammar.
 
@@ -93,7 +97,7 @@ def parse(overrides: Sequence[str]) -> list[Override]:
         UserError: one that it cannot read, or without a key.
     """
     try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        parsed = _parser().parse_overrides(list(overrides))
         for override in parsed:
             if not override.key_or_group:
                 raise OverrideParseException(str(override.input_line), "the key is missing")

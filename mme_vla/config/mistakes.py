@@ -37,8 +37,9 @@ class ConfigTree:
         self.config_name = config_name
         self.fixed = fixed
         self.overrides = overrides
-        names = [o for o in overrides if "." not in o.key_or_group]  # a key with dots is no group: asking takes 10 ms
-        self.choices = [o for o in names if loader.get_group_options(o.key_or_group)]
+        names = [o for o in overrides if "." not in o.key_or_group]  # a key with dots is no group
+        searched = loader.repository if fixed and isinstance(loader, ConfigLoaderImpl) else loader
+        self.choices = [o for o in names if searched.get_group_options(o.key_or_group)]
         self.values = [o for o in overrides if o not in self.choices]
 
     def composed(self, words: Sequence[str]) -> DictConfig:
@@ -56,12 +57,16 @@ class ConfigTree:
         return hydra.compose(self.config_name, list(words))
 
     def defaults(self) -> Any:
-        """Compose with the group choices alone, as plain containers."""
+        """Compose with the group choices alone, as plain containers; not to be changed."""
+        if self.fixed:
+            return _remembered_defaults(self.config_name, self._words())
         return OmegaConf.to_container(self._chosen())
 
     def _chosen(self) -> DictConfig:
-        words = tuple(str(choice.input_line) for choice in self.choices)
-        return pickle.loads((_remembered if self.fixed else _pickled)(self.config_name, words))
+        return pickle.loads((_remembered if self.fixed else _pickled)(self.config_name, self._words()))
+
+    def _words(self) -> tuple[str, ...]:
+        return tuple(str(choice.input_line) for choice in self.choices)
 
     def explain(self, error: Exception) -> str:
         """Say what was misspelt, with the near names; Hydra's own words where nothing was."""
@@ -116,6 +121,11 @@ def _pickled(config_name: str, words: tuple[str, ...]) -> bytes:
 
 
 _remembered = cache(_pickled)
+
+
+@cache
+def _remembered_defaults(config_name: str, words: tuple[str, ...]) -> Any:
+    return OmegaConf.to_container(pickle.loads(_remembered(config_name, words)))
 
 
 def _expected(default: Any, given: Any) -> str:

@@ -4,11 +4,11 @@ import functools
 import json
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from mme_vla.config.hydra_engine import is_fixed, own_hydra, parse
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.config.variant import DECISIVE, POLICY, Sections, decisive, may_remember, variant_name
+from mme_vla.config.variant import DECISIVE, POLICY, Sections, decisive, may_be_of, variant_name
 from mme_vla.config.words import join_memories, literal
 from mme_vla.errors import UserError
 
@@ -34,7 +34,8 @@ def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str
     Args:
         config_name: what was composed. trees: folders of YAML files, the library's first.
     """
-    cfg = join_memories(cfg.copy())
+    if isinstance(cfg.get("memory"), ListConfig):
+        cfg = join_memories(cfg.copy())
     if not is_fixed(trees, ()):
         return found_name(cfg, config_name, trees)
     key = _what_names(cfg)
@@ -55,6 +56,12 @@ def found_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> st
 
     def parts() -> Sections | None:
         chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
+        for group, section in chosen.items():
+            if section and not section.get("name"):
+                raise UserError(
+                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
+                    f"keys are set beside it, {group}.<key>=<value>."
+                )
         words = [f"{group}={section.name if section else 'none'}" for group, section in chosen.items()]
         if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
             words.insert(0, f"model={given}")
@@ -66,7 +73,7 @@ def found_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> st
     sections = decisive(cfg)
 
     def reference(model: str) -> tuple[str, Sections] | None:
-        if model in theirs and not may_remember(trees[0] / "model" / f"{model}.yaml", sections.get("memory.name")):
+        if model in theirs and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
             return None
         return composed((f"model={model}",), trees[:1] if model in theirs else trees)
 

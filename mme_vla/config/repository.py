@@ -9,6 +9,7 @@ from typing import Self
 from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.object_type import ObjectType
 from hydra.plugins.config_source import ConfigResult
 
 
@@ -25,6 +26,7 @@ class RememberedFiles(ConfigRepository):
     def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
         super().initialize_sources(config_search_path)
         self._read: dict[str, bytes] = {}
+        self._listed: dict[tuple[str, ObjectType | None], list[str]] = {}
 
     def load_config(self, config_path: str) -> ConfigResult | None:
         if config_path not in self._read:
@@ -34,6 +36,12 @@ class RememberedFiles(ConfigRepository):
             self._read[config_path] = pickle.dumps(found)
         read: ConfigResult = pickle.loads(self._read[config_path])
         return read
+
+    def get_group_options(self, group_name: str, results_filter: ObjectType | None = ObjectType.CONFIG) -> list[str]:
+        key = group_name, results_filter
+        if key not in self._listed:
+            self._listed[key] = super().get_group_options(group_name, results_filter)
+        return list(self._listed[key])
 
 
 @cache

@@ -42,17 +42,23 @@ def decisive(cfg: DictConfig) -> Sections:
     return {key: value for key, value in found.items() if value is not None and key not in FREE}
 
 
-def may_remember(model: Path, memory: str | None) -> bool:
-    """Whether a model's file may compose to this memory: a look at two files, where composing takes 60 ms a model."""
+def may_be_of(model: Path, sections: Sections) -> bool:
+    """Whether a model may compose to this memory and integration: a look at its files, where composing takes 60 ms."""
     described = _read(model)
-    if not isinstance(described, dict) or "name" in (described.get("memory") or {}):
+    if not isinstance(described, dict):
         return True
-    chosen = [one["/memory"] for one in described.get("defaults") or () if isinstance(one, dict) and "/memory" in one]
-    file = model.parent.parent / "memory" / f"{chosen[0]}.yaml" if chosen else None
+    return all(_may_choose(model.parent.parent, described, part, sections) for part in ("memory", "integration"))
+
+
+def _may_choose(tree: Path, described: dict[Any, Any], part: str, sections: Sections) -> bool:
+    if "name" in (described.get(part) or {}):
+        return True
+    chosen = [one[f"/{part}"] for one in described.get("defaults") or () if isinstance(one, dict) and f"/{part}" in one]
+    file = tree / part / f"{chosen[0]}.yaml" if chosen else None
     if file is None or not file.is_file():
         return True
     name = _read(file)
-    return not isinstance(name, dict) or name.get("name") == memory
+    return not isinstance(name, dict) or name.get("name") == sections.get(f"{part}.name")
 
 
 def _read(file: Path) -> Any:
