@@ -25,6 +25,7 @@ INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], 
 """Intrinsic matrix of both cameras, [3, 3]."""
 SENSORS = {"front": "base_camera", "wrist": "hand_camera"}
 """The benchmark's names of the cameras, and the simulator's."""
+_SCALAR_LAST = [1, 2, 3, 0]
 _FRONT_EYE, _FRONT_TARGET = np.array([0.3, 0.0, 0.4]), np.array([0.0, 0.0, -0.2])
 
 
@@ -83,7 +84,7 @@ class AngleTrack:
         q = q / np.linalg.norm(q)
         if self._quaternion is not None and q @ self._quaternion < 0:
             q = -q
-        angles = Rotation.from_quat(q, scalar_first=True).as_euler("xyz")
+        angles = Rotation.from_quat(q[_SCALAR_LAST]).as_euler("xyz")
         if self._angles is not None:
             change = (angles - self._angles + np.pi) % (2 * np.pi) - np.pi
             angles = self._angles + change
@@ -159,7 +160,7 @@ class Observer:
         return front_extrinsic() if name == "front" else extrinsic_of(self._wrist_pose())
 
     def _wrist_pose(self) -> "sapien.Pose":
-        return self.task.agent.robot.links_map["camera_link"].pose.sp
+        return self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
 
     def _take_pictures(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]

@@ -11,6 +11,8 @@ It also keeps one Vulkan device from being opened per environment, of which NVID
 import logging
 from typing import TYPE_CHECKING
 
+from mme_vla.envs.shaders import lean_shaders
+
 if TYPE_CHECKING:
     import sapien
 
@@ -46,6 +48,8 @@ def renderer_works() -> bool:
 def _take_picture(device: "sapien.Device") -> None:
     import sapien
 
+    lean = lean_shaders() if device.is_cpu() else None
+    sapien.render.set_camera_shader_dir("default" if lean is None else lean.shader_pack)
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
     camera = scene.add_camera("check", _CHECK_SIZE, _CHECK_SIZE, 1.0, 0.01, 1.0)
     scene.update_render()

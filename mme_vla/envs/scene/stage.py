@@ -14,7 +14,7 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs.rendering import keep_renderer
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
-from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.scene.things import Thing, pose_of
 from mme_vla.envs.shaders import lean_shaders
 
 RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
@@ -138,7 +138,7 @@ class Stage(BaseEnv):
     @property
     def tcp_pose(self) -> sapien.Pose:
         """Pose of the tool centre point in the world."""
-        return self.agent.tcp.pose.sp
+        return pose_of(self.agent.tcp)
 
     @property
     def qpos(self) -> np.ndarray:

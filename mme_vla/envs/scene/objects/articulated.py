@@ -7,7 +7,7 @@ import sapien
 from transforms3d.euler import euler2quat
 
 from mme_vla.envs.scene.objects.shapes import RGB, XY, Shapes, at
-from mme_vla.envs.scene.things import Thing
+from mme_vla.envs.scene.things import Thing, pose_of
 
 if TYPE_CHECKING:
     from mme_vla.envs.scene.stage import Stage
@@ -39,12 +39,12 @@ class Button(Thing):
     @property
     def pose(self) -> sapien.Pose:
         """Pose of the base in the world."""
-        return self.articulation.pose.sp
+        return pose_of(self.articulation.root)
 
     @property
     def position(self) -> np.ndarray:
         """Foot of the cap in the world [3], metres: above the centre of the base, lower while pressed."""
-        return np.asarray(self.entity.pose.sp.p)
+        return np.asarray(pose_of(self.entity).p)
 
     @property
     def base_z(self) -> float:
@@ -81,7 +81,7 @@ class Peg(Thing):
     @property
     def pose(self) -> sapien.Pose:
         """Pose of the head half in the world."""
-        return self.articulation.pose.sp
+        return pose_of(self.articulation.root)
 
     def move_to(self, pose: sapien.Pose) -> None:
         """Teleport the peg, at rest."""
