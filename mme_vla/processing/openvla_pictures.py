@@ -26,9 +26,10 @@ def lanczos(frames: np.ndarray, size: int) -> np.ndarray:
     """
     if frames.shape[-3:-1] == (size, size):
         return frames
-    rows, columns = (_weights(length, size) for length in frames.shape[-3:-1])
-    resized = np.einsum("ih,...hwc->...iwc", rows, frames.astype(np.float32))
-    resized = np.einsum("jw,...iwc->...ijc", columns, resized)
+    *count, height, width, colours = frames.shape
+    lines = frames.reshape(*count, height, width * colours).astype(np.float32)
+    resized = (_weights(height, size) @ lines).reshape(*count, size, width, colours)
+    resized = _weights(width, size) @ resized
     return np.clip(np.rint(resized), 0, 255).astype(np.uint8)
 
 

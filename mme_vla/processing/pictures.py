@@ -70,7 +70,8 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
 
 def to_unit_range(images: Tensor) -> Tensor:
     """Map uint8 0…255 to float32 -1…1."""
-    return images.float() / 255 * 2 - 1
+    # In place: the pictures of an episode are large, and each step would take as much memory again.
+    return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
 
 
 def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
