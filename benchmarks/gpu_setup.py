@@ -12,6 +12,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla import MMEPolicy, build_policy
 from mme_vla.evaluation.analyses.cost import flops
+from mme_vla.evaluation.analyses.meta_shapes import RememberedShapes
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.types import Batch
 
@@ -66,8 +67,9 @@ def peak_gib(device: torch.device) -> float | None:
 
 
 def milliseconds(work: Callable[[], object], rounds: int, warmup: int, device: torch.device) -> list[float]:
-    """How long each round takes, the device's work included; ascending."""
+    """How long each round takes, the device's work included; ascending. A CPU is warmed up once at most."""
     found = []
+    warmup = warmup if device.type == "cuda" else min(warmup, 1)
     for index in range(warmup + rounds):
         wait(device)
         begun = time.perf_counter()
@@ -92,7 +94,7 @@ def sample_flops(model: str, backbone: str) -> tuple[int, int]:
     """
     policy = built(model, backbone, torch.device("meta"))
     batch = policy.full_batch("meta")
-    with FlopCounterMode(display=False) as counter:
+    with RememberedShapes(), FlopCounterMode(display=False) as counter:
         policy(batch, draws_of(policy, 1, torch.device("meta")))[0].backward()
     computed = counter.get_total_flops()
     again = 0

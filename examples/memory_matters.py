@@ -166,12 +166,15 @@ def learn(
     seed: int = 0,
     backbone: Mapping[str, Any] | None = None,
     config_dir: Path | None = None,
+    every: int = 100,
+    enough: float = 0.08,
 ) -> dict[str, Any]:
     """Train one policy until it answers for the episodes it trains on; its error on others, and what it took.
 
     Args:
         seconds: most CPU time, encoding included. steps: most updates. episodes: to learn from.
         backbone: keys of the tiny backbone to change. config_dir: YAML files of your own.
+        every: updates between two looks at the error on what it trains on. enough: error that it stops at.
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)
@@ -194,10 +197,10 @@ def learn(
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         done += 1
-        if done % 100 == 0 and policy.memory is not None:
+        if done % every == 0 and policy.memory is not None:
             error = open_loop_error(policy, seen, 24)
             print(f"  {model}: {error:.2f} on the episodes it learns from after {done} steps", flush=True)
-            if error < 0.08:
+            if error < enough:
                 break
     cpu, wall = time.process_time() - start, time.perf_counter() - wall
     return {"model": model, "error": open_loop_error(policy, unseen), "steps": done, "cpu": cpu, "wall": wall}

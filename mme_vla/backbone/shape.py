@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
-import torch
-
 from mme_vla.backbone.base import Backbone
+from mme_vla.backbone.shapes_only import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.registry import BACKBONES
 
@@ -36,7 +35,7 @@ def shape_of(section: Mapping[str, Any]) -> Backbone:
 
 
 def _shape(kind: type[Backbone], sizes: Any) -> Backbone:
-    with torch.device("meta"):
+    with shapes_only():
         return kind(sizes)
 
 

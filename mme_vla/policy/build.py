@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.backbone.shapes_only import shapes_only
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.words import words
 from mme_vla.errors import UserError
@@ -76,8 +77,9 @@ def build_from_config(
     sections = {key: plain[key] for key in SECTIONS if key in plain}
     check_token_budget(sections)
     # Shapes need no words: on meta the full-size tokenizer is not asked for.
-    processor = None if torch.device(device).type == "meta" else build_processor(sections)
-    with torch.random.fork_rng(devices=[]), torch.device(device):
+    bare = torch.device(device).type == "meta"
+    processor = None if bare else build_processor(sections)
+    with torch.random.fork_rng(devices=[]), shapes_only() if bare else torch.device(device):
         torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
         policy: Policy = policy_class(sections).from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()

@@ -15,6 +15,7 @@ import mme_vla.memory  # noqa: F401  (importing the rooms registers what they sh
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.shape import read_backbone
+from mme_vla.backbone.shapes_only import shapes_only
 from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
@@ -111,7 +112,7 @@ class MMEPolicy(Policy):
             )
         integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
         experts = integration.extra_experts()
-        with nullcontext() if fresh_backbone else torch.device("meta"):
+        with nullcontext() if fresh_backbone else shapes_only():
             backbone = backbone_cls(sizes, experts)
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())

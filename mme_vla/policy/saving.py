@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from mme_vla.backbone.shapes_only import shapes_only
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError, brief
 from mme_vla.files import check_sums, inside, read_json, write_sums
@@ -153,7 +154,7 @@ class Saved(nn.Module):
             raise UserError(f"{source}: policy={brief(given)} must be a section.")
         config = {**config, "policy": {**given, **(policy or {})}}
         try:
-            with torch.device("meta"):
+            with shapes_only():
                 built = cls.from_config(config)
                 if config.get("adapters"):
                     add_adapters(built, **config["adapters"])  # type: ignore[arg-type]  # whoever is saved is a Policy

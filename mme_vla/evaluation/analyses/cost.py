@@ -17,6 +17,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.errors import UserError
+from mme_vla.evaluation.analyses.meta_shapes import RememberedShapes
 from mme_vla.evaluation.results.cost_table import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
@@ -49,7 +50,7 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
 
 def flops(work: Callable[[], object]) -> int:
     """FLOPs of a call, forward only."""
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+    with torch.no_grad(), RememberedShapes(), FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops()
 

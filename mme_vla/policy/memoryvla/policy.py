@@ -13,6 +13,7 @@ from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.layers.recomputing import Recompute
 from mme_vla.backbone.openvla.prismatic import Prismatic
 from mme_vla.backbone.openvla.vision import IMAGENET
+from mme_vla.backbone.shapes_only import shapes_only
 from mme_vla.backbone.shard_groups import ShardGroup
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
@@ -113,7 +114,7 @@ class MemoryVlaPolicy(Policy):
                 "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
                 "or more, or a memory in place of the banks (memory=framesamp)."
             )
-        with nullcontext() if fresh_backbone else torch.device("meta"):
+        with nullcontext() if fresh_backbone else shapes_only():
             vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
         if not fresh_backbone:
             vlm.to_empty(device=torch.get_default_device())
