@@ -30,10 +30,13 @@ def rule_uniform(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
     with np.errstate(over="ignore"):
         z = np.arange(count, dtype=np.uint64) + (np.uint64(zlib.crc32(f"{seed}/{name}".encode())) << np.uint64(32))
         z += np.uint64(0x9E3779B97F4A7C15)
-        z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        z ^= z >> np.uint64(31)
-    values = (z >> np.uint64(40)).astype(np.float32) / np.float32(2**23) - np.float32(1)
+        for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB), (31, 1)):
+            z ^= z >> np.uint64(shift)
+            z *= np.uint64(factor)
+    z >>= np.uint64(40)
+    values = z.astype(np.float32)
+    values /= np.float32(2**23)
+    values -= np.float32(1)
     return torch.from_numpy(values.reshape(shape))
 
 
@@ -45,7 +48,7 @@ def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
     if len(shape) < 2:
         return 1 + 0.2 * uniform
     fan = int(np.prod(shape[1:], dtype=np.int64))
-    return torch.tensor(np.float32(np.sqrt(3 / fan))) * uniform
+    return uniform.mul_(torch.tensor(np.float32(np.sqrt(3 / fan))))
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:

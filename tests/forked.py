@@ -42,6 +42,11 @@ class Command:
         )
         self.process.start()
 
+    @property
+    def errors(self) -> str:
+        """What it has printed as errors up to now."""
+        return self._printed[1].read_text() if self._printed[1].exists() else ""
+
     def finish(self, timeout: float = 280.0) -> "subprocess.CompletedProcess[str]":
         """Wait for its end; one that takes longer than `timeout` seconds is killed, and an error."""
         self.process.join(timeout)

@@ -1,28 +1,29 @@
 """LeRobot's own commands, in forks of one process that has imported them: importing takes longer than they do.
 
-That process is this file, run as a script. Of each line that it reads, the path of a JSON file, it runs what stands
-there: `{"paths": [of sys.path, …], "commands": [[module, word, …], …], "said": where it is printed}`.
+That process is itself forked from the one that has imported PyTorch, LeRobot's datasets and the simulator.
 """
 
 import importlib
-import json
 import os
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
 
 from plugin_packages import PLUGINS
+
+from mme_vla.envs.vector import processes
 
 TRAIN, EVAL, VIZ = (f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval", "dataset_viz"))
 
 
 class LeRobot:
-    """The process that runs LeRobot's commands."""
+    """The process that runs LeRobot's commands, at the other end of a connection."""
 
-    def __init__(self, process: "subprocess.Popen[str]") -> None:
-        self._process = process
+    def __init__(self, connection: "Connection[object, int]") -> None:
+        self._connection = connection
 
     def run(self, folder: Path, commands: Sequence[Sequence[str]], plugins: Mapping[str, str]) -> str:
         """Run commands with some of our plugins there as if installed: distribution → folder in plugins/.
@@ -37,46 +38,53 @@ class LeRobot:
             installed.mkdir(parents=True)
             (installed / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1.0\n")
             paths += [str(source), str(installed.parent)]
-        listed, said = folder / "commands.json", folder / "said.txt"
-        listed.write_text(json.dumps({"paths": paths, "commands": [list(c) for c in commands], "said": str(said)}))
-        assert self._process.stdin is not None and self._process.stdout is not None
-        print(listed, file=self._process.stdin, flush=True)
-        ended = self._process.stdout.readline().strip()
-        printed = said.read_text()
-        assert ended == "0", printed[-6000:]
+        said = folder / "said.txt"
+        self._connection.send((paths, commands, said))
+        ended, printed = self._connection.recv(), said.read_text()
+        assert ended == 0, printed[-6000:]
         return printed
 
 
 @contextmanager
 def lerobot(folder: Path) -> Iterator[LeRobot]:
     """LeRobot's commands, on the CPU, with this folder for what Hugging Face's libraries keep."""
-    environment = os.environ | {
-        "PYTHONPATH": str(PLUGINS.parent),
-        "HF_HUB_OFFLINE": "1",
-        "HF_HOME": str(folder),
-        "ACCELERATE_USE_CPU": "true",
-    }
-    command = [sys.executable, __file__]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
-    ) as process:
-        yield LeRobot(process)
+    environment = os.environ | {"ACCELERATE_USE_CPU": "true"}
+    context = processes.simulating_processes()
+    ours, theirs = context.Pipe()
+    process = context.Process(target=processes.begin, args=(environment, _serve, theirs, folder))
+    process.start()
+    theirs.close()
+    with ours:
+        yield LeRobot(ours)
+    process.join()
 
 
-def _main() -> None:
-    answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what is printed while importing is no answer
-    for module in (TRAIN, EVAL, "mme_vla.envs.vector.preloaded"):
+def _serve(connection: "Connection[int, object]", folder: Path) -> None:
+    import datasets.config
+    import draccus.wrappers.docstring as described
+    import huggingface_hub.constants
+
+    # What the variables HF_HUB_OFFLINE and HF_HOME say to a process that has yet to import these.
+    huggingface_hub.constants.HF_HUB_OFFLINE = datasets.config.HF_HUB_OFFLINE = True
+    datasets.config.HF_DATASETS_CACHE = folder
+    # Nobody reads the help, which is searched for in the source of every class, for each command anew.
+    described.get_attribute_docstring = lambda *_: described.AttributeDocString()
+    sys.path.insert(0, str(PLUGINS.parent))
+    for module in (TRAIN, EVAL):
         importlib.import_module(module)
-    for line in sys.stdin:
+    while True:
+        try:
+            asked: Any = connection.recv()
+        except EOFError:
+            return
         child = os.fork()
         if child == 0:
-            return _run(**json.loads(Path(line.strip()).read_text()))
-        print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), file=answers, flush=True)
+            return _run(*asked)
+        connection.send(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 
-def _run(paths: Sequence[str], commands: Sequence[Sequence[str]], said: str) -> None:
-    with Path(said).open("wb") as file:
+def _run(paths: Sequence[str], commands: Sequence[Sequence[str]], said: Path) -> None:
+    with said.open("wb") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     sys.path[:0] = paths
@@ -84,7 +92,3 @@ def _run(paths: Sequence[str], commands: Sequence[Sequence[str]], said: str) -> 
         print(f"\n$ {module} {' '.join(words)}", flush=True)
         sys.argv = [module, *words]
         importlib.import_module(module).main()
-
-
-if __name__ == "__main__":
-    _main()

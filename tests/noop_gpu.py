@@ -27,11 +27,13 @@ def _lacking() -> str:
 
 
 _EACH = """
-import importlib, os, runpy, sys
+import gc, importlib, os, runpy, sys
 script, *jobs = sys.argv[1:]
 runpy.run_path(script)
 for name in ("timm", "torch._dynamo"):
     importlib.import_module(name)
+gc.collect()
+gc.freeze()  # a child need not look through what was imported, nor copy its pages
 for job in jobs:
     if (child := os.fork()) == 0:
         sys.argv = [script, *job.split()]

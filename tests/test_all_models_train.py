@@ -22,7 +22,7 @@ from mme_vla.training.logging import read_metrics
 
 STEPS, WINDOW = 30, 6
 SMALL = [
-    "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1",
+    "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2",
     "backbone.vision.width=16", "backbone.vision.mlp_dim=16", "policy.augment=false", "logger=none",
     "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.log_every=1", "train.val_samples=0",
     "train.open_loop_chunks=0",

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import av
@@ -10,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 from torch import Tensor
+from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.pi05 import gemma
@@ -17,6 +19,7 @@ from mme_vla.commands.analyse import main
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.evaluation.analyses.attention_mass import AttentionWatch
 from mme_vla.evaluation.analyses.cost import count_model
+from mme_vla.evaluation.analyses.meta_shapes import RememberedShapes
 from mme_vla.evaluation.analyses.modulation import ModulationWatch
 from mme_vla.evaluation.analyses.recurrence import recurrence_curves
 from mme_vla.evaluation.analyses.recurrence_plot import recurrence_plot
@@ -30,6 +33,10 @@ from mme_vla.testing.small import random_batch, small_policy, unit_stats
 @pytest.fixture(scope="module")
 def sample() -> EpisodeSource:
     return EpisodeSource("sample")
+
+
+FEW_TOKENS = {"vision.patch_size": 14}
+"""8×8 tokens a view, where whole episodes are encoded."""
 
 
 def fixed_noise() -> Tensor:
@@ -114,7 +121,7 @@ def test_wrong_policies_are_named() -> None:
 
 
 def test_a_replay_shows_every_frame_once(sample: EpisodeSource) -> None:
-    policy = small_policy("framesamp_modul")
+    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
     seen = [(step, running.frames_seen) for step, running in replay(policy, sample, 0, stride=32)]
     start = int(sample.exec_starts[0])
     assert seen == [(step, step + 1) for step in range(start, int(sample.lengths[0]), 32)]
@@ -124,7 +131,7 @@ def test_a_replay_shows_every_frame_once(sample: EpisodeSource) -> None:
 
 
 def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSource) -> None:
-    policy = build_policy("ttt_modul")
+    policy = build_policy("ttt_modul", backbone=FEW_TOKENS)
     policy.require_processor().stats = unit_stats()
     curves = recurrence_curves(policy, sample, 1)
     before, after = curves.curves["inner_loss_before"], curves.curves["inner_loss_after"]
@@ -132,7 +139,7 @@ def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSo
     assert (after < before).mean() > 0.9
     assert before[-1] < before[0]
     assert recurrence_plot([curves], "ttt").startswith("<svg")
-    other = build_policy("rmt_expert")
+    other = build_policy("rmt_expert", backbone=FEW_TOKENS)
     other.require_processor().stats = unit_stats()
     assert set(recurrence_curves(other, sample, 1).curves) == {"slot_change"}
     with pytest.raises(UserError, match="no recurrent memory"):
@@ -167,6 +174,21 @@ def test_the_attention_command_works_on_a_checkpoint(tmp_path: Path, capsys: pyt
     assert "1.3 / 21.8" in capsys.readouterr().out  # the paper's FrameSamp+Expert
     made = json.loads(out.read_text())
     assert np.sum(made["layers"], 1) == pytest.approx(1)
+
+
+def test_remembered_shapes_change_no_result_and_no_count() -> None:
+    made: list[list[Tensor]] = []
+    counts = []
+    x, y = torch.empty(3, 3, 8, device="meta"), torch.empty(8, 5, device="meta")
+    for remembering in (RememberedShapes(), nullcontext()):
+        with remembering, FlopCounterMode(display=False) as counter:
+            turned = x.transpose(0, 1)
+            made.append([f(z) for z in (x, turned, x) for f in (torch.exp, lambda z: z @ y, lambda z: z > 0)])
+            made[-1] += [x.sum(1), x.sum(2), x.double() + x, x[:, :1] * turned[:1].transpose(0, 1)]
+        counts.append(counter.get_total_flops())
+    assert counts[0] == counts[1] == 3 * (2 * 9 * 8 * 5)
+    ours, theirs = ([(z.shape, z.stride(), z.dtype, z.device) for z in of] for of in made)
+    assert ours == theirs
 
 
 def test_shipped_costs_are_what_the_code_costs() -> None:

@@ -9,10 +9,12 @@ from mme_vla import UserError
 from mme_vla.backbone.layers.attention import attend, look, part_of
 from mme_vla.backbone.layers.blocks import Visibility
 from mme_vla.backbone.layers.sight import Sight
-from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 
 OTHERS = ["flex", "varlen"]
 pytestmark = pytest.mark.filterwarnings("ignore:flex_attention called without torch.compile")
+
+FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
 
 
 def inputs(table: Visibility, kv_heads: int) -> tuple[Sight, list[Tensor]]:
@@ -62,7 +64,7 @@ def test_the_last_layer_asks_for_a_part_of_the_queries(backend: str) -> None:
 @pytest.mark.parametrize("backend", OTHERS)
 def test_a_policy_gives_the_same_loss_and_the_same_chunk(model: str, backend: str) -> None:
     def results(attention: str) -> tuple[float, Tensor]:
-        policy = small_policy(model, policy={"augment": False}, **{"+policy.attention": attention})
+        policy = small_policy(model, backbone=FEW_TOKENS, policy={"augment": False}, **{"+policy.attention": attention})
         batch = random_batch(policy, 2)
         draws = policy.loss_draws(2, torch.Generator().manual_seed(1))
         with torch.no_grad():

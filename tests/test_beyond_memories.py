@@ -31,6 +31,8 @@ from mme_vla.testing.small import (
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 D = 24
+FEW_TOKENS: dict[str, Any] = {"vision": {**SMALL_VISION, "patch_size": 8}}
+"""8×8 tokens a view: nothing here depends on their number."""
 
 
 def stored(memory: Any, tokens: torch.Tensor, exec_start: int = 0) -> CachedHistory:
@@ -78,7 +80,7 @@ def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_
 
 def test_retrieval_looks_at_tokens_as_they_are_stored() -> None:
     """What a prompt does to tokens (`mark`) is not known when a dataset is read, so it must not decide."""
-    policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2})
+    policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2}, backbone=FEW_TOKENS)
     policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
     frames, seen = moving_frames(40), []
     select = policy.require_memory().select
@@ -186,7 +188,7 @@ def test_what_is_not_kept_still_reaches_the_loss() -> None:
 
 @cache
 def mover(integration: str = "modul") -> MMEPolicy:
-    return small_policy(f"actions_{integration}", memory={"max_steps": 12, "max_video": 6})
+    return small_policy(f"actions_{integration}", memory={"max_steps": 12, "max_video": 6}, backbone=FEW_TOKENS)
 
 
 def test_own_actions_read_what_was_done_and_no_picture() -> None:
@@ -244,7 +246,7 @@ SMALLER: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(params=BEYOND, scope="module")
 def policy(request: pytest.FixtureRequest) -> MMEPolicy:
-    words: dict[str, Any] = {"policy": {"history_dtype": "float32"}, "backbone": {"vision": SMALL_VISION}}
+    words: dict[str, Any] = {"policy": {"history_dtype": "float32"}, "backbone": FEW_TOKENS}
     name: str = request.param
     return small_policy(name, memory=SMALLER[name.rsplit("_", 1)[0]], **words)
 
@@ -334,7 +336,7 @@ def test_what_the_robot_did_is_no_vision_token_and_is_not_marked_beside_a_prompt
     """An episode's is not either: the memory has to be told the same in training."""
     members: list[Any] = [{"name": "framesamp", "budget": 64}, {"name": "actions", **SMALLER["actions"]}]
     for name, memory in (("actions_modul", SMALLER["actions"]), ("framesamp_ttt_modul", {"members": members})):
-        policy = small_policy(name, memory=memory)
+        policy = small_policy(name, memory=memory, backbone=FEW_TOKENS)
         policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
         batch = random_batch(policy, valid=96)
         found = policy._marked(batch)

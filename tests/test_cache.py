@@ -1,10 +1,9 @@
 """The vision cache: equal to the online history, resumable, and refused where it does not fit."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
+import forked
 import numpy as np
 import pytest
 import torch
@@ -96,13 +95,14 @@ def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_pa
 
 def test_drafts_of_a_killed_build_are_removed_by_the_next(source, tmp_path) -> None:
     memory = LastFrames(scored=True)
-    build = (
+    build = tmp_path / "build.py"
+    build.write_text(
         "import os, sys; from pathlib import Path; import numpy as np; from mme_vla.data.cache.building import _draft;"
         "_draft(Path(sys.argv[1]), np.save, np.zeros(3)); os.kill(os.getpid(), 9)"
     )
     folder = cache_folder(tmp_path, source, expected := fingerprint(source, memory.storage, "abc", "float32"))
     folder.mkdir(parents=True)
-    subprocess.run([sys.executable, "-c", build, str(token_file(folder, 0))])
+    assert forked.run(str(build), str(token_file(folder, 0))).returncode == -9
     assert len(list(folder.iterdir())) == 1
     build_cache(source, memory, encode, folder, expected)
     assert not [path for path in folder.iterdir() if path.name.endswith(".partial")]

@@ -227,7 +227,7 @@ def test_a_policy_of_choices_trains_and_keeps_its_robot(folder: Path, tmp_path: 
         "data.val_episodes=[1]", f"data.cache.root={tmp_path / 'caches'}", "backbone.depth=1",
         "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "logger=none",
         "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=2",
-        "train.open_loop_chunks=2", *(["memory.budget=64"] if "framesamp" in model else []),
+        "train.open_loop_chunks=1", *(["memory.budget=64"] if "framesamp" in model else []),
     ]  # fmt: skip
     cfg = compose("train", words)
     config: Any = OmegaConf.to_container(cfg, resolve=True)

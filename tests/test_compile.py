@@ -16,6 +16,8 @@ from mme_vla.training.validation import Validation
 from mme_vla.types import Batch
 
 MOST_GRAPHS = 6
+SHORT_TOWER = {"backbone.vision.depth": 1}
+"""The tower is one graph of all its layers, and takes as long to trace as they are many."""
 
 
 @pytest.fixture(autouse=True)
@@ -52,7 +54,7 @@ def batch_of(policy: MMEPolicy, samples: int, prompt: int, frames: int) -> Batch
     [("framesamp_modul", 4), ("ttt_expert", 2), ("rmt_context", 2)],
 )
 def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
-    policy = small_policy(model, **{"backbone.depth": depth}, policy={"augment": False}).train()
+    policy = small_policy(model, **{"backbone.depth": depth}, **SHORT_TOWER, policy={"augment": False}).train()
     policy.backbone.vision.requires_grad_(False)
     first, second = batch_of(policy, 2, 32, 16), batch_of(policy, 2, 16, 8)
     draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
@@ -70,7 +72,7 @@ def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
 
 
 def test_what_cannot_be_compiled_whole_is_an_error_and_not_slow() -> None:
-    policy = small_policy("pi05", policy={"augment": False})
+    policy = small_policy("pi05", **SHORT_TOWER, policy={"augment": False})
     policy.compile(backend=Counted())
     policy.backbone.transformer.layers[0].experts["vlm"].mlp = Printing()
     with pytest.raises(torch._dynamo.exc.Unsupported):

@@ -88,6 +88,14 @@ def test_a_mistake_is_answered_with_the_near_names(tree: Path, override: str, me
     assert message in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    "words", [["model=framesamp_modul", "~memory.name"], ["model=pi05", "integration=modulator", "+memory.budget=64"]]
+)
+def test_a_memory_without_a_name_is_said(words: list[str]) -> None:
+    with pytest.raises(UserError, match="`memory` has no name, only budget"):
+        compose("train", words)
+
+
 @pytest.mark.parametrize("override", ["train.note=text", "train.lr=2", "train.clip=null", "+train.x=1", "seed=${fast}"])
 def test_a_fitting_value_passes(tree: Path, override: str) -> None:
     compose("demo", [override], directory=tree)

@@ -1,6 +1,7 @@
 """HDF5 → LeRobot, resumable."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,21 @@ from mme_vla.errors import UserError
 PNG = ConvertOptions(images="png")
 
 
-@pytest.fixture
-def recorded(tmp_path: Path) -> tuple[list[EpisodeRef], list[Recorded]]:
-    episodes = write_file(tmp_path / "record_dataset_Alpha.h5", [12, 9], videos=[5, 0])
-    episodes += write_file(tmp_path / "record_dataset_Beta.h5", [7])
-    return list_episodes(find_files([tmp_path])), episodes
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory) -> tuple[list[EpisodeRef], list[Recorded]]:
+    folder = tmp_path_factory.mktemp("recorded")
+    episodes = write_file(folder / "record_dataset_Alpha.h5", [12, 9], videos=[5, 0])
+    episodes += write_file(folder / "record_dataset_Beta.h5", [7])
+    return list_episodes(find_files([folder])), episodes
+
+
+@pytest.fixture(scope="module")
+def filmed(recorded, tmp_path_factory) -> tuple[Path, list[Recorded]]:
+    """The episodes as a dataset with videos."""
+    refs, episodes = recorded
+    folder = tmp_path_factory.mktemp("filmed") / "out"
+    convert(refs, folder)
+    return folder, episodes
 
 
 def check(source: EpisodeSource, episodes: list[Recorded], tolerance: int) -> None:
@@ -61,10 +72,9 @@ def test_columns_may_be_spelt_as_lerobots_policies_ask_for(tmp_path: Path, recor
         ConvertOptions(names="lerobbot")
 
 
-def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(tmp_path: Path, recorded) -> None:
-    refs, episodes = recorded
-    convert(refs, tmp_path / "out")
-    source = EpisodeSource(tmp_path / "out")
+def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(filmed) -> None:
+    folder, episodes = filmed
+    source = EpisodeSource(folder)
     assert source.video_cameras == ("front", "wrist") and source.fps == 20
     check(source, episodes, tolerance=3)
     frames = source.frames(0, np.arange(12))
@@ -80,8 +90,8 @@ def test_a_conversion_says_what_is_done_and_nothing_of_what_the_libraries_do(tmp
     assert f"{len(episodes)} of {len(episodes)} episodes" in said
 
 
-def test_a_flipped_bit_in_a_converted_dataset_is_found(tmp_path: Path, recorded) -> None:
-    convert(recorded[0], tmp_path / "out")
+def test_a_flipped_bit_in_a_converted_dataset_is_found(tmp_path: Path, filmed) -> None:
+    shutil.copytree(filmed[0], tmp_path / "out")
     assert EpisodeSource(tmp_path / "out").verify() > 5
     for pattern in ("data/**/*.parquet", "videos/**/*.mp4"):
         file = next((tmp_path / "out").glob(pattern))

@@ -99,14 +99,14 @@ def test_an_episode_remembers(policy: DiffusionPolicy) -> None:
 def test_it_trains_on_cached_tokens(tmp_path: Path) -> None:
     tower = [f"backbone.memory_tower.{key}={value}" for key, value in SMALL["memory_tower"].items()]
     cfg = compose("train", [
-        "model=diffusion_policy", "memory=framesamp", "integration=film", "memory.budget=64", *tower, "logger=none",
-        "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu", "train.val_samples=0",
-        "train.open_loop_chunks=0", f"data.cache.root={tmp_path / 'caches'}",
+        "model=diffusion_policy", "memory=framesamp", "integration=film", "memory.budget=64", "memory.every=8", *tower,
+        "logger=none", "train.steps=2", "train.batch_size=2", "train.workers=0", "train.device=cpu",
+        "train.val_samples=0", "train.open_loop_chunks=0", f"data.cache.root={tmp_path / 'caches'}",
     ])  # fmt: skip
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     checkpoint = train(cfg, config, tmp_path / "run", begun=time.perf_counter())
     again = Policy.from_pretrained(checkpoint)
-    assert again.config["name"] == "diffusion_policy_framesamp_film"
+    assert again.config["name"] == "diffusion_policy_framesamp_film-every_8"
     assert again.memory is not None and again.memory.budget == 64
 
 

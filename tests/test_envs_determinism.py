@@ -10,12 +10,12 @@ from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError
 
-STEPS = 80
-"""Enough for objects to be covered (64), and for the first swap to be under way."""
+STEPS, LOOK = 80, 4
+"""Enough for objects to be covered (64), and for the first swap to be under way; what once differs goes on to."""
 
 
 def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
-    """The simulation's state after every step of an arm that sways, and the texts."""
+    """The simulation's state after every fourth step of an arm that sways, and the texts."""
     env = make_task(task, render=False, seed=4, difficulty=difficulty)
     env.reset()
     seen = [env.get_state().cpu().numpy()]
@@ -23,7 +23,8 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
         action = np.array(env.reset_action, np.float32)
         action[:7] += 0.05 * np.sin(0.1 * k)
         env.step(action)
-        seen.append(env.get_state().cpu().numpy())
+        if k % LOOK == LOOK - 1:
+            seen.append(env.get_state().cpu().numpy())
     texts = [*env.goals(), *(subtask.text for subtask in env.progress.subtasks)]
     env.close()
     return np.stack(seen), texts
@@ -33,7 +34,7 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
 def test_the_same_seed_gives_bit_equal_states_twice(task: str) -> None:
     (first, words), (second, same_words) = states(task, "hard"), states(task, "hard")
     assert np.array_equal(first, second) and words == same_words
-    assert len(first) == STEPS + 1 and not np.array_equal(first[0], first[-1]), "nothing moved"
+    assert len(first) == STEPS // LOOK + 1 and not np.array_equal(first[0], first[-1]), "nothing moved"
 
 
 def test_the_benchmarks_own_words_ask_for_a_recovery_demonstration() -> None:

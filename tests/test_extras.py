@@ -16,12 +16,14 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from typing import NamedTuple
 
+import forked
 import pytest
 from h5_files import write_file
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mme_vla.errors import UserError
+from mme_vla.evaluation.record_log import find_records, read_folders
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 FOLDER = REPOSITORY / "tests" / "extras"
@@ -47,6 +49,12 @@ TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.pa
 TRAIN = f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
 PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
 STEP = "run/checkpoints/step_000001"
+NANO = (
+    "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0 demonstrations.hard=0 "
+    "train.steps=20 train.batch_size=4 train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] drawn_for=[] "
+    "output=nano"
+)
+"""The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes."""
 
 # In this order: some read what an earlier one wrote.
 SUFFICE = [
@@ -74,7 +82,7 @@ SUFFICE = [
     Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
     Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
-    Case(("sim",), "mme_vla.nano --help", "demonstrations"),  # tests/test_nano_end_to_end.py runs it like this
+    Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
     Case(("sim",), "mme_vla.nano.vision_pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
                    "output=tower", "nano_vision.safetensors", draws=True),
     Case(("sim",), "mme_vla.envs.record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
@@ -108,14 +116,19 @@ NEED = [
 
 
 @pytest.fixture(scope="module")
-def ended(tmp_path_factory: pytest.TempPathFactory) -> dict[Case, tuple[int, str]]:
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the commands are run."""
+    return tmp_path_factory.mktemp("extras")
+
+
+@pytest.fixture(scope="module")
+def ended(folder: Path) -> dict[Case, tuple[int, str]]:
     """How every command ended, and what it said."""
     drawn = can_draw()
     there = [
         case for case in [*SUFFICE, *NEED] if all(is_installed(e) for e in case.extras) and (drawn or not case.draws)
     ]
     asked = [[case.words.split(), hidden(case.extras), case.wait] for case in there]
-    folder = tmp_path_factory.mktemp("extras")
     write_file(folder / "record_dataset_Alpha.h5", [9, 7])
     path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
     variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(())), "HF_HUB_OFFLINE": "1",
@@ -162,6 +175,25 @@ def test_a_command_names_the_extra_that_it_needs(ended: dict[Case, tuple[int, st
     assert f"extra `{case.says}`" in said and NEW.format(case.says) in said
 
 
+def test_nano_goes_from_nothing_to_a_page_and_again_without_doing_anything_twice(
+    ended: dict[Case, tuple[int, str]], folder: Path
+) -> None:
+    if not any(case.words.endswith(NANO) for case in ended):
+        pytest.skip(f"needs the simulator, {NEW.format('sim')}, and a driver: scripts/install_vulkan.sh")
+    made = folder / "nano"
+    records = read_folders(find_records([made / "framesamp_modul"]))
+    assert [record.episode for record in sorted(records, key=lambda r: r.episode)] == [0, 1]
+    assert {record.action_space for record in records} == {"waypoint"}
+    page = (made / "page.md").read_text()
+    assert "| framesamp_modul" in page and "| planner" in page and (made / "learning.png").is_file()
+    films = list(made.glob("films/failure/**/*.mp4"))
+    assert len(films) == 1 and films[0].name in page
+    written = {path: path.stat().st_mtime_ns for path in made.rglob("*.npz")}
+    assert forked.run("mme_vla.nano", *NANO.split(), cwd=folder).returncode == 0
+    assert {path: path.stat().st_mtime_ns for path in made.rglob("*.npz")} == written
+    assert len(read_folders(find_records([made / "framesamp_modul"]))) == 2
+
+
 def test_every_command_is_among_the_cases() -> None:
     commands = {command_of(file) for file in (REPOSITORY / "mme_vla").rglob("*.py") if is_command(file)}
     assert "mme_vla.evaluate" in commands
@@ -200,12 +232,16 @@ def installed() -> dict[str, Distribution]:
 def needs() -> dict[str, list[str]]:
     """The packages that each extra names."""
     found: dict[str, list[str]] = {}
-    for line in installed()["mme-vla"].requires or []:
-        requirement = Requirement(line)
+    for requirement in required("mme-vla"):
         named = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
         if named:
             found.setdefault(named[1], []).append(canonicalize_name(requirement.name))
     return found
+
+
+@cache
+def required(name: str) -> list[Requirement]:
+    return [Requirement(line) for line in installed()[name].requires or []]
 
 
 def is_installed(extra: str) -> bool:
@@ -221,8 +257,7 @@ def closure(names: Iterable[tuple[str, str]]) -> set[str]:
         if (name, extra) in seen or name not in installed():
             continue
         seen.add((name, extra))
-        for line in installed()[name].requires or []:
-            wanted = Requirement(line)
+        for wanted in required(name):
             if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):
                 rest += [(canonicalize_name(wanted.name), each) for each in ("", *wanted.extras)]
     return {name for name, _ in seen}

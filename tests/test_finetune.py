@@ -9,10 +9,11 @@ from mme_vla import MMEPolicy, UserError
 from mme_vla.commands.weights import convert
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.policy.finetune import apply_finetuning, merge_adapters
-from mme_vla.testing.small import random_batch, small_policy
+from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 from mme_vla.weights import load_weights
 
 TOLERANCE = 1e-4  # ten steps with the sum of two products in place of the product of a sum
+FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
 VARIANTS = ["pi05", "framesamp_context", "tokendrop_modul", "framesamp_expert"]
 
 
@@ -37,7 +38,7 @@ def stir(policy: MMEPolicy) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_full_learns_all_but_the_vision_tower(variant: str) -> None:
-    policy = small_policy(variant)
+    policy = small_policy(variant, backbone=FEW_TOKENS)
     counts = apply_finetuning(policy)
     assert {name for name, _ in policy.named_parameters()} - learning(policy) == {
         name for name, _ in policy.named_parameters() if name.startswith("backbone.vision.")
@@ -49,7 +50,7 @@ def test_full_learns_all_but_the_vision_tower(variant: str) -> None:
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None:
-    policy = small_policy(variant)
+    policy = small_policy(variant, backbone=FEW_TOKENS)
     counts = apply_finetuning(policy, "expert_only")
     assert {policy.part_of(name) for name in learning(policy)} == {"action", "memory"} - (
         {"memory"} if variant == "pi05" else set()
@@ -63,7 +64,7 @@ def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> None:
     pytest.importorskip("peft", reason="LoRA needs the extra 'vlm'")
-    policy = small_policy(variant)
+    policy = small_policy(variant, backbone=FEW_TOKENS)
     plain = chunk(policy)
     names = set(policy.state_dict())
     counts = apply_finetuning(policy, "lora", rank=4, alpha=8)
@@ -91,7 +92,9 @@ def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> 
     assert "adapters" not in loaded.config
     assert (chunk(loaded) - taught).abs().max() < TOLERANCE
     # Elsewhere, adapters are folded in as they are read.
-    assert (chunk(load_weights(small_policy(variant), tmp_path / "apart")) - taught).abs().max() < TOLERANCE
+    assert (
+        chunk(load_weights(small_policy(variant, backbone=FEW_TOKENS), tmp_path / "apart")) - taught
+    ).abs().max() < TOLERANCE
     convert(tmp_path / "apart", tmp_path / "plain")
     assert (chunk(MMEPolicy.from_pretrained(tmp_path / "plain")) - taught).abs().max() < TOLERANCE
 

@@ -2,10 +2,11 @@
 
 import json
 import math
+from functools import cache
 
 import pytest
 
-from mme_vla import build_policy
+from mme_vla import Policy, build_policy
 from mme_vla.weights.name_tables import write
 from mme_vla.weights.released import released_derived, released_table, released_unread
 
@@ -26,10 +27,16 @@ VARIANTS = {
 }
 
 
+@cache
+def full_size(variant: str) -> Policy:
+    """Shapes alone, and nobody changes them."""
+    return build_policy(variant, backbone="pi05", device="meta")
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
     tree = json.loads((shared / "spec" / f"param_tree_{VARIANTS[variant]}.json").read_text())
-    policy = build_policy(variant, backbone="pi05", device="meta")
+    policy = full_size(variant)
     ours = policy.state_dict()
     table = released_table(policy)
     assert set(table) == set(ours), "every tensor of ours has a released place, and no place is invented"
@@ -40,7 +47,7 @@ def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_parameter_count_is_the_released_one_less_unread_and_derived(variant: str, shared):
     summary = json.loads((shared / "spec" / "param_tree_summary.json").read_text())[VARIANTS[variant]]
-    policy = build_policy(variant, backbone="pi05", device="meta")
+    policy = full_size(variant)
     unread = sum(math.prod(gap.shape) for gap in released_unread(policy))
     derived = sum(constant.make().numel() for constant in released_derived(policy))
     assert sum(p.numel() for p in policy.parameters()) == summary["total_parameters"] - unread - derived

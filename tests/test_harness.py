@@ -1,10 +1,9 @@
 """The model server of vla-evaluation-harness, driven by the harness's own runner: the numbers are the policy's."""
 
 import asyncio
-import subprocess
-import sys
 from typing import Any
 
+import forked
 import numpy as np
 import pytest
 
@@ -159,7 +158,6 @@ def test_a_robot_that_moves_by_waypoints_is_refused() -> None:
 
 
 def test_the_command_shows_the_harnesss_words() -> None:
-    command = [sys.executable, "-m", "mme_vla.serving.vla_eval", "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    done = forked.run("mme_vla.serving.vla_eval", "--help")
     assert done.returncode == 0, done.stderr
     assert "--args.checkpoint" in done.stdout and "--args.flow_steps" in done.stdout

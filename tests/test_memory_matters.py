@@ -4,11 +4,11 @@ from functools import partial
 
 import pytest
 from conftest import REPOSITORY
-from test_training import SMALL
 
 from mme_vla.testing.small import BEYOND
 
 GUESSING = 0.75
+TOWER = {"depth": 1, "image_size": 16, "patch_size": 4, "width": 16, "mlp_dim": 16, "num_heads": 1}
 
 
 @pytest.fixture
@@ -16,7 +16,9 @@ def learn(monkeypatch):
     monkeypatch.syspath_prepend(REPOSITORY / "examples")
     import memory_matters
 
-    return partial(memory_matters.learn, steps=99, episodes=32, lr=5e-3, backbone=SMALL)
+    monkeypatch.setitem(memory_matters.OF_KIND, "learned_topk", {"pool": memory_matters.LENGTH, "hidden": 32})
+    short = {"episodes": 32, "lr": 3e-3, "every": 25, "enough": 0.4 * GUESSING}
+    return partial(memory_matters.learn, steps=300, backbone={"depth": 1, "vision": TOWER}, **short)
 
 
 def test_a_memory_learns_what_only_the_video_showed(learn):
@@ -29,4 +31,4 @@ def test_so_does_each_memory_beyond_the_paper(learn, model):
 
 
 def test_without_memory_it_stays_a_guess(learn):
-    assert learn("pi05")["error"] > 0.9 * GUESSING
+    assert learn("pi05", steps=100)["error"] > 0.9 * GUESSING

@@ -170,9 +170,9 @@ def test_an_episode_remembers_as_a_sample_does_and_writes_nothing(policy: Memory
 
 
 WORDS = {
-    "framesamp": ["memory=framesamp", "processor.group_size=2"],
+    "framesamp": ["memory=framesamp", "memory.every=8", "processor.group_size=2", "train.open_loop_chunks=1"],
     "ttt": ["memory=ttt", "memory.grid=4", "processor.group_size=2"],
-    "alone": ["memory=framesamp", "processor.group_size=1"],  # each sample a step by itself
+    "alone": ["memory=framesamp", "memory.every=8", "processor.group_size=1"],  # each sample a step by itself
 }
 SMALL = ["backbone.vision.image_size=28", "backbone.head.depth=1", "train.batch_size=2", "processor.jpeg=false"]
 
@@ -186,12 +186,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module", params=WORDS)
 def trained(request: pytest.FixtureRequest, runs: Path) -> Path:
     """A run of two updates in one go."""
-    run("memoryvla", runs / request.param, *SMALL, *WORDS[request.param], "train.steps=2", "train.open_loop_chunks=1")
+    run("memoryvla", runs / request.param, *SMALL, *WORDS[request.param], "train.steps=2")
     return runs / request.param
 
 
 def test_it_trains_by_the_command_and_resumes_where_it_stopped(trained: Path) -> None:
-    parts, words = trained.parent / f"{trained.name}_parts", [*SMALL, *WORDS[trained.name]]
+    parts, words = (
+        trained.parent / f"{trained.name}_parts",
+        [*SMALL, *WORDS[trained.name], "train.val_samples=0", "train.open_loop_chunks=0"],
+    )
     run("memoryvla", parts, *words, "train.steps=1")
     resumed = run("memoryvla", trained.parent / "unused", *words, "train.steps=2", f"resume={parts}")
     assert losses(parts) == losses(trained) and len(losses(parts)) == 2

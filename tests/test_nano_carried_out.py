@@ -6,11 +6,13 @@ import torch
 from test_nano import demonstration, nano
 
 from mme_vla.embodiment.robomme import benchmark_state
+from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env
 from mme_vla.envs.rendering_check import render_backend
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
 from mme_vla.nano.learning import Decisions, statistics
+from mme_vla.nano.planner import Replay, replay
 
 SCENE = {"seed": 3_000_001, "difficulty": "easy"}
 
@@ -21,7 +23,7 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> 
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    made = record("SwingXtimes", choices=[], cameras=["front"], carried_out=True, **SCENE)  # type: ignore[arg-type]
+    made = record("SwingXtimes", choices=[], cameras=[], carried_out=True, **SCENE)  # type: ignore[arg-type]
     assert made is not None
     env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]
     seen, _ = env.reset()
@@ -49,3 +51,11 @@ def test_noise_is_in_what_is_learned_and_not_in_what_is_asked_for() -> None:
         assert (after - before).std().item() == pytest.approx(spread, rel=0.5)
     assert torch.equal(batch.state[:, -1], moved.state[:, -1])
     assert batch.actions is not None and torch.equal(batch.actions, moved.actions)  # type: ignore[arg-type]
+
+
+def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:
+    pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
+    spec = metadata.episode("VideoUnmask", "val", 0)
+    record = replay(Replay(spec, max_steps=500))
+    assert (record.model, record.outcome, record.seed) == ("planner", "success", spec.seed)
+    assert replay(Replay(spec, max_steps=record.steps // 2)).outcome == "timeout"

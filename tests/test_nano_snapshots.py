@@ -10,6 +10,7 @@ from mme_vla.nano.demonstrations import record
 
 def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
     """Marks come and go, and belong to no thing of the task: what is drawn afterwards has them where they were."""
+    from mme_vla.envs.drawing import Drawing
     from mme_vla.envs.make import make_env
     from mme_vla.envs.recording.frames import FrameChoice
 
@@ -17,11 +18,12 @@ def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
     made = record("PatternLock", 3_000_001, "easy", [FrameChoice("decisions", remembered)], ["front"])
     assert made is not None
     env = make_env("PatternLock", seed=3_000_001, difficulty="easy", action_space="waypoint")
+    drawn = made.pictures["front"]
+    env.drawing = Drawing({"front": drawn}, now=())
     try:
         shown = env.reset()[0]["front_rgb_list"]
     finally:
         env.close()
-    drawn = made.pictures["front"]
     assert made.exec_start == len(shown) - 1 and len(drawn) > 3
     for frame, picture in drawn.items():
         if frame < made.exec_start:

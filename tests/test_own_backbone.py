@@ -78,7 +78,7 @@ def trained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     """A checkpoint that the command trained, the backbone's file alone naming all that goes with it."""
     monkeypatch.setattr(sys, "argv", [])
     monkeypatch.chdir(EXAMPLE)
-    small = ["backbone.vision.image_size=16", "backbone.vision.patch_size=1", "backbone.depth=1"]
+    small = ["backbone.vision.image_size=16", "backbone.vision.patch_size=1", "backbone.depth=1", "memory.every=8"]
     brief = ["train.steps=2", "train.val_samples=2", "train.open_loop_chunks=1", "train.workers=0", "logger=none"]
     choices = ["--config-dir", "configs", "backbone=regression", "model=framesamp_context"]
     run("train", *choices, *small, *brief, f"hydra.run.dir={tmp_path / 'run'}")

@@ -12,16 +12,20 @@ from mme_vla.processing.pictures import to_unit_range
 from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
 
 TOLERANCE = 2e-5
+FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
+"""8×8 tokens a view; nothing here depends on their number."""
+MEMORY = {"budget": 128}
 
 
 @pytest.fixture(params=MODELS)
 def policy(request):
-    return small_policy(request.param, backbone={"vision": SMALL_VISION})
+    memory = {} if request.param == "pi05" else {"memory": MEMORY}
+    return small_policy(request.param, backbone=FEW_TOKENS, **memory)
 
 
 @pytest.fixture(params=NEURAL)
 def remembering(request):
-    return small_policy(request.param, backbone={"vision": SMALL_VISION})
+    return small_policy(request.param, backbone=FEW_TOKENS, memory=MEMORY)
 
 
 @torch.no_grad()
@@ -130,7 +134,7 @@ def test_gradient_checkpointing_changes_nothing(remembering):
 
 
 def test_modulator_encodes_memory_once_per_chunk():
-    policy = small_policy("framesamp_modul")
+    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
     calls = {"memory": 0, "keys": 0, "recall": 0}
     layer = policy.integration.layers[0]
     policy.memory.register_forward_hook(lambda *_: calls.update(memory=calls["memory"] + 1))
@@ -150,7 +154,10 @@ def test_vision_and_language_run_once_per_chunk(policy):
 
 
 def test_exact_identity_modulator_is_the_memoryless_policy_to_the_bit():
-    plain, modulated = small_policy("pi05"), small_policy("framesamp_modul", integration={"exact_identity": "true"})
+    plain, modulated = (
+        small_policy("pi05", backbone=FEW_TOKENS),
+        small_policy("framesamp_modul", backbone=FEW_TOKENS, integration={"exact_identity": "true"}),
+    )
     shared = plain.state_dict()
     assert not modulated.load_state_dict(shared, strict=False).unexpected_keys
     batch = random_batch(plain)
@@ -160,7 +167,7 @@ def test_exact_identity_modulator_is_the_memoryless_policy_to_the_bit():
 
 
 def test_released_modulator_starts_near_the_memoryless_policy():
-    plain, modulated = small_policy("pi05"), small_policy("framesamp_modul")
+    plain, modulated = small_policy("pi05", backbone=FEW_TOKENS), small_policy("framesamp_modul", backbone=FEW_TOKENS)
     modulated.load_state_dict(plain.state_dict(), strict=False)
     batch = random_batch(plain)
     before = velocity(plain, batch)
@@ -187,7 +194,8 @@ def prefix_keys(policy, batch):
 @pytest.mark.parametrize("integration", ["context", "expert"])
 def test_prompt_sees_memory_only_if_asked(integration):
     for sees in (True, False):
-        policy = small_policy(f"framesamp_{integration}", integration={"prompt_sees_memory": str(sees).lower()})
+        asked = {"prompt_sees_memory": str(sees).lower()}
+        policy = small_policy(f"framesamp_{integration}", backbone=FEW_TOKENS, memory=MEMORY, integration=asked)
         row = policy.integration.visibility["prompt"]
         assert ("memory" in row) is sees
         batch = random_batch(policy)
@@ -200,7 +208,7 @@ def test_prompt_sees_memory_only_if_asked(integration):
 @pytest.mark.parametrize("budget", [64, 512, 2048])
 @pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt"])
 def test_budget_is_a_number_in_the_config(memory, budget):
-    policy = small_policy(f"{memory}_context", memory={"budget": budget})
+    policy = small_policy(f"{memory}_context", backbone=FEW_TOKENS, memory={"budget": budget})
     batch = random_batch(policy, batch=1, valid=64)
     tokens = policy.encode_memory(batch.history)
     assert tokens.tokens.shape[1] == tokens.mask.shape[1] == budget
@@ -251,7 +259,7 @@ def test_checkpoint_round_trip_keeps_every_number(policy, tmp_path):
 
 
 def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
-    policy = small_policy("framesamp_modul")
+    policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
     with pytest.raises(UserError, match=r"config\.json"):
         MMEPolicy.from_pretrained(tmp_path / "nowhere")
     policy.save_pretrained(tmp_path / "damaged")
@@ -259,7 +267,7 @@ def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
     weights.write_bytes(weights.read_bytes()[:1000])
     with pytest.raises(UserError, match="damaged"):
         MMEPolicy.from_pretrained(tmp_path / "damaged")
-    other = small_policy("tokendrop_expert")
+    other = small_policy("tokendrop_expert", backbone=FEW_TOKENS)
     other.save_pretrained(tmp_path / "other")
     (tmp_path / "other" / "config.json").write_text((tmp_path / "damaged" / "config.json").read_text())
     (tmp_path / "other" / SUMS).unlink()
@@ -268,7 +276,7 @@ def test_foreign_and_damaged_checkpoints_are_refused(tmp_path):
 
 
 def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
-    policy = small_policy("pi05")
+    policy = small_policy("pi05", backbone=FEW_TOKENS)
     batch = random_batch(policy, batch=4)
     batch.action_mask = torch.arange(batch.actions.shape[1]).expand(4, -1) < torch.tensor([[1], [20], [7], [20]])
     noise, time_ = torch.randn(batch.actions.shape), torch.full((4,), 0.5)

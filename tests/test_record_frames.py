@@ -16,6 +16,7 @@ from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import open_episode
 from mme_vla.data.hdf5_values import EpisodeRef
 from mme_vla.embodiment import Embodiment
+from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.recorded import Job
@@ -97,8 +98,10 @@ def test_what_is_drawn_is_what_a_whole_recording_shows(recorded: EpisodeRef) -> 
         with pytest.raises(UserError, match=r"front was not drawn at step 1; .* frames=decisions"):
             episode.front(1)
     assert choice == {"at": "decisions", "memory": {"name": "framesamp", "budget": 64}}
+    # What of a whole recording is compared, and the steps before, whose pictures these would be if any were stale.
+    more = {int(k) + d for steps in drawn.values() for k in np.flatnonzero(steps) for d in (-1, 0)}
     task = make_task("PatternLock", render=True, seed=seed, difficulty="easy")
-    whole = Recorder(task).record().frames
+    whole = Recorder(task, drawing=Drawing({"front": more, "wrist": more})).record().frames
     task.close()
     assert len(frames) == len(whole)
     assert 0 < drawn["wrist"].sum() < drawn["front"].sum() < len(frames)

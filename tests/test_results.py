@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from mme_vla import UserError
+from mme_vla.commands import results as results_command
 from mme_vla.commands.results import main
 from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
@@ -57,6 +58,18 @@ def as_published(method: str) -> list[EpisodeRecord]:
 @pytest.fixture(scope="module")
 def demo() -> Results:
     return aggregate(demo_records([("framesamp_modul", None), ("groundsg", "qwenvl")]), Protocol(samples=200))
+
+
+@pytest.fixture(scope="module")
+def made_up() -> list[EpisodeRecord]:
+    """One run of each method: that these are made up, and which there are, does not depend on how many."""
+    return demo_records(results_command.DEMO, checkpoints=(60_000,), seeds=(7,))
+
+
+@pytest.fixture
+def drawn_once(monkeypatch: pytest.MonkeyPatch, made_up: list[EpisodeRecord]) -> None:
+    """The command's made-up records are drawn for all tests at once."""
+    monkeypatch.setattr(results_command, "demo_records", lambda methods: list(made_up))
 
 
 # The paper
@@ -325,14 +338,17 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     assert unknown.count("state it by hand") == 2
 
 
+@pytest.mark.usefixtures("drawn_once")
 def test_the_demo_says_that_it_is_made_up(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--demo", "--brief", "--samples", "20"])
     assert "Made-up records" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("drawn_once")
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [([], "Name files or folders"), (["nowhere"], "does not exist"), (["--demo", "--compare", "pi05", "pi06"], "pi06"),
+    [([], "Name files or folders"), (["nowhere"], "does not exist"),
+     (["--demo", "--samples", "20", "--compare", "pi05", "pi06"], "pi06"),
      (["--demo", "--tasks", "Binfill"], "Did you mean 'BinFill'")],
 )  # fmt: skip
 def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,9 +26,19 @@ def modules() -> dict[str, Path]:
     return found
 
 
-def imports(file: Path) -> Iterator[str]:
+@cache
+def parsed(file: Path) -> ast.Module:
+    return ast.parse(file.read_text())
+
+
+@cache
+def imports(file: Path) -> tuple[str, ...]:
     """Modules of this library that a file names, wherever in it: at run time, lazily, or for type checkers alone."""
-    for node in ast.walk(ast.parse(file.read_text())):
+    return tuple(_imports(file))
+
+
+def _imports(file: Path) -> Iterator[str]:
+    for node in ast.walk(parsed(file)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names if alias.name in modules())
         elif isinstance(node, ast.ImportFrom) and node.module:
@@ -39,7 +49,7 @@ def imports(file: Path) -> Iterator[str]:
 
 def is_entry(file: Path) -> bool:
     """A documented `python -m` name: it imports a command, runs it, and has nothing else in it."""
-    return "from mme_vla.commands" in file.read_text() and len(ast.parse(file.read_text()).body) == 3
+    return "from mme_vla.commands" in file.read_text() and len(parsed(file).body) == 3
 
 
 def test_rooms_import_only_from_rooms_below_them() -> None:
@@ -62,7 +72,8 @@ def test_entries_hold_a_command_and_nothing_else_and_nobody_imports_them() -> No
     for name, file in modules().items():
         assert not entries & set(imports(file)), f"{name} imports an entry; import the command's own module"
         if name.split(".")[-1] != "__main__" and name not in entries:
-            guarded = [node for node in ast.parse(file.read_text()).body if "__main__" in ast.unparse(node)[:40]]
+            plain = (node for node in parsed(file).body if not isinstance(node, ast.FunctionDef | ast.ClassDef))
+            guarded = [node for node in plain if "__main__" in ast.unparse(node)[:40]]
             assert not guarded, f"{name} runs as a script: commands are in mme_vla/commands, entries only call them"
 
 
@@ -132,7 +143,7 @@ def test_episodes_write_and_memories_read_under_names_of_their_own() -> None:
     methods: dict[str, set[str]] = {}
     for room in ("memory", "policy", "subgoal"):
         for file in (PACKAGE / room).rglob("*.py"):
-            for node in ast.walk(ast.parse(file.read_text())):
+            for node in ast.walk(parsed(file)):
                 if isinstance(node, ast.ClassDef):
                     defined = {f.name for f in node.body if isinstance(f, ast.FunctionDef)}
                     methods.setdefault(room if room == "memory" else node.name, set()).update(defined)

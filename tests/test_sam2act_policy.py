@@ -197,7 +197,7 @@ def run(data: Path, folder: Path, *words: str, resume: str = "null") -> Path:
     """Train as the command does; the last checkpoint."""
     small = ["model=sam2act_plus", f"data.sources=[{data}]", "data.val_episodes=[]", "logger=none", "train.workers=0",
              "train.device=cpu", "train.batch_size=2", "train.warmup=1", "train.log_every=1",
-             "train.save_every=2", f"resume={resume}"]  # fmt: skip
+             f"resume={resume}"]  # fmt: skip
     cfg = compose("train", [*small, *words])
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     return train(cfg, config, folder, begun=time.perf_counter())
@@ -206,11 +206,11 @@ def run(data: Path, folder: Path, *words: str, resume: str = "null") -> Path:
 @pytest.mark.parametrize("optimizer", ["adamw", "lamb"])
 def test_the_command_trains_it_and_resumes_to_the_last_bit(data: Path, tmp_path: Path, optimizer: str) -> None:
     chosen = f"train.optimizer={optimizer}"
-    whole = run(data, tmp_path / "whole", chosen, "train.steps=4")
-    run(data, tmp_path / "parts", chosen, "train.steps=2")
-    parts = run(data, tmp_path / "new", chosen, "train.steps=4", resume=str(tmp_path / "parts"))
+    whole = run(data, tmp_path / "whole", chosen, "train.steps=2")
+    run(data, tmp_path / "parts", chosen, "train.steps=1")
+    parts = run(data, tmp_path / "new", chosen, "train.steps=2", resume=str(tmp_path / "parts"))
     assert parts.parent.parent == tmp_path / "parts"
-    assert [line["step"] for line in read_metrics(tmp_path / "whole") if "train/loss" in line] == [1, 2, 3, 4]
+    assert [line["step"] for line in read_metrics(tmp_path / "whole") if "train/loss" in line] == [1, 2]
     ended = [load_tensors(folder) for folder in (whole, parts)]
     assert all(torch.equal(value, ended[1][name]) for name, value in ended[0].items())
     assert isinstance(Policy.from_pretrained(whole), SAM2ActPolicy)

@@ -4,19 +4,13 @@ import asyncio
 import http.client
 import json
 import logging
-import os
 import re
-import signal
 import socket
-import subprocess
-import sys
-import threading
 from types import SimpleNamespace
 
 import forked
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
 
 from mme_vla.commands.loading import load_policy
@@ -175,31 +169,23 @@ def test_garbage_on_the_wire_is_answered_and_harms_nobody(served, sent):
 
 
 def test_the_command_serves_and_stops_when_told(tmp_path):
-    command = [sys.executable, "-m", "mme_vla.serve", "model=framesamp_modul", "backbone=tiny", "port=0"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(REPOSITORY), "MME_VLA_API_KEY": "secret"}
-    server = subprocess.Popen(command, cwd=REPOSITORY, env=environment, stderr=subprocess.PIPE, text=True)
-    assert server.stderr is not None
-    guard = threading.Timer(120, server.kill)
-    guard.start()
+    words = ("mme_vla.serve", "model=framesamp_modul", "backbone=tiny", "port=0")
+    server = forked.Command(*words, env={"OMP_NUM_THREADS": "1", "MME_VLA_API_KEY": "secret"})
     try:
-        lines = []
-        for line in server.stderr:
-            lines.append(line)
-            if "ready at ws://127.0.0.1:" in line:
-                break
-        assert any("UNTRAINED" in line for line in lines)
-        assert "secret" not in "".join(lines)
-        port = int(lines[-1].split("ws://127.0.0.1:")[1].split()[0])
+        wait_until(lambda: "ready at ws://127.0.0.1:" in server.errors or not server.process.is_alive(), 120)
+        lines = server.errors
+        assert "UNTRAINED" in lines
+        assert "secret" not in lines
+        port = int(lines.split("ready at ws://127.0.0.1:")[1].split()[0])
         with Client(f"ws://127.0.0.1:{port}", api_key="secret") as client:
             assert client.metadata["model"] == "framesamp_modul"
             assert client.infer(challenge(*course()[0], first=True))["actions"].shape == (16, 8)
-            server.send_signal(signal.SIGTERM)
-            rest = server.stderr.read()
-            assert server.wait(30) == 0
-        assert "stopped · 0 clients · 1 inferences" in rest
+            server.process.terminate()
+            done = server.finish(30)
+        assert done.returncode == 0
+        assert "stopped · 0 clients · 1 inferences" in done.stderr.removeprefix(lines)
     finally:
-        guard.cancel()
-        server.kill()
+        server.process.kill()
 
 
 def test_the_command_says_what_it_needs():

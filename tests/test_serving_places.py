@@ -32,7 +32,7 @@ def policy():
 
 def released_episode(address: str, seed: int) -> tuple[object, np.ndarray]:
     """One episode as the released evaluation script runs it: a connection of its own, which it never closes."""
-    raw = connect(address, compression=None, max_size=None)
+    raw = connect(address, compression=None, max_size=None, ping_interval=None)  # pings come after 20 s: not here
     unpack(raw.recv())
     chunks = []
     state = states(1, seed)

@@ -2,11 +2,10 @@
 
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import forked
 import pytest
 import torch
 from test_training import loggers, policy, trainer
@@ -21,7 +20,7 @@ ASKED_ONCE = """
 import os, signal, sys
 from torch import distributed
 from mme_vla.training.stopping import stop_asked
-rank, meeting = int(sys.argv[1]), sys.argv[2]
+meeting, rank = sys.argv[1], int(sys.argv[2])
 distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=2)
 with stop_asked() as asked:
     for step in range(1, 7):
@@ -48,12 +47,10 @@ def test_a_stop_signal_saves_and_leaves(tmp_path: Path) -> None:
 
 
 def test_all_processes_stop_after_the_same_update_when_one_is_asked(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", ASKED_ONCE]
-    started = [
-        subprocess.Popen([*command, str(rank), str(tmp_path / "meeting")], stdout=subprocess.PIPE, text=True)
-        for rank in range(2)
-    ]
-    assert [process.communicate(timeout=100)[0].strip() for process in started] == ["stopped after 3"] * 2
+    (tmp_path / "asked.py").write_text(ASKED_ONCE)
+    words = (str(tmp_path / "asked.py"), str(tmp_path / "meeting"))
+    started = [forked.Command(*words, str(rank)) for rank in range(2)]
+    assert [command.finish(100).stdout.strip() for command in started] == ["stopped after 3"] * 2
 
 
 @pytest.fixture

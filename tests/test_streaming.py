@@ -10,16 +10,24 @@ from mme_vla.testing.small import NEURAL, SMALL_VISION, cached_history, moving_f
 from mme_vla.types import Batch
 
 FRAMES = 90
+FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}
+"""8×8 tokens a view; what is chosen and carried does not depend on their number."""
 
 
 @pytest.fixture(params=NEURAL, scope="module")
 def policy(request):
-    return small_policy(request.param, policy={"history_dtype": "float32"}, backbone={"vision": SMALL_VISION})
+    return small_policy(request.param, policy={"history_dtype": "float32"}, backbone=FEW_TOKENS)
 
 
 @pytest.fixture(scope="module")
 def frames():
     return moving_frames(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def offline(policy, frames):
+    """The cache of the episode, with twenty frames of a video."""
+    return cached_history(policy, frames, exec_start=20)
 
 
 def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upto=None):
@@ -34,8 +42,7 @@ def feed(policy, frames, goal="pick up the cube", seed=0, chunk=16, demo=30, upt
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 16])
-def test_selection_is_the_same_online_and_from_the_cache(policy, frames, chunk):
-    offline = cached_history(policy, frames, exec_start=20)
+def test_selection_is_the_same_online_and_from_the_cache(policy, frames, offline, chunk):
     for step in (0, 6, 7, 40, FRAMES - 1):
         online = online_history(policy, frames[: step + 1], chunk, exec_start=min(20, step + 1))
         assert np.array_equal(policy.memory.select(online, step), policy.memory.select(offline, step)), step
@@ -127,7 +134,7 @@ def test_episodes_refuse_what_they_cannot_use(policy, frames):
 
 
 def test_bfloat16_history_is_what_the_cache_stores(frames):
-    policy = small_policy("framesamp_context")
+    policy = small_policy("framesamp_context", backbone=FEW_TOKENS)
     online = online_history(policy, frames, 16)
     cached = cached_history(policy, frames)
     step = FRAMES - 1
@@ -137,13 +144,13 @@ def test_bfloat16_history_is_what_the_cache_stores(frames):
 
 
 def test_tokendrop_at_the_smallest_budget_keeps_the_first_frame_alone(frames):
-    policy = small_policy("tokendrop_context", memory={"budget": 64})
+    policy = small_policy("tokendrop_context", backbone=FEW_TOKENS, memory={"budget": 64})
     chosen = policy.memory.select(cached_history(policy, frames), FRAMES - 1)
     assert chosen.tolist() == [[0, patch] for patch in range(64)]
 
 
 def test_tokendrop_encodes_only_the_frames_it_can_choose(frames, monkeypatch):
-    policy = small_policy("tokendrop_context")
+    policy = small_policy("tokendrop_context", backbone=FEW_TOKENS)
     counted = []
     original = policy.encode_frames
     monkeypatch.setattr(policy, "encode_frames", lambda f: counted.append(len(f)) or original(f))

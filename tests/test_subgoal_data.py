@@ -44,6 +44,12 @@ def h5(parity, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def labelled(h5):
+    """All episodes and their labels, which tests only read."""
+    return [(episode, episode.labels()) for episode in open_input(h5)]
+
+
+@pytest.fixture(scope="module")
 def built(h5, tmp_path_factory):
     output = tmp_path_factory.mktemp("built") / "data"
     build(open_input(h5), output, list(SETS), RELEASED)
@@ -68,10 +74,10 @@ def test_sets_equal_the_released_ones_row_by_row(built, golden, name):
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repeated_rows(h5, golden, name):
+def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repeated_rows(labelled, golden, name):
     found, expected = [], []
-    for episode in open_input(h5):
-        found += episode_rows(name, episode.labels(), RowOptions(noise=None)).rows
+    for _, labels in labelled:
+        found += episode_rows(name, labels, RowOptions(noise=None)).rows
     repeats = {
         f"qwenvl/images/{task}_ep{number}_step{step}.png": count
         for task, episodes in golden["qwen_selection"].items()
@@ -84,17 +90,17 @@ def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repea
     assert name.startswith("memer") or len(found) > len(golden["vlm_datasets"][SETS[name]])
 
 
-def test_selected_steps_and_repeats_equal_the_released_ones(h5, golden):
-    for episode in open_input(h5):
-        labels, expected = episode.labels(), golden["qwen_selection"][episode.task][episode.number]
+def test_selected_steps_and_repeats_equal_the_released_ones(labelled, golden):
+    for episode, labels in labelled:
+        expected = golden["qwen_selection"][episode.task][episode.number]
         steps, repeats = selected_steps(labels)
         assert transitions(labels) == expected["transitions"]
         assert steps == expected["selected"]
         assert {str(step): count for step, count in repeats.items()} == expected["duplicates"]
 
 
-def test_every_picture_and_video_a_row_names_is_there(built, h5):
-    labels = {episode.name: (episode, episode.labels()) for episode in open_input(h5)}
+def test_every_picture_and_video_a_row_names_is_there(built, labelled):
+    labels = {episode.name: (episode, its) for episode, its in labelled}
     for name in SETS:
         for row in rows_of(built, name):
             marks = row["messages"][1]["content"]

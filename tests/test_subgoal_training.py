@@ -42,15 +42,15 @@ def tiny():
 
 def settings(data, output, **words):
     given = {
-        "rows": data / "grounded.jsonl", "output": output, "vlm": "tiny", "steps": 20, "batch": 2, "lr": 1e-2,
-        "per_device_batch": 1, "workers": 0, "log_every": 1, "save_every": 10, "report_to": "null", "device": "cpu",
+        "rows": data / "grounded.jsonl", "output": output, "vlm": "tiny", "steps": 14, "batch": 2, "lr": 1e-2,
+        "per_device_batch": 1, "workers": 0, "log_every": 1, "save_every": 7, "report_to": "null", "device": "cpu",
         "gradient_checkpointing": "false", **words,
     }  # fmt: skip
     return compose("subgoal_train", [f"{key}={value}" for key, value in given.items()])
 
 
 def losses(output):
-    state = json.loads((output / "checkpoint-20" / "trainer_state.json").read_text())
+    state = json.loads((output / "checkpoint-14" / "trainer_state.json").read_text())
     return [entry["loss"] for entry in state["log_history"] if "loss" in entry]
 
 
@@ -133,9 +133,9 @@ def test_the_whole_path_learns_resumes_and_predicts(data, tmp_path):
 
     halved = tmp_path / "halved"
     assert find_checkpoint(halved, "auto") is None
-    (tmp_path / "straight" / "checkpoint-10").rename(tmp_path / "checkpoint-10")
+    (tmp_path / "straight" / "checkpoint-7").rename(tmp_path / "checkpoint-7")
     halved.mkdir()
-    (tmp_path / "checkpoint-10").rename(halved / "checkpoint-10")
+    (tmp_path / "checkpoint-7").rename(halved / "checkpoint-7")
     fine_tune(settings(data, halved, resume="auto"))
     assert losses(halved) == pytest.approx(found, rel=1e-4), "the resumed run ends as the straight one"
 

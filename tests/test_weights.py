@@ -32,16 +32,22 @@ def bases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return {fmt: folder / fmt for fmt in FORMATS}
 
 
+@pytest.fixture(scope="module")
+def base(bases: dict[str, Path]) -> MMEPolicy:
+    """That policy itself, to compare with."""
+    return MMEPolicy.from_pretrained(bases["ours"])
+
+
 def equal(one: MMEPolicy, other: MMEPolicy) -> bool:
     theirs = other.state_dict()
     return all(torch.equal(tensor, theirs[name]) for name, tensor in one.state_dict().items())
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
-def test_every_format_is_told_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path]) -> None:
+def test_every_format_is_told_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path], base: MMEPolicy) -> None:
     assert detect_format(bases[fmt]) == fmt
     loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
-    assert equal(loaded, MMEPolicy.from_pretrained(bases["ours"]))
+    assert equal(loaded, base)
     assert all(p.requires_grad for p in loaded.parameters())
 
 
@@ -55,15 +61,15 @@ def test_statistics_of_one_dataset_come_with_the_weights(fmt: str, bases: dict[s
 @pytest.mark.parametrize("fmt", FORMATS)
 @pytest.mark.parametrize("variant", PERCEPTUAL)
 def test_only_the_memorys_own_parameters_are_new_when_starting_from_pi05(
-    variant: str, fmt: str, bases: dict[str, Path]
+    variant: str, fmt: str, bases: dict[str, Path], base: MMEPolicy
 ) -> None:
-    policy, base = build_policy(variant), MMEPolicy.from_pretrained(bases["ours"]).state_dict()
+    policy, loaded = build_policy(variant), base.state_dict()
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     new = start_from(policy, bases[fmt])
-    assert set(new) == memory_parameters(policy) == set(before) - set(base)
+    assert set(new) == memory_parameters(policy) == set(before) - set(loaded)
     assert new
     for name, tensor in policy.state_dict().items():
-        assert torch.equal(tensor, before[name] if name in new else base[name]), name
+        assert torch.equal(tensor, before[name] if name in new else loaded[name]), name
 
 
 def test_another_variants_memory_is_left_behind_and_said(tmp_path: Path) -> None:

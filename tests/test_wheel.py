@@ -18,11 +18,13 @@ TRAIN = [
 ]  # fmt: skip
 USE = """
 import runpy
+import sys
 import mme_vla
 
 print(mme_vla.__file__)
 print(type(mme_vla.build_policy("tokendrop_expert")).__name__, flush=True)
 runpy.run_module("mme_vla.train", run_name="__main__", alter_sys=True)
+print("lerobot.datasets" in sys.modules)
 """
 
 
@@ -73,9 +75,10 @@ def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> N
 
 def test_a_policy_builds_and_trains_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
     (tmp_path / "use.py").write_text(USE)
-    module, kind = run([str(installed), "use.py", *TRAIN], cwd=tmp_path).splitlines()[:2]
+    module, kind, *_, imported = run([str(installed), "use.py", *TRAIN], cwd=tmp_path).splitlines()
     assert Path(module).is_relative_to(installed.parent.parent)
     assert kind == "MMEPolicy"
+    assert imported == "False"  # writing datasets needs it, and seconds to import it
     assert list((tmp_path / "run").rglob("*.safetensors"))
 
 

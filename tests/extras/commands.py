@@ -10,19 +10,21 @@ import json
 import os
 import runpy
 import signal
+import socket
 import sys
 import tempfile
 import time
 import traceback
 from contextlib import redirect_stderr
-from multiprocessing import forkserver
+from multiprocessing import connection, forkserver, resource_tracker
+from typing import Any
 
 import sitecustomize
 
 from mme_vla.envs.vector import processes
 
 SLOW = (
-    "torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "mme_vla.policy.mme",
+    "torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.policy.mme",
     "mme_vla.training.loop",
 )  # fmt: skip
 """What most commands import, without any extra; not Hydra, which looks for its plugins as it is imported."""
@@ -38,12 +40,21 @@ def hide(modules: list[str]) -> None:
 
 
 def have_simulator(hidden: list[str]) -> None:
-    """Import it, where all but its own extra is hidden, and start the process that simulating ones are forked from."""
+    """Import it, where all but its own extra is hidden, and be forked: simulating processes are, in turn, from that."""
     hide(hidden)
-    processes.simulating_processes()
-    forkserver.ensure_running()
     for module in processes.PRELOADED:
         importlib.import_module(module)
+    resource_tracker.ensure_running()
+    server: Any = forkserver._forkserver
+    alive, server._forkserver_alive_fd = os.pipe()
+    with socket.socket(socket.AF_UNIX) as listener:
+        server._forkserver_address = connection.arbitrary_address("AF_UNIX")
+        listener.bind(server._forkserver_address)
+        listener.listen()
+        if os.fork() == 0:
+            os.close(server._forkserver_alive_fd)  # it ends with the last process that holds the other end
+            forkserver.main(listener.detach(), alive, [])
+    os.close(alive)
 
 
 def child(words: list[str], hidden: list[str], printed: int) -> None:
