@@ -2,9 +2,11 @@
 
 import asyncio
 import threading
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
@@ -18,6 +20,22 @@ GOAL = "pick up the cube"
 def serving_policy(name: str = "tokendrop_expert", **overrides: Any) -> MMEPolicy:
     """Eight by eight patches a picture: most of a request's time would be the tower's."""
     return small_policy(name, backbone={"vision": {**SMALL_VISION, "patch_size": 8}}, **overrides)
+
+
+class Reading:
+    """Of a video without end: whether reading has begun, whether it is enough, whether it is over."""
+
+    def __init__(self) -> None:
+        self.begun, self.enough, self.over = threading.Event(), threading.Event(), threading.Event()
+
+    def longer(self, steps: Iterator[None]) -> Iterator[None]:
+        self.begun.set()
+        try:
+            yield from steps
+            while not self.enough.wait(0.001):
+                yield
+        finally:
+            self.over.set()
 
 
 class Served:
@@ -56,6 +74,22 @@ class Served:
     def busy(self) -> int:
         """Clients that wait for an answer."""
         return sum(connection.busy for connection in self.server.connections.open)
+
+    @contextmanager
+    def reading(self) -> Iterator["Reading"]:
+        """Within the block the first video, once it is read, goes on being read: one of any length."""
+        state, engine = Reading(), self.server.engine
+        begin = engine.run
+
+        async def run(steps: Iterator[None], pieces: int = 1) -> None:
+            first = pieces > 1 and not state.begun.is_set()
+            await (begin(state.longer(steps), 10**6) if first else begin(steps, pieces))
+
+        with patch.object(engine, "run", run):
+            try:
+                yield state
+            finally:
+                state.enough.set()
 
     def client(self, **options: Any) -> Client:
         return Client(f"ws://127.0.0.1:{self.server.port}", **{"timeout": 60, **options})

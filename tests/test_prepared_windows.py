@@ -1,12 +1,10 @@
 """A full window moves at every decision: what its next one needs is prepared while nobody waits, to the same bit."""
 
-import asyncio
-
 import numpy as np
 import pytest
 import torch
 from rollout_stand_ins import InlineEnvs, quick_policy, roll
-from serving_fakes import Served, acted_directly, course, observation
+from serving_fakes import Served, acted_directly, course, observation, wait_until
 from test_recurrent import RandomHistory, make, same_memory, window  # noqa: F401  (a fixture)
 
 from mme_vla.envs.vector.jobs import Job
@@ -196,5 +194,5 @@ def test_a_server_prepares_after_it_has_answered(monkeypatch):
             client.add_buffer(front, state, exec_start=len(front) - 1 if index == 0 else 0)
             actions = client.infer(observation(front[-1], wrist[-1], state[-1]))["actions"]
             assert np.array_equal(actions, expected[index])
-            served.on_loop(asyncio.sleep(0.2))
-    assert True in done, "a window of four frames and pieces of two"
+            wait_until(lambda: not served.server.engine.turns)
+        wait_until(lambda: True in done)  # a window of four frames, pieces of two

@@ -140,7 +140,7 @@ def test_a_page_in_a_browser_is_refused(served):
 
 
 def test_silent_sessions_are_freed(policy):
-    with Served(policy, limits=Limits(idle_s=2)) as served:
+    with Served(policy, limits=Limits(idle_s=4)) as served:
         by_http(served, course()[:1])
         assert len(served.server.sessions.kept) == 1
         wait_until(lambda: not served.server.sessions.kept)
