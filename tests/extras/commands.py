@@ -17,6 +17,7 @@ import time
 import traceback
 from contextlib import redirect_stderr
 from multiprocessing import connection, forkserver, resource_tracker
+from pathlib import Path
 from typing import Any
 
 import sitecustomize
@@ -27,10 +28,17 @@ SLOW = (
     "torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.policy.mme",
     "mme_vla.training.loop",
 )  # fmt: skip
-"""What most commands import, without any extra; not Hydra, which looks for its plugins as it is imported."""
+"""What most commands import, without any extra."""
 
 
-SIMULATOR = "mani_skill"
+COMMANDS = (
+    "composed_before", "mme_vla.commands.evaluate", "mme_vla.commands.gallery", "mme_vla.commands.play",
+    "mme_vla.commands.record", "mme_vla.commands.serve", "mme_vla.commands.train", "mme_vla.commands.weights",
+)  # fmt: skip
+"""Hydra, and what needs it: as it is imported it looks for its plugins, one of which is an extra's."""
+
+
+SIMULATOR, PLUGIN = "mani_skill", "hydra_plugins.hydra_joblib_launcher"
 
 
 def hide(modules: list[str]) -> None:
@@ -104,9 +112,16 @@ if __name__ == "__main__":
         for slow in SLOW:
             importlib.import_module(slow)
     ended: dict[int, tuple[int, str]] = {}
-    for simulates in (False, True):
-        some = [i for i, (_, hidden, _) in enumerate(asked) if (SIMULATOR not in hidden) == simulates]
-        if simulates and some:
+    installed = {SIMULATOR, PLUGIN} & sitecustomize.Selective.hidden
+    there = [installed - set(hidden) for _, hidden, _ in asked]
+    for needed in ({PLUGIN}, set(), {SIMULATOR}):
+        some = [i for i in range(len(asked)) if there[i] == needed]
+        if not needed:
+            sys.path.append(str(Path(__file__).parents[1]))
+            for slow in COMMANDS:
+                importlib.import_module(slow)
+            sys.path.pop()
+        elif needed == {SIMULATOR} and some:
             have_simulator(max((asked[i][1] for i in some), key=len))
         ended |= {i: run(*asked[i]) for i in some}
     print(json.dumps([ended[i] for i in range(len(asked))]))
