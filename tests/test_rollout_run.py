@@ -1,10 +1,7 @@
 """A whole run: killed and gone on with, dying workers, shards, videos, the command."""
 
 import importlib.util
-import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -12,7 +9,6 @@ import forked
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
 from rollout_scripted_env import make_far_env, make_mortal_env
 from rollout_stand_ins import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
 
@@ -61,16 +57,15 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp
     assert len({record.outcome for record in whole.records}) > 1, "the episodes should differ"
 
     folder, records = tmp_path / "killed", tmp_path / "killed" / "episodes.jsonl"
-    command = [sys.executable, str(TESTS / "rollout_stand_ins.py"), str(folder), str(checkpoint), "0.05"]
-    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, cwd=REPOSITORY)
+    run = forked.Command(str(TESTS / "rollout_stand_ins.py"), str(folder), str(checkpoint), "0.05")
     try:
         until = time.monotonic() + 120
         while not records.exists() or records.read_bytes().count(b"\n") < 2:
-            assert process.poll() is None and time.monotonic() < until
+            assert run.process.is_alive() and time.monotonic() < until, run.errors
             time.sleep(0.02)
     finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+        run.process.kill()
+        assert run.finish().returncode == -signal.SIGKILL
     with records.open("ab") as file:
         file.write(b'{"model":"tiny","che')  # as if it had been writing
     with pytest.warns(UserWarning, match="half-written"):
