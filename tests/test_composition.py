@@ -1,11 +1,15 @@
 """Choices of the library's own files are composed once, and values set on them: as Hydra itself would have done."""
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
+from hydra._internal.sources_registry import SourcesRegistry
 
 from mme_vla import UserError
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import cli, compose
+from mme_vla.config.repository import remembered_files
 
 MEMORY = ["model=framesamp_modul", "memory.budget=5"]
 
@@ -43,3 +47,20 @@ def test_what_does_not_fit_is_said_in_the_same_words(word: str, tmp_path: Path) 
 def test_what_is_remembered_is_not_what_is_handed_out() -> None:
     compose("train", MEMORY).memory.budget = 6
     assert compose("train", MEMORY).memory.budget == 5 == compose("train", [*MEMORY, "seed=1"]).memory.budget
+
+
+def test_a_command_reads_no_file_of_the_library_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[str] = []
+    files = SourcesRegistry.instance().resolve("file")
+    load = files.load_config
+    monkeypatch.setattr(
+        files, "load_config", lambda self, config_path: read.append(config_path) or load(self, config_path)
+    )
+    monkeypatch.setattr(sys, "argv", ["train", *MEMORY, f"output={tmp_path}"])
+    monkeypatch.setattr(os, "environ", {**os.environ})
+    monkeypatch.chdir(tmp_path)
+    remembered_files.cache_clear()
+    named: list[str] = []
+    cli("train")(lambda cfg: named.append(cfg.name))()
+    assert named == ["framesamp_modul"]
+    assert "memory/framesamp" in read and len(read) == len(set(read))

@@ -10,10 +10,11 @@ from pathlib import Path
 from types import ModuleType
 
 from hydra import version
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal import config_loader_impl
+from hydra._internal.config_repository import ConfigRepository
 from hydra._internal.hydra import Hydra
 from hydra._internal.utils import create_config_search_path
-from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
@@ -65,6 +66,24 @@ def is_fixed(trees: Sequence[Path], words: Sequence[str]) -> bool:
     return tuple(trees) == (config_dir().resolve(),) and not any("searchpath" in word for word in words)
 
 
+def _repository(config_search_path: ConfigSearchPath) -> ConfigRepository:
+    """What Hydra reads through: of the library's own tree alone, what this process has read before.
+
+    A command composes twice, once to check its words and once as Hydra runs it, and so does each job of a sweep.
+    """
+    directory = config_dir().resolve()
+    if _places(config_search_path) == _places(create_config_search_path(str(directory))):
+        return remembered_files(directory)
+    return ConfigRepository(config_search_path=config_search_path)
+
+
+def _places(config_search_path: ConfigSearchPath) -> list[tuple[str | None, str | None]]:
+    return [(element.provider, element.path) for element in config_search_path.get_path()]
+
+
+config_loader_impl.ConfigRepository = _repository  # type: ignore[misc, assignment]
+
+
 @contextmanager
 def own_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
     """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
@@ -77,11 +96,7 @@ def own_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
     try:
         version.setbase(VERSION_BASE)
         name = JobRuntime.instance().get("name")  # a sweep's next job is still to be called by it
-        engine = Hydra.create_main_hydra2(task_name=name, config_search_path=search_path)
-        if is_fixed((directory, *extra_dirs), ()):
-            assert isinstance(engine.config_loader, ConfigLoaderImpl)
-            engine.config_loader.repository = remembered_files(directory)
-        yield engine
+        yield Hydra.create_main_hydra2(task_name=name, config_search_path=search_path)
     finally:
         GlobalHydra.instance().hydra = outer
         base.version_base = outer_base
