@@ -14,7 +14,7 @@ import pytest
 REPOSITORY = Path(__file__).resolve().parent.parent
 TRAIN = [
     "model=tokendrop_expert", "train.steps=3", "train.val_samples=2", "train.open_loop_chunks=1",
-    "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1", "hydra.run.dir=run",
+    "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2", "hydra.run.dir=run",
 ]  # fmt: skip
 USE = """
 import runpy
