@@ -185,7 +185,8 @@ def learn(
     )
     policy.backbone.vision.requires_grad_(False)
     seen, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
-    optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=lr, betas=(0.9, 0.95))
+    trained = [p for p in policy.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(trained, lr=lr, betas=(0.9, 0.95), fused=True)
     rng, done = np.random.default_rng(seed), 0
     while time.process_time() - start < seconds and done < steps:
         policy.train()
@@ -193,7 +194,7 @@ def learn(
             group["lr"] = lr * min(1.0, (done + 1) / 30)
         loss, _ = policy(make_batch(policy, seen, rng, batch_size))
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         done += 1

@@ -52,7 +52,7 @@ def test_with_a_memory_it_answers_by_what_it_remembers() -> None:
     }
     answers = torch.tensor([1.0, -1.0])[:, None, None].expand_as(batch.actions)
     batch = replace(batch, **alike, actions=answers, proprio=torch.zeros(2, policy.embodiment.state.width))
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=8e-3)
+    optimizer = torch.optim.AdamW(policy.parameters(), lr=8e-3, fused=True)
     for _ in range(80):
         optimizer.zero_grad()
         loss, _ = policy(batch)
