@@ -53,9 +53,9 @@ for what, (absent, code) in json.load(sys.stdin).items():
                 traceback.print_exc(file=printed)
             printed.flush()
             os._exit(0)
-        os.waitpid(child, 0)
+        status = os.waitpid(child, 0)[1]
         printed.seek(0)
-        said[what] = printed.read()
+        said[what] = printed.read() or (f"killed: status {status}" if status else "")
 print(json.dumps(said))
 """
 
