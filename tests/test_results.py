@@ -424,7 +424,7 @@ def test_escape_sequences_of_names_do_not_reach_the_terminal(
 def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
     results = aggregate(records(start, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20))
     rows = list(csv.DictReader(io.StringIO(to_csv(results), newline="")))
-    assert {row["method"] for row in rows} == {f"'{start}"}
+    assert {row["method"] for row in rows} == {f"'{start.strip()}"}
     assert {row["mean"] for row in rows} == {"100.0000"}
 
 

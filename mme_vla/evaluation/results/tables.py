@@ -243,7 +243,8 @@ def to_latex(table: Table) -> str:
 
 
 def _no_formula(text: str) -> str:
-    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r")) else text
+    text = " ".join(text.split())  # a name with a line break would begin another row
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
 
 
 CSV_COLUMNS = (
