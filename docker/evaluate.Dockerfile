@@ -1,6 +1,6 @@
 # A policy on the benchmark: docker build -f docker/evaluate.Dockerfile -t mme-vla-evaluate .
 # docker run --gpus all -v <checkpoint>:/checkpoint:ro -v <folder>:/results mme-vla-evaluate
-FROM python:3.12-slim
+FROM python:3.12.12-slim-trixie
 
 WORKDIR /app
 COPY scripts/install_vulkan.sh scripts/install_vulkan.sh

@@ -43,6 +43,18 @@ def brief(value: object, most: int = 80, quote: bool = True) -> str:
     return text if len(text) <= most else f"{text[:half]}…{text[-half:]}"
 
 
+def printable(text: str) -> str:
+    r"""Text for a terminal: escape sequences and other characters that cannot be seen, spelled out. Lines stay lines.
+
+    >>> print(printable("\x1b[2J"))
+    \x1b[2J
+    """
+    return "".join(
+        letter if letter.isprintable() or letter in "\n\N{NO-BREAK SPACE}" else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
+
+
 def listed(names: Iterable[object], most: int = 12) -> str:
     """Names as one list of a message, the first `most` of them and how many more there are.
 

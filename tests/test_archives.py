@@ -123,3 +123,35 @@ def test_a_cut_archive_is_damaged(published: Path, tmp_path: Path) -> None:
     (tmp_path / "79999.zip").write_bytes(flipped)
     with pytest.raises(UserError, match="damaged"):
         load_weights(build_policy("tokendrop_modul"), tmp_path / "79999.zip")
+
+
+def test_a_name_that_stands_twice_is_refused(tmp_path: Path) -> None:
+    file = write(tmp_path / "1.zip", **{"params/manifest.ocdbt": b"x", "params/d/1": b"first"})
+    with zipfile.ZipFile(file, "a") as archive, pytest.warns(UserWarning, match="Duplicate name"):
+        archive.writestr("params/d/1", b"second")
+    with pytest.raises(UserError, match="names 'params/d/1' twice"):
+        open_source(file)
+
+
+def test_entries_that_overlap_are_refused(tmp_path: Path) -> None:
+    """One entry's content holds the header of another, which the directory lists as well."""
+    inner = write(tmp_path / "inner.zip", **{"params/d/2": b"y" * 1000})
+    with zipfile.ZipFile(inner) as archive:
+        hidden = archive.getinfo("params/d/2")
+    file = tmp_path / "1.zip"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("params/manifest.ocdbt", b"x")
+        archive.writestr("params/d/1", inner.read_bytes())
+        outer = archive.getinfo("params/d/1")
+        hidden.header_offset = outer.header_offset + len(outer.FileHeader())
+        archive.filelist.append(hidden)
+    with zipfile.ZipFile(file) as archive:
+        assert archive.read("params/d/1") == inner.read_bytes()
+    with pytest.raises(UserError, match="the bytes of 'params/d/1' overlap"):
+        open_source(file)
+
+
+def test_many_small_files_that_unpack_to_more_than_arrays_do_are_refused(tmp_path: Path) -> None:
+    pieces = {f"params/d/{i}": bytes(4_000_000) for i in range(3)}
+    with pytest.raises(UserError, match="bytes unpack to 12,000,001: that is no checkpoint"):
+        open_source(write(tmp_path / "1.zip", **{"params/manifest.ocdbt": b"x"}, **pieces))

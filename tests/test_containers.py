@@ -9,6 +9,9 @@ from pathlib import Path
 import pytest
 
 from mme_vla.config.comments import COMMANDS, keys
+from mme_vla.config.composition import compose
+from mme_vla.errors import UserError
+from mme_vla.serving.settings import ServeSettings
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 FILES = sorted((REPOSITORY / "docker").glob("*.Dockerfile"))
@@ -28,9 +31,9 @@ def test_there_is_one_to_serve_and_one_to_evaluate() -> None:
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.name)
 def test_a_dockerfile_says_nothing_that_cannot_be(file: Path) -> None:
     found = steps(file)
-    assert found[0][0] == "FROM" and re.fullmatch(r"[\w.-]+:[\w.-]+", found[0][1]), "a pinned image"
-    python = found[0][1].partition(":")[2].removesuffix("-slim")
-    assert (REPOSITORY / ".python-version").read_text().strip().startswith(python)
+    image = re.fullmatch(r"python:(\d+\.\d+)\.\d+-slim-[a-z]+", found[0][1])
+    assert found[0][0] == "FROM" and image is not None, "one release of Python on one of Debian"
+    assert image[1] == (REPOSITORY / ".python-version").read_text().strip()
     for word, rest in found:
         assert word in {"FROM", "WORKDIR", "COPY", "RUN", "USER", "EXPOSE", "ENTRYPOINT", "CMD"}
         if word == "COPY":
@@ -63,7 +66,19 @@ def test_it_installs_an_extra_that_exists_and_runs_a_command_with_its_own_words(
     assert found.get("EXPOSE") in (None, ports[1])
 
 
-def test_what_an_image_needs_is_not_left_out() -> None:
-    left_out = (REPOSITORY / ".dockerignore").read_text().splitlines()
+def test_an_image_holds_what_it_needs_and_nothing_else() -> None:
+    rules = [line for line in (REPOSITORY / ".dockerignore").read_text().splitlines() if not line.startswith("#")]
     needed = {"mme_vla", "configs", "plugins", "scripts", "pyproject.toml", "README.md", "LICENSE", "constraints.txt"}
-    assert not needed & set(left_out)
+    assert rules[0] == "*", "what is not named, such as .env, keys, datasets and checkpoints, stays out"
+    assert {rule[1:] for rule in rules if rule.startswith("!")} == needed | {".python-version"}
+    assert {"**/.env*", "**/*.key", "**/*.pem"} <= set(rules)
+
+
+def test_the_serving_image_does_not_start_without_a_key() -> None:
+    (entry,) = [json.loads(rest) for word, rest in steps(FILES[1]) if word == "ENTRYPOINT"]
+    assert {"host=0.0.0.0", "require_key=true"} <= set(entry)
+    with pytest.raises(UserError, match="MME_VLA_API_KEY"):
+        ServeSettings.from_dict({"host": "0.0.0.0", "require_key": True, "api_key": ""})
+    assert ServeSettings.from_dict({"require_key": True, "api_key": "secret"}).api_key == "secret"
+    config = compose("serve", [*entry[3:], "model=pi05", "backbone=tiny", "require_key=false"])
+    assert config.require_key is False, "words after the image's name count"

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from mme_vla.files import (
     check_sums,
     inside,
     parse_json,
+    read_bytes,
     read_json,
     read_json_lines,
     read_text,
@@ -148,3 +150,13 @@ def test_values_and_lists_in_messages_stay_short() -> None:
     assert brief("x" * 1000, 9) == "'xxx…xxx'"
     assert len(brief(10**5000)) <= 80
     assert listed(["a", "b", "c"], 2) == "a, b and 1 more"
+
+
+def test_reading_takes_the_memory_that_a_file_needs_not_its_limit(tmp_path: Path) -> None:
+    (tmp_path / "small").write_bytes(b"text")
+    tracemalloc.start()
+    try:
+        assert read_bytes(tmp_path / "small", limit=2**28) == b"text"
+        assert tracemalloc.get_traced_memory()[1] < 2**20
+    finally:
+        tracemalloc.stop()

@@ -1,6 +1,8 @@
 """The model server of vla-evaluation-harness, driven by the harness's own runner: the numbers are the policy's."""
 
 import asyncio
+import sys
+from pathlib import Path
 from typing import Any
 
 import forked
@@ -11,12 +13,15 @@ vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed:
 from vla_eval.api import serve_background  # noqa: E402
 from vla_eval.benchmarks.base import StepBenchmark, StepResult  # noqa: E402
 from vla_eval.connection import Connection  # noqa: E402
+from vla_eval.model_servers import serve as harness_serve  # noqa: E402
 from vla_eval.runners.base import ModelActError  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW  # noqa: E402
 
+from mme_vla.commands.harness import main  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 from mme_vla.policy.mme import MMEPolicy  # noqa: E402
+from mme_vla.serving import harness  # noqa: E402
 from mme_vla.serving.harness import MMEVLAModelServer  # noqa: E402
 from mme_vla.testing.small import small_policy  # noqa: E402
 
@@ -161,3 +166,35 @@ def test_the_command_shows_the_harnesss_words() -> None:
     done = forked.run("mme_vla.serving.vla_eval", "--help")
     assert done.returncode == 0, done.stderr
     assert "--args.checkpoint" in done.stdout and "--args.flow_steps" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "address", "warned"),
+    [
+        ((), ("127.0.0.1", 8000), False),
+        (("--port=1",), ("127.0.0.1", 1), False),
+        (("--address=:2",), ("127.0.0.1", 2), False),
+        (("--host=0.0.0.0",), ("0.0.0.0", 8000), True),
+        (("--address=0.0.0.0:3",), ("0.0.0.0", 3), True),
+        (("--config=FILE",), ("0.0.0.0", 4), True),
+    ],
+)
+def test_the_server_listens_on_this_machine_alone_by_default(
+    words: tuple[str, ...],
+    address: tuple[str, int],
+    warned: bool,
+    policy: MMEPolicy,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    addresses = []
+    monkeypatch.setattr(harness_serve, "serve", lambda server, host, port: addresses.append((host, port)))
+    monkeypatch.setattr(harness, "serve", harness_serve.serve, raising=False)
+    policy.save_pretrained(tmp_path / "checkpoint")
+    (tmp_path / "server.yaml").write_text("host: 0.0.0.0\nport: 4\n")
+    words = tuple(word.replace("FILE", str(tmp_path / "server.yaml")) for word in words)
+    monkeypatch.setattr(sys, "argv", ["vla_eval", *words, f"--args.checkpoint={tmp_path / 'checkpoint'}"])
+    main()
+    assert addresses == [address]
+    assert ("whoever reaches this port" in caplog.text) == warned

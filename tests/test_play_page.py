@@ -4,6 +4,7 @@ import http.client
 import json
 import os
 import signal
+import socket
 import struct
 import subprocess
 import sys
@@ -19,6 +20,7 @@ from play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
 
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import read_records
+from mme_vla.play import web
 from mme_vla.play.desk import Desk
 from mme_vla.play.run import Identity, PlayRun
 from mme_vla.play.web import is_local, listen, make_server
@@ -302,3 +304,42 @@ def test_the_page_says_when_the_server_is_gone(tmp_path):
             browser.open(f"http://127.0.0.1:{page.port}/")
             browser.wait("document.querySelectorAll('.option:not(:disabled)').length === 3")
         browser.wait("document.querySelector('#error').innerText.includes('does not answer')")
+
+
+def ended(connection):
+    """What came until the server closed the connection."""
+    connection.settimeout(30)
+    received = b""
+    try:
+        while piece := connection.recv(2**16):
+            received += piece
+    except ConnectionResetError:
+        pass
+    return received
+
+
+def test_headers_and_bodies_that_never_end_are_not_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(web, "ARRIVAL_S", 0.5)
+    with served(tmp_path) as page:
+        at = ("127.0.0.1", page.port)
+        head = b"POST /next HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 9\r\n\r\n"
+        with socket.create_connection(at) as silent, socket.create_connection(at) as half:
+            half.sendall(b"GET /state HTTP/1.1\r\nHost:")
+            assert ended(silent) == ended(half) == b""
+        with socket.create_connection(at) as again:
+            again.sendall(b"GET /icon.svg HTTP/1.1\r\nHost: localhost\r\n\r\nGET /state HT")
+            assert ended(again).startswith(b"HTTP/1.1 200")
+        with socket.create_connection(at) as slow:
+            slow.sendall(head + b"{")
+            answer = ended(slow)
+        assert answer.startswith(b"HTTP/1.1 400") and b"did not arrive within" in answer
+        assert page.ask("GET", "/state")[0].status == 200
+
+
+@pytest.mark.parametrize("method", ["POST /choose", "GET /state"])
+def test_a_body_that_is_not_read_ends_the_connection(tmp_path, method):
+    with served(tmp_path) as page, socket.create_connection(("127.0.0.1", page.port)) as endless:
+        endless.sendall(method.encode() + b" HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+                        b"Content-Length: 1000000000\r\n\r\n" + bytes(5000))  # fmt: skip
+        answer = ended(endless)
+    assert b"connection: close" in answer.lower().partition(b"\r\n\r\n")[0]

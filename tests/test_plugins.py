@@ -200,3 +200,18 @@ def test_hydra_imports_nothing_from_the_folder_one_stands_in(tmp_path: Path) -> 
     environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
     assert not (tmp_path / "ran").exists()
+
+
+def test_a_file_where_one_stands_takes_no_place_of_an_installed_module(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_plugin_beside.py").write_text("import tabnanny\n")
+    (tmp_path / "tabnanny.py").write_text("raise AssertionError('this is not the installed module')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
+    for name in ("tabnanny", "own_plugin_beside"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    import_modules(["own_plugin_beside"])
+    assert hasattr(sys.modules["tabnanny"], "check")
+    sys.modules.pop("own_plugin_beside")
+    plugins._imported.pop("own_plugin_beside")

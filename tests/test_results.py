@@ -1,6 +1,7 @@
 """The results command: the paper's tables come back, nothing incomplete is averaged, comparisons are paired."""
 
 import csv
+import io
 import json
 import math
 from dataclasses import replace
@@ -398,3 +399,61 @@ def test_a_submission_shows_settings_of_unusual_kinds_as_they_are(config: dict[s
     methods = aggregate(records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]}), SMALL).methods
     run = {"settings": {"model": "a", "checkpoint": 100}, "notes": {"policy": policy_facts(config)}}
     assert said in training_details(methods, [run])
+
+
+HOSTILE = "\x1b]0;title\x07\x1b[2J"
+
+
+def test_escape_sequences_of_names_do_not_reach_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for i, name in enumerate((f"a{HOSTILE}", f"b{HOSTILE}")):
+        with RecordLog(tmp_path / f"episodes-{i}.jsonl") as log:
+            for record in records(name, {"BinFill": [True, False]}):
+                log.append(record)
+    main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2"])
+    assert "\\x1b[2J" in (printed := capsys.readouterr().out)
+    assert "\x1b" not in printed and "\x07" not in printed
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / HOSTILE)])
+    assert "\\x1b[2J" in (printed := capsys.readouterr().err)
+    assert "\x1b" not in printed and "\x07" not in printed
+
+
+@pytest.mark.parametrize("start", ["=HYPERLINK(1)", "+1", "-1", "@SUM(1)", "\t=1", "\r=1"])
+def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
+    results = aggregate(records(start, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20))
+    rows = list(csv.DictReader(io.StringIO(to_csv(results), newline="")))
+    assert {row["method"] for row in rows} == {f"'{start.strip()}"}
+    assert {row["mean"] for row in rows} == {"100.0000"}
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("[x](javascript:alert(1))", "[x]\\(javascript:alert(1))"),
+        ("![x][y]", "![x]\\[y]"),
+        ("[x]: javascript:alert(1)", "[x]\\: javascript:alert(1)"),
+        ("<script>", "\\<script>"),
+        ("a\\](b)", "a\\\\]\\(b)"),
+        ("a|b", "a\\|b"),
+        ("a\n# b", "a # b"),
+        ("[+1.0, +2.0]", "[+1.0, +2.0]"),
+    ],
+)
+def test_a_name_is_no_link_and_no_html_of_markdown(name: str, shown: str) -> None:
+    assert to_markdown(Table(name, ["method"], [[name]])) == f"### {shown}\n\n| method |\n| :--- |\n| {shown} |\n"
+
+
+def test_training_details_hold_no_link_of_a_name() -> None:
+    name = "[x](javascript:alert(1))"
+    results = aggregate(records(name, {"BinFill": [True]}), Protocol(("BinFill",), episodes=1, samples=20))
+    assert "](" not in training_details(results.methods, [])
+
+
+def test_a_name_with_dollar_signs_is_text_in_the_figures(tmp_path: Path) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for record in records(r"$\nonsense$", {"BinFill": [True, False]}):
+            log.append(record)
+    main([str(tmp_path), "--tasks", "BinFill", "--episodes", "2", "--html", str(tmp_path / "page.html"), "--brief"])
+    assert r"$\nonsense$" in (tmp_path / "page.html").read_text()

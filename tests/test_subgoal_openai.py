@@ -162,3 +162,40 @@ def test_a_player_speaks_to_the_same_endpoints(server: ChatServer) -> None:
     action, note = player.choose(session)
     assert action == {"choice": "a", "point": [128, 64]} and note["answers"][0] == "I see it."
     assert (player.model, player.notes()["usage"]["calls"]) == ("gpt-5-mini", 2)
+
+
+def test_an_answer_that_repeats_the_key_is_kept_without_it(
+    server: ChatServer, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    login = base64.b64encode(b"me:pa@ssword-1").decode()
+    address = server.url.replace("//", "//me:pa%40ssword-1@")
+    echo = f"{SECRET} pa@ssword-1 {login}"
+    server.answers = [failure(500, echo), says(None, refusal=echo), subgoal(f"press {echo}")]
+    predictor = OpenAI(base_url=address, cache=str(tmp_path), retries=1, interval=16, **QUICK)
+    episode = predictor.start_episode("press", None, "StopCube")
+    heard = []
+    with caplog.at_level(logging.DEBUG):
+        for _ in range(2):
+            episode.observe(frames(16))
+            heard.append(predictor.predict([episode])[0])
+    kept = "".join(file.read_text() for file in tmp_path.rglob("*.json"))
+    for text in (caplog.text, repr(heard), kept):
+        assert not any(secret in text for secret in (SECRET, "ssword", login))
+    assert heard[1].answer is not None and "press *** *** ***" in heard[1].answer and "press *** *** ***" in kept
+    assert set(server.keys) == {f"Basic {login}"}, "as it is sent for an address with a password"
+
+
+@pytest.mark.parametrize("address", ["ftp://me:secret-word@host", "http://[me:secret-word@host"])
+def test_an_address_that_is_refused_is_named_without_its_password(address: str) -> None:
+    with pytest.raises(UserError, match="must be an address") as caught:
+        OpenAISettings(base_url=address)
+    assert "secret-word" not in str(caught.value)
+
+
+def test_a_key_that_is_a_word_is_left_in_answers(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("OPENAI_API_KEY", "none")
+    server.answers = [subgoal("press none of them")]
+    predictor = OpenAI(base_url=server.url, **QUICK)
+    episode = predictor.start_episode("press")
+    episode.observe(frames(1))
+    assert predictor.predict([episode])[0].text == "press none of them"

@@ -7,6 +7,6 @@ def main() -> None:
     Raises:
         UserError: the extra `harness` is not installed, or a checkpoint that cannot be served.
     """
-    from mme_vla.serving.harness import MMEVLAModelServer, run_server
+    from mme_vla.serving.harness import run_server
 
-    run_server(MMEVLAModelServer)
+    run_server()

@@ -7,7 +7,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, printable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,7 +27,7 @@ def main(cfg: DictConfig) -> None:
     """
     from rich.console import Console
 
-    console = Console()
+    console = Console(markup=False)
     if (cfg.checkpoint is None) == (cfg.dataset is None):
         raise UserError("Name one thing to inspect: checkpoint=<folder>, or dataset=<folder> (`sample` is built in).")
     if cfg.checkpoint is not None:
@@ -69,7 +69,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _plain(section))
-    settings.add_row("words", policy.require_processor().words_from)
+    settings.add_row("words", printable(policy.require_processor().words_from))
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
@@ -99,16 +99,17 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
     for episode in range(min(len(source), most)):
         frames, video = int(source.lengths[episode]), int(source.exec_starts[episode])
-        goal, seconds = source.goal(episode), f"{frames / source.fps:.1f}"
-        table.add_row(str(episode), source.task(episode), str(frames), str(video), seconds, goal)
+        goal, seconds = printable(source.goal(episode)), f"{frames / source.fps:.1f}"
+        table.add_row(str(episode), printable(source.task(episode)), str(frames), str(video), seconds, goal)
     if len(source) > most:
         table.add_row("…", f"{len(source) - most} more")
     frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
     table.add_row("all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold")
     console.print(table)
+    subgoals = printable(", ".join(source.subgoal_names)) or "none"
     console.print(
         f"{frames - video} execution steps to train on · {source.fps:g} frames per second · pictures as "
-        f"{'video' if source.video_cameras else 'images'} · subgoals: {', '.join(source.subgoal_names) or 'none'}",
+        f"{'video' if source.video_cameras else 'images'} · subgoals: {subgoals}",
         highlight=False,
     )
     console.print(
@@ -121,12 +122,12 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
     """Print an episode's phases, and what is recorded at one step."""
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     table = _table(f"{source.name}, episode {episode}, step {step} of {length}", "", "")
-    table.add_row("task", source.task(episode))
-    table.add_row("goal", source.goal(episode))
+    table.add_row("task", printable(source.task(episode)))
+    table.add_row("goal", printable(source.goal(episode)))
     table.add_row("video", f"frames 0 … {start - 1}" if start else "none")
     table.add_row("execution", f"frames {start} … {length - 1}")
     for name, text in source.subgoals(episode, step).items():
-        table.add_row(name, text)
+        table.add_row(name, printable(text))
     table.add_row("state", _numbers(source.states(episode, step, step + 1)[0]))
     table.add_row("action", _numbers(source.actions(episode, step, step + 1)[0]))
     console.print(table)
@@ -210,7 +211,7 @@ def _parts(policy: "Policy") -> dict[str, list[Any]]:
 def _table(title: str, *columns: str) -> "Table":
     from rich.table import Table
 
-    table = Table(title=title, title_justify="left", show_header=any(columns), title_style="bold")
+    table = Table(title=printable(title), title_justify="left", show_header=any(columns), title_style="bold")
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right")
     return table
@@ -220,7 +221,7 @@ def _plain(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key}={_plain(inner) if not isinstance(inner, dict) else '{' + _plain(inner) + '}'}"
                          for key, inner in value.items())  # fmt: skip
-    return str(value)
+    return printable(str(value))
 
 
 def _numbers(values: np.ndarray) -> str:

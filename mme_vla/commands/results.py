@@ -12,7 +12,7 @@ from pathlib import Path
 from mme_vla.config.composition import print_user_errors
 from mme_vla.config.help import argument_parser
 from mme_vla.envs.metadata import FURTHER_SPLITS
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, printable
 from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
@@ -26,6 +26,7 @@ from mme_vla.evaluation.results.tables import (
     Table,
     comparison_table,
     detail,
+    escape_markdown,
     leaderboard,
     overview,
     print_table,
@@ -87,9 +88,9 @@ def run(args: argparse.Namespace) -> None:
     for table in _tables(results, comparisons, detailed=not args.brief):
         print_table(table, console.width)
     for comparison in comparisons:
-        console.print(comparison.verdict, markup=False, highlight=False)
+        console.print(printable(comparison.verdict), markup=False, highlight=False)
     for note in results.notes:
-        console.print(f"• {note}", markup=False, highlight=False, soft_wrap=True)
+        console.print(printable(f"• {note}"), markup=False, highlight=False, soft_wrap=True)
     for path in write(results, comparisons, args):
         console.print(f"wrote {path}", markup=False, highlight=False, soft_wrap=True)
 
@@ -132,7 +133,7 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
         parts.append(training_details(results.methods, read_runs(find_records(args.runs))))
         if comparisons:
             parts.append(to_markdown(comparison_table(comparisons)))
-        parts += [f"- {note}" for note in results.notes]
+        parts += [f"- {escape_markdown(note)}" for note in results.notes]
         texts[args.markdown] = "\n".join(parts) + ("\n" if results.notes else "")
     if args.html:
         from mme_vla.evaluation.results.report import html_report

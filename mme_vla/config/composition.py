@@ -30,7 +30,7 @@ from mme_vla.config.hydra_engine import config_dir as config_dir
 from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
 from mme_vla.config.naming import remember_name, true_name
 from mme_vla.config.words import join_memories, several_memories
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, printable
 
 
 def compose(
@@ -220,11 +220,18 @@ def known_keys(config_name: str, tree: Path) -> list[str]:
 def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
     """Let a command's logger, and warnings, speak on standard error; `clock` puts the time of day before each line."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
+    handler.setFormatter(_Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
     logger.setLevel(logging.INFO)
     logger.handlers = [handler]
     logger.propagate = False
     warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
+
+
+class _Printable(logging.Formatter):
+    """Lines as a terminal may have them: they name what untrusted files and clients sent."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 def _choices(override: Override) -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, printable
 from mme_vla.files.trouble import disk_trouble
 
 DISK_TROUBLE, MISTAKE = 1, 2  # exit codes; a signal's is 128 and its number, as a shell has it
@@ -65,7 +65,7 @@ def _say(text: str, bold: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    rest = text.removeprefix(bold)
+    rest = printable(text.removeprefix(bold))
     try:
         Console(stderr=True, soft_wrap=True).print(Text(bold, "bold red"), Text(rest), sep="")
     except OSError:  # the terminal, or the disk that standard error goes to, is what gave way

@@ -23,7 +23,8 @@ _imported: dict[str, None] = {}  # in order
 def import_plugins(names: Iterable[str]) -> None:
     """Import modules that the user named.
 
-    The current directory counts as importable, so that a file beside the command is enough.
+    The current directory counts as importable, so that a file beside the command is enough. Installed packages come
+    first, so that no file there takes the place of one.
 
     Raises:
         UserError: there is no such module. What goes wrong inside one keeps its traceback.
@@ -31,7 +32,7 @@ def import_plugins(names: Iterable[str]) -> None:
     for name in names:
         here = str(Path.cwd())
         if here not in sys.path:
-            sys.path.insert(0, here)
+            sys.path.append(here)
         try:
             importlib.import_module(name)
         except ModuleNotFoundError as error:

@@ -30,7 +30,7 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
                 raise UserError(f"{path} is not a file; expected {what}.")
             if found.st_size > limit:
                 raise UserError(f"{path} has {found.st_size:,} bytes; {what} has at most {limit:,}.")
-            return file.read(limit + 1)
+            return file.read(found.st_size + 1)  # reading `limit` would allocate it, whatever the size
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the path

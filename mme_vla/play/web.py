@@ -17,6 +17,7 @@ log = logging.getLogger("mme_vla.play")
 PAGE = {"": "index.html", "play.css": "play.css", "play.js": "play.js", "film.js": "film.js", "icon.svg": "icon.svg"}
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 MOST = 4096  # bytes of a request's body
+ARRIVAL_S = 10  # seconds that headers may take, and a body
 HEADERS = (
     (b"content-security-policy", b"default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
                                  b"connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"),
@@ -78,10 +79,14 @@ def make_app(desk: Desk, local: bool = True) -> Any:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise UserError("Send JSON, as application/json.")
         content = bytearray()
-        async for piece in request.stream():
-            content += piece
-            if len(content) > MOST:
-                raise UserError(f"The request is longer than {MOST} bytes.")
+        try:
+            async with asyncio.timeout(ARRIVAL_S):
+                async for piece in request.stream():
+                    content += piece
+                    if len(content) > MOST:
+                        raise UserError(f"The request is longer than {MOST} bytes.")
+        except TimeoutError:
+            raise UserError(f"The request did not arrive within {ARRIVAL_S} s.") from None
         return parse_json(bytes(content) or b"{}", "The request")
 
     async def choose(request: Request) -> Response:
@@ -119,21 +124,31 @@ def make_app(desk: Desk, local: bool = True) -> Any:
 
 
 def _guarded(app: Any, local: bool) -> Any:
-    """Refuse foreign host names, and add the headers that keep the page to itself."""
+    """Refuse foreign host names, add the headers that keep the page to itself, and hang up on bodies not read."""
 
     async def guarded(scope: Any, receive: Any, send: Any) -> None:
         if scope["type"] != "http":
             return await app(scope, receive, send)
 
+        headers = dict(scope["headers"])
+        unread = b"transfer-encoding" in headers or headers.get(b"content-length", b"0").strip(b"0") != b""
+
+        async def reading() -> Any:
+            nonlocal unread
+            message = await receive()
+            unread = unread and bool(message.get("more_body", False))
+            return message
+
         async def sealed(message: Any) -> None:
             if message["type"] == "http.response.start":
-                message = {**message, "headers": [*message["headers"], *HEADERS]}
+                close = [(b"connection", b"close")] if unread else []
+                message = {**message, "headers": [*message["headers"], *HEADERS, *close]}
             await send(message)
 
         if local and not is_local(_host_of(scope)):
             await sealed({"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]})
             return await sealed({"type": "http.response.body", "body": b"This page is for this machine only.\n"})
-        return await app(scope, receive, sealed)
+        return await app(scope, reading, sealed)
 
     return guarded
 
@@ -153,9 +168,31 @@ def make_server(desk: Desk, local: bool = True) -> Any:
     """
     app = make_app(desk, local)
     import uvicorn
+    from uvicorn.protocols.http.h11_impl import H11Protocol
 
-    return uvicorn.Server(uvicorn.Config(app, log_level="warning", access_log=False, ws="none", lifespan="on",
-                                         timeout_graceful_shutdown=5))  # fmt: skip
+    class TimedProtocol(H11Protocol):
+        """HTTP/1.1 that waits `ARRIVAL_S` for the headers of a request; uvicorn's waits without end."""
+
+        def connection_made(self, transport: Any) -> None:
+            super().connection_made(transport)
+            self._head = self.loop.call_later(ARRIVAL_S, transport.abort)
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            self._head.cancel()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            if self.cycle is not None and not self.cycle.response_complete:
+                self._head.cancel()
+
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            if self.cycle.response_complete:  # no further request has come already
+                self._head = self.loop.call_later(ARRIVAL_S, self.transport.abort)
+
+    return uvicorn.Server(uvicorn.Config(app, http=TimedProtocol, log_level="warning", access_log=False, ws="none",
+                                         lifespan="on", timeout_graceful_shutdown=5))  # fmt: skip
 
 
 def serve(desk: Desk, host: str, port: int) -> None:

@@ -4,6 +4,8 @@ The harness sends one observation a step and asks for one action. Most are answe
 frames count all the same, and are handed to the episode when the next chunk is chosen.
 """
 
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,16 +17,19 @@ from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.processing.subgoal_text import subgoal_kind
+from mme_vla.serving.listen import is_local
 from mme_vla.serving.settings import ServeSettings
 
 try:
+    from jsonargparse import ActionConfigFile, ArgumentParser
     from vla_eval.model_servers.base import SessionContext
     from vla_eval.model_servers.predict import PredictModelServer
-    from vla_eval.model_servers.serve import run_server as run_server
+    from vla_eval.model_servers.serve import serve
     from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW, DimSpec
 except ImportError as error:
     raise missing_extra("A model server of vla-evaluation-harness", "harness") from error
 
+logger = logging.getLogger("mme_vla.serving")
 VIEWS = {"front": "agentview", "wrist": "wrist"}
 """The harness's names of the cameras."""
 SPACES = ("joint_angle", "ee_pose")
@@ -161,3 +166,32 @@ class MMEVLAModelServer(PredictModelServer):
             episode.remember(np.stack(video), is_demo=True)
         episode.observe({name: np.stack([p[name] for p in pictures]) for name in pictures[0]}, np.stack(states))
         return episode
+
+
+def run_server(arguments: Sequence[str] | None = None) -> None:
+    """Serve with the command-line options of the harness's model servers, but on this machine alone by default.
+
+    Raises:
+        UserError: a checkpoint that cannot be served.
+    """
+    parser = ArgumentParser(description="A policy behind vla-evaluation-harness.")
+    parser.add_argument("--config", action=ActionConfigFile, help="YAML file with these options")
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on; clients send no key")
+    parser.add_argument("--port", type=int, default=8000)
+    parser.add_argument("--address", help="host:port in one, before --host and --port")
+    parser.add_argument("--verbose", "-v", action="store_true", help="log every message")
+    parser.add_argument("--script", help="ignored; files of the harness name it")
+    parser.add_class_arguments(MMEVLAModelServer, "args", fail_untyped=False, sub_configs=True)
+    options = parser.parse_args(arguments)
+    level = logging.DEBUG if options.verbose else logging.INFO
+    logging.basicConfig(level=level, format="%(asctime)s %(name)s: %(message)s")
+    host, port = options.host, options.port
+    if options.address:
+        name, _, number = options.address.rpartition(":")
+        if not number.isdecimal():
+            raise UserError(f"--address={options.address!r} must be host:port, such as 127.0.0.1:8000.")
+        host, port = name or host, int(number)
+    server = MMEVLAModelServer(**options.args.as_dict())
+    if not is_local(host):
+        logger.warning("host=%s: whoever reaches this port can use it, the harness has no key", host)
+    serve(server, host=host, port=port)

@@ -42,6 +42,7 @@ class ServeSettings:
     host: str = "127.0.0.1"
     port: int = 8001
     api_key: str | None = field(default=None, repr=False)
+    require_key: bool = False
     action_space: str | None = None
     execute: int | None = None
     flow_steps: int | None = None
@@ -59,6 +60,11 @@ class ServeSettings:
             isinstance(key, str) and key.isascii() and key.isprintable() and key.strip() == key != ""
         ):
             raise UserError("api_key must be a text of plain ASCII without blanks around it; null asks for none.")
+        if self.require_key and key is None:
+            raise UserError(
+                "require_key=true, and there is no api_key: set the environment variable MME_VLA_API_KEY, or say "
+                "require_key=false to serve every client that reaches the port."
+            )
         if not isinstance(self.port, int) or not 0 <= self.port < 65536:
             raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
         given = [name for name in ("execute", "flow_steps") if getattr(self, name) is not None]

@@ -12,24 +12,26 @@ import shutil
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
 from torch.distributed import checkpoint as dcp
+from torch.distributed.checkpoint.api import CheckpointException
 from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
 from torch.distributed.tensor import DTensor
 
 from mme_vla.errors import UserError, listed
-from mme_vla.files import Sums, sum_line
-from mme_vla.policy.tensor_files import check_values
+from mme_vla.files import Sums, decoding, inside, sum_line
+from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
 
 SHARDS = "shards"
 RAW, AVERAGE, STEPS = "raw", "average", "steps"
 MOMENTS = ("exp_avg", "exp_avg_sq")
+_REMEDY = "Copy the whole checkpoint again, or take an earlier one."
 
 
 def shard_files(checkpoint: Path) -> list[Path]:
@@ -141,10 +143,12 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     folder = checkpoint / SHARDS
     files = shard_files(checkpoint)
     rank, world = (0, 1) if alone else (distributed.get_rank(), distributed.get_world_size())
-    for file in files[rank::world]:  # all together look at each file once
-        Sums(folder, file.with_suffix(".sha256").name).check(file.name)
+    sums = {file: _sums_of(checkpoint, file) for file in files}
+    for file in files[rank::world]:  # all together compare each file once
+        sums[file].check(file.name)
     reader = dcp.HuggingFaceStorageReader(str(folder))
-    stored = {name: about.size for name, about in reader.read_metadata().state_dict_metadata.items()}  # type: ignore[union-attr]
+    with _decoding(folder):
+        stored = {name: about.size for name, about in reader.read_metadata().state_dict_metadata.items()}  # type: ignore[union-attr]
     wanted = {name: tensor.shape for name, tensor in tensors.items()}
     names = set(wanted) - set(stored) if others else set(wanted) ^ set(stored)
     wrong = sorted(names | {name for name in wanted.keys() & stored.keys() if wanted[name] != stored[name]})
@@ -153,10 +157,34 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
             f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
             "It belongs to another model or other settings, or a file of it is missing."
         )
-    with _quiet():
-        dcp.load(tensors, storage_reader=reader, no_dist=alone)
+    try:
+        with _quiet():
+            dcp.load(tensors, storage_reader=reader, no_dist=alone)
+    except CheckpointException as error:  # what the processes met with, by their numbers
+        with _decoding(folder):
+            raise next(iter(error.failures.values()))[0] from error
     own = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
     check_values(own, str(folder))
+
+
+def _sums_of(checkpoint: Path, file: Path) -> Sums:
+    """The checksum of a shard, which every process writes beside its own.
+
+    Raises:
+        UserError: there is none, or a file that cannot be a shard.
+    """
+    note = file.with_suffix(".sha256")
+    for path in (file, note):
+        inside(checkpoint, path.relative_to(checkpoint).as_posix())
+    sums = Sums(file.parent, note.name)
+    if file.name not in sums.table:
+        raise UserError(f"{note} with the checksum of {file.name} is missing. {_REMEDY}")
+    check_header(file)
+    return sums
+
+
+def _decoding(folder: Path) -> AbstractContextManager[None]:
+    return decoding(folder, "shards of a checkpoint", _REMEDY)
 
 
 def fresh_folder(draft: Path) -> None:

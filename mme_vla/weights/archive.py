@@ -15,8 +15,9 @@ from mme_vla.weights.orbax import ARRAY_FILES, MANIFEST, VARIANT_FILE, Zipped
 
 SUFFIX = ".zip"
 _MOST_ENTRIES, _MOST_BYTES, _MOST_RATIO = 200_000, 2**38, 200
-"""Of an archive, of all it unpacks to, and of a file in it against its packed size: beyond, it is no checkpoint."""
+"""Of an archive, of all it unpacks to, and of one file or all against the packed size: beyond, it is no checkpoint."""
 _SMALL = 4 * 2**20  # bytes of a file that is unpacked
+_HEADER = 30  # least bytes before the content of a file
 _REMEDY = "Download or copy it again."
 _facts: dict[tuple[Path, int], tempfile.TemporaryDirectory[str]] = {}
 
@@ -46,7 +47,7 @@ def open_archive(file: Path) -> Archive:
     """
     with decoding(file, "a zip archive", _REMEDY), zipfile.ZipFile(file) as opened:
         entries = [entry for entry in opened.infolist() if not entry.is_dir()]
-        _check(file, entries)
+        _check(file, entries, opened.start_dir)
         names = [entry.filename for entry in entries]
         place = _arrays(names)
         if place is None:
@@ -56,8 +57,9 @@ def open_archive(file: Path) -> Archive:
     return Archive(Zipped(file.resolve(), place, within), folder)
 
 
-def _check(file: Path, entries: list[zipfile.ZipInfo]) -> None:
-    total = sum(entry.file_size for entry in entries)
+def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
+    """Refuse what no checkpoint holds. end: offset of the archive's directory, where its last entry ends."""
+    total, packed = sum(entry.file_size for entry in entries), sum(entry.compress_size for entry in entries)
     if len(entries) > _MOST_ENTRIES or total > _MOST_BYTES:
         raise UserError(f"{file} unpacks to {len(entries):,} files of {total:,} bytes: that is no checkpoint.")
     for entry in entries:
@@ -68,6 +70,23 @@ def _check(file: Path, entries: list[zipfile.ZipInfo]) -> None:
             raise UserError(f"{file} is encrypted: unpack it yourself, and name the folder.")
         if entry.file_size > _SMALL and entry.file_size > _MOST_RATIO * max(entry.compress_size, 1):
             raise UserError(f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no checkpoint.")
+    if total > _SMALL and total > _MOST_RATIO * packed:
+        raise UserError(f"{file}: {packed:,} bytes unpack to {total:,}: that is no checkpoint.")
+    _check_distinct(file, entries, end)
+
+
+def _check_distinct(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
+    """Refuse names and bytes that stand twice: what is compared with its checksum might not be what is read."""
+    names: set[str] = set()
+    for entry in entries:
+        if entry.filename in names:
+            raise UserError(f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
+        names.add(entry.filename)
+    ordered = sorted(entries, key=lambda entry: entry.header_offset)
+    ends = [*(entry.header_offset for entry in ordered[1:]), end]
+    for entry, following in zip(ordered, ends, strict=True):
+        if entry.header_offset + _HEADER + entry.compress_size > following:
+            raise UserError(f"{file}: the bytes of {brief(entry.filename)} overlap with what follows. {_REMEDY}")
 
 
 def _arrays(names: list[str]) -> str | None:

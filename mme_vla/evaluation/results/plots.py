@@ -27,6 +27,7 @@ _STYLE = {
     "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK, "axes.spines.top": False,
     "axes.spines.right": False, "axes.grid": True, "axes.grid.axis": "y", "grid.color": "#e3e6ec",
     "axes.axisbelow": True, "legend.frameon": False, "svg.hashsalt": "mme_vla",
+    "text.parse_math": False,  # a name may hold dollar signs
 }  # fmt: skip
 
 

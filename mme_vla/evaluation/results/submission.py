@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.evaluation.results.aggregate import Method
+from mme_vla.evaluation.results.tables import escape_markdown
 from mme_vla.evaluation.run_file import RUN_FILE, read_run
 
 UNKNOWN = "not recorded with these results: state it by hand"
@@ -45,13 +46,14 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
             ]  # fmt: skip
             facts = next((run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")), None)
             seeds = sorted({run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint})
-            parts.append(f"**{method.label}, checkpoint {checkpoint}**\n")
-            parts += [f"- {name}: {text}" for name, text in _lines(facts)]
+            parts.append(f"**{escape_markdown(method.label)}, checkpoint {escape_markdown(str(checkpoint))}**\n")
+            parts += [f"- {name}: {escape_markdown(text)}" for name, text in _lines(facts)]
             record = next(r for run in method.runs if run.key.checkpoint == checkpoint for r in run.records.values())
-            parts.append(
-                f"- evaluation: split {record.split}, {record.action_space} actions, at most {record.max_steps} steps, "
-                f"model seeds {', '.join(map(str, seeds))}\n"
+            evaluation = (
+                f"split {record.split}, {record.action_space} actions, at most {record.max_steps} steps, "
+                f"model seeds {', '.join(map(str, seeds))}"
             )
+            parts.append(f"- evaluation: {escape_markdown(evaluation)}\n")
     return "\n".join(parts)
 
 

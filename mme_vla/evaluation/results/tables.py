@@ -2,10 +2,12 @@
 
 import csv
 import io
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from mme_vla.errors import printable
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
 from mme_vla.evaluation.results.compare import Comparison, show_p
 from mme_vla.evaluation.suites import PAPER_SEEDS, SUITES
@@ -181,17 +183,17 @@ def _percent(value: float | str) -> str:
 
 
 def to_rich(table: Table) -> "RichTable":
-    """For the terminal."""
+    """For the terminal, which obeys no escape sequence of a name."""
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    made = RichTable(title=Text(table.title), title_justify="left", title_style="bold")
+    made = RichTable(title=Text(printable(table.title)), title_justify="left", title_style="bold")
     for i, column in enumerate(table.columns):
-        made.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
+        made.add_column(Text(printable(column)), justify="left" if i == 0 else "right", overflow="fold")
     for i, row in enumerate(table.rows):
         if i in table.rules:
             made.add_section()
-        made.add_row(*map(Text, row), style="bold" if i in table.strong else None)
+        made.add_row(*(Text(printable(cell)) for cell in row), style="bold" if i in table.strong else None)
     return made
 
 
@@ -207,8 +209,13 @@ def print_table(table: Table, width: int) -> None:
 def to_markdown(table: Table) -> str:
     """A Markdown table under its title."""
     lines = [table.columns, [":---", *["---:"] * (len(table.columns) - 1)], *table.rows]
-    body = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-    return f"### {table.title}\n\n{body}\n"
+    body = "\n".join("| " + " | ".join(map(escape_markdown, line)) + " |" for line in lines)
+    return f"### {escape_markdown(table.title)}\n\n{body}\n"
+
+
+def escape_markdown(text: str) -> str:
+    """Text in one line of Markdown: no name in it becomes a link, a picture, HTML, or a cell of its own."""
+    return re.sub(r"[\\|<`]|(?<=\])[(:\[]", r"\\\g<0>", " ".join(text.splitlines()))
 
 
 _LATEX = {"\\": r"\textbackslash{}", "_": r"\_", "%": r"\%", "&": r"\&", "#": r"\#", "±": r"$\pm$", "−": "$-$",
@@ -235,6 +242,11 @@ def to_latex(table: Table) -> str:
     ])  # fmt: skip
 
 
+def _no_formula(text: str) -> str:
+    text = " ".join(text.split())  # a name with a line break would begin another row
+    return f"'{text}" if text.startswith(("=", "+", "-", "@")) else text
+
+
 CSV_COLUMNS = (
     "method", "kind", "name", "mean", "std", "low", "high", "runs", "complete_runs", "episodes", "expected_episodes",
     "paper_mean", "paper_std",
@@ -242,7 +254,7 @@ CSV_COLUMNS = (
 
 
 def to_csv(results: Results) -> str:
-    """Every figure as a row of numbers."""
+    """Every figure as a row of numbers; names that a spreadsheet would run as formulas get an apostrophe first."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(CSV_COLUMNS)
@@ -253,5 +265,5 @@ def to_csv(results: Results) -> str:
                 reported = f.paper or (None, None)
                 numbers = [f.mean, f.std, low, high, f.runs, f.complete, f.done, f.expected, *reported]
                 cells = [f"{n:.4f}" if isinstance(n, float) else ("" if n is None else str(n)) for n in numbers]
-                writer.writerow([method.label, kind, name, *cells])
+                writer.writerow([*map(_no_formula, (method.label, kind, name)), *cells])
     return out.getvalue()

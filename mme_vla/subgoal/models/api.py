@@ -29,6 +29,7 @@ CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai"
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
 _LONGEST_PAUSE = 60.0  # seconds
+_SECRET = 8  # characters; what is shorter protects nothing, such as the key `none`, and may be a word of an answer
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,7 @@ class Api:
                 if error.problem == "refused":
                     break
             except Exception as error:  # whatever the network and the client come up with
-                reason = self._without_key(f"{type(error).__name__}: {error}")
+                reason = self._redacted(f"{type(error).__name__}: {error}")
                 if self._is_fatal(error):
                     raise UserError(
                         f"{self.settings.model} cannot be asked: {reason}. Check the key in "
@@ -150,8 +151,8 @@ class Api:
             self.usage.output_tokens += heard.output_tokens
             self.usage.cost += (heard.input_tokens * prices[0] + heard.output_tokens * prices[1]) / 1e6
         if heard.refusal:
-            raise ApiFailure("refused", heard.refusal)
-        if not (text := heard.text.strip()):
+            raise ApiFailure("refused", self._redacted(heard.refusal, _SECRET))
+        if not (text := self._redacted(heard.text, _SECRET).strip()):
             raise ApiFailure("empty", "the answer is empty")
         return Reply(text, heard.input_tokens, heard.output_tokens)
 
@@ -178,8 +179,12 @@ class Api:
         name = digest.hexdigest()
         return Path(self.settings.cache) / name[:2] / f"{name}.json"
 
-    def _without_key(self, text: str) -> str:
-        return text.replace(self.settings.key, "***") if self.settings.key else text
+    def _redacted(self, text: str, shortest: int = 1) -> str:
+        """Text without the secrets, as far as they have `shortest` characters."""
+        for secret in sorted(self.settings.secrets, key=len, reverse=True):
+            if len(secret) >= shortest:
+                text = text.replace(secret, "***")
+        return text
 
     def _is_fatal(self, error: Exception) -> bool:
         return _code(error) in _FATAL or (_code(error) == 400 and "api key" in str(error).lower())

@@ -53,6 +53,11 @@ class Settings:
         """The key, empty where there is none."""
         return "" if self.key_variable is None else os.environ.get(self.key_variable, "")
 
+    @property
+    def secrets(self) -> list[str]:
+        """What no log, record or cache may hold."""
+        return [self.key] if self.key else []
+
 
 _WANTED = {
     "temperature": "a number, 0 or more, or null for models that take none",

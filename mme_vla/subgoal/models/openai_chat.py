@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
@@ -37,8 +38,23 @@ class OpenAISettings(Settings):
         frames = self.video_frames
         if isinstance(frames, bool) or not isinstance(frames, int) or frames < 2 or frames % 2:
             raise UserError(f"video_frames={frames!r} must be an even number of pictures, 2 or more.")
-        if self.base_url is not None and not str(self.base_url).startswith(("http://", "https://")):
-            raise UserError(f"base_url={self.base_url!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
+        if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
+            shown = str(self.base_url).rpartition("@")[2]  # without a password
+            raise UserError(f"base_url={shown!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
+
+    @property
+    def login(self) -> str:
+        """`user:password` of an address that has them, else empty."""
+        address = urlsplit(self.base_url or "")
+        if not (address.username or address.password):
+            return ""
+        return f"{unquote(address.username or '')}:{unquote(address.password or '')}"
+
+    @property
+    def secrets(self) -> list[str]:
+        """See `Settings`; the password of an address is one too, and its base64, as which it is sent."""
+        login = self.login
+        return [*super().secrets, *filter(None, (login, _base64(login), login.partition(":")[2]))]
 
 
 class OpenAIConnection(Connection):
@@ -99,10 +115,28 @@ def _make_client(settings: OpenAISettings) -> Any:
         import openai
     except ImportError:
         raise missing_extra("An OpenAI-compatible endpoint", "openai") from None
+    # The client's errors and logs name its address: the login travels in a header instead.
+    address = urlsplit(settings.base_url or "")
+    address = address._replace(netloc=address.netloc.rpartition("@")[2])
     # Tries are counted, and waited between, by `Api`.
     return openai.OpenAI(
-        api_key=settings.key or "none", base_url=settings.base_url, timeout=settings.timeout, max_retries=0
+        api_key=settings.key or "none",
+        base_url=address.geturl() or None,
+        default_headers={"Authorization": f"Basic {_base64(settings.login)}"} if settings.login else None,
+        timeout=settings.timeout,
+        max_retries=0,
     )
+
+
+def _scheme(address: object) -> str:
+    try:
+        return urlsplit(str(address)).scheme
+    except ValueError:  # brackets that hold no address
+        return ""
+
+
+def _base64(text: str) -> str:
+    return base64.b64encode(text.encode()).decode("ascii")
 
 
 def _pictures(pixels: np.ndarray, most: int) -> list[dict[str, Any]]:
