@@ -1,5 +1,6 @@
 """How every command ends: a sentence and an exit code where the user, the system or the disk ended it."""
 
+import os
 import signal
 import sys
 import threading
@@ -22,11 +23,15 @@ def print_user_errors() -> Iterator[None]:
     """Surround a command: what is not a bug ends the process with a sentence instead of a traceback.
 
     A `UserError` ends with code 2, a disk that refuses (full, read-only, too many files) with 1, Ctrl-C with 130 and
-    SIGTERM with 143. Other exceptions pass.
+    SIGTERM with 143. Where the reader of standard output closes it, as `| head` does, the command ends quietly. Other
+    exceptions pass.
     """
     with _terminable():
         try:
             yield
+        except BrokenPipeError:
+            if not _output_is_closed():
+                raise
         except UserError as error:
             _say(f"Error: {error}", "Error: ")
             raise SystemExit(MISTAKE) from None
@@ -41,6 +46,18 @@ def print_user_errors() -> Iterator[None]:
                 raise
             _say(f"Error: {sentence}", "Error: ")
             raise SystemExit(DISK_TROUBLE) from None
+        finally:
+            _output_is_closed()
+
+
+def _output_is_closed() -> bool:
+    """Whether the reader of standard output has closed it. What is still to be written is then dropped."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return True
+    return False
 
 
 @contextmanager
