@@ -43,8 +43,10 @@ def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
 
 
 def test_a_run_that_is_worse_than_holding_still_says_why() -> None:
-    summary = {"joints": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
-    assert worse_than_still(summary, 350).startswith("1 of 2 joints are predicted worse than by holding still")
+    summary = {"names": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
+    assert worse_than_still(summary, 350).startswith(
+        "1 of 2 numbers of the action are predicted worse than by holding still"
+    )
     assert "350 updates" in worse_than_still(summary, 350)
     assert worse_than_still({**summary, "mean_abs_error": [0.05, 0.1]}, 350) == ""
 

@@ -1,5 +1,6 @@
 """The commands: the only place that reads a command line. `mme-vla NAME` and `python -m mme_vla NAME` run them."""
 
+import os
 import sys
 from importlib import import_module
 
@@ -39,6 +40,7 @@ def run(module: str) -> None:
     A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
     """
     with print_user_errors():
-        if sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
+        first = os.environ.get("LOCAL_RANK", "0") == "0"
+        if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
             print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
         import_module(f"{__name__}.{module}").main()

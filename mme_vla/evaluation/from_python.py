@@ -39,7 +39,7 @@ def evaluate(
     needs nothing of the kind.
 
     Args:
-        policy: one with statistics; or a folder, a hub repository or `nano` (it ships with the library) to load one from.
+        policy: one with statistics; or what to load one from: a folder, a hub repository, or the shipped `nano`.
         tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all of the split, a
             number for the first so many, or a list.
         seed: of the policy's noise.

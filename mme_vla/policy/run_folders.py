@@ -75,7 +75,7 @@ def resolve_checkpoint(path: Path) -> Path:
 
 
 def newest_checkpoint(path: Path) -> Path:
-    """The newest checkpoint where `path` is a run, its `checkpoints` folder or a name of `find_run`; else `path` itself.
+    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself.
 
     Raises:
         UserError: `latest`, and there is no run with a checkpoint beside it.
