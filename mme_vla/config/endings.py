@@ -1,12 +1,14 @@
 """How every command ends: a sentence and an exit code where the user, the system or the disk ended it."""
 
 import os
+import select
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TextIO
 
 from mme_vla.errors import UserError
 from mme_vla.files.trouble import disk_trouble
@@ -30,7 +32,7 @@ def print_user_errors() -> Iterator[None]:
         try:
             yield
         except BrokenPipeError:
-            if not _output_is_closed():
+            if not _has_no_reader(sys.stdout):
                 raise
         except UserError as error:
             _say(f"Error: {error}", "Error: ")
@@ -47,17 +49,17 @@ def print_user_errors() -> Iterator[None]:
             _say(f"Error: {sentence}", "Error: ")
             raise SystemExit(DISK_TROUBLE) from None
         finally:
-            _output_is_closed()
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:  # what is still to be written has no reader
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _output_is_closed() -> bool:
-    """Whether the reader of standard output has closed it. What is still to be written is then dropped."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether a stream is a pipe whose other end is closed."""
+    poll = select.poll()
+    poll.register(stream, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 @contextmanager
