@@ -3,6 +3,7 @@
 import sys
 
 from mme_vla.commands import COMMANDS, run
+from mme_vla.config.endings import print_user_errors
 from mme_vla.errors import did_you_mean
 
 
@@ -12,7 +13,8 @@ def main() -> None:
     if name in ("-h", "--help"):
         width = max(map(len, COMMANDS))
         lines = "\n".join(f"  {command:<{width}}  {does}" for command, (_, does) in COMMANDS.items())
-        print(f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more of one.")
+        with print_user_errors():
+            print(f"usage: mme-vla COMMAND …\n\n{lines}\n\nmme-vla COMMAND --help says more of one.")
         return
     if name not in COMMANDS:
         print(f"mme-vla: there is no command {name!r}. {did_you_mean(name, COMMANDS)}", file=sys.stderr)

@@ -34,13 +34,17 @@ def test_every_memory_that_ships_is_asked() -> None:
 
 
 @pytest.mark.parametrize("name", SIZES)
-def test_every_memory_of_the_library_keeps_a_memorys_promises(name: str) -> None:
+def test_every_memory_of_the_library_keeps_a_memorys_promises(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     check_memory(name, **SIZES[name])
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [name] * 4
 
 
 @pytest.mark.parametrize("name", ["context", "modulator", "expert"])
-def test_every_integration_of_the_library_keeps_an_integrations_promises(name: str) -> None:
+def test_every_integration_of_the_library_keeps_an_integrations_promises(
+    name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     check_integration(name)
+    assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [name] * 4
 
 
 def test_the_backbone_of_the_library_keeps_a_backbones_promises() -> None:

@@ -89,7 +89,7 @@ SUFFICE = [
          "recorded: 1 episodes", draws=True),
     Case(("sim",), "mme_vla.envs.show task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
     Case(("sim",), f"{PLAY} player=random", "records:"),
-    Case(("sim", "play"), f"{PLAY}2 port=0", "open http", wait="setting up"),
+    Case(("sim", "play"), f"{PLAY}2 port=0", "open http", wait="ready at http"),
 ]  # fmt: skip
 
 NEED = [

@@ -1,11 +1,18 @@
 """What a newcomer meets between the first training and the first table."""
 
+import io
+import os
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from conftest import REPOSITORY
 
+from mme_vla import Memory, commands
+from mme_vla.commands import train as train_command
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
@@ -19,8 +26,6 @@ from mme_vla.training.start import weights_to_start_from
 
 
 def test_latest_is_the_run_that_wrote_a_checkpoint_last(tmp_path: Path) -> None:
-    import os
-
     for age, run in enumerate(("b", "a", "unfinished")):
         step = tmp_path / run / "checkpoints" / "step_000010"
         step.mkdir(parents=True)
@@ -43,8 +48,10 @@ def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
 
 
 def test_a_run_that_is_worse_than_holding_still_says_why() -> None:
-    summary = {"joints": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
-    assert worse_than_still(summary, 350).startswith("1 of 2 joints are predicted worse than by holding still")
+    summary = {"names": ["a", "b"], "mean_abs_error": [0.2, 0.1], "mean_abs_error_holding_still": [0.1, 0.2]}
+    assert worse_than_still(summary, 350).startswith(
+        "1 of 2 numbers of the action are predicted worse than by holding still"
+    )
     assert "350 updates" in worse_than_still(summary, 350)
     assert worse_than_still({**summary, "mean_abs_error": [0.05, 0.1]}, 350) == ""
 
@@ -92,3 +99,72 @@ def test_the_demonstration_takes_own_memories_and_always_shows_the_one_without(m
     monkeypatch.chdir(REPOSITORY / "examples" / "last_frames")
     learned = memory_matters.learn("last_frames_context", steps=1, episodes=2, config_dir=Path("configs"))
     assert (learned["model"], learned["steps"]) == ("last_frames_context", 1)
+
+
+class _Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(
+    ("stream", "words", "said"),
+    [(_Terminal, [], "Loading PyTorch"), (io.StringIO, [], ""), (_Terminal, ["--help"], "")],
+)
+def test_a_terminal_gets_a_line_before_the_imports(
+    stream: type[io.StringIO], words: list[str], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    standard_error, before = stream(), []
+    monkeypatch.setattr(sys, "stderr", standard_error)
+    monkeypatch.setattr(sys, "argv", ["train", *words])
+    monkeypatch.delenv("LOCAL_RANK", raising=False)
+
+    def slow_import(name: str) -> SimpleNamespace:
+        before.append(standard_error.getvalue())
+        return SimpleNamespace(main=lambda: None)
+
+    monkeypatch.setattr(commands, "import_module", slow_import)
+    commands.run("train")
+    assert before[0].startswith(said) and bool(before[0]) == bool(said)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["analyse", "--help"]])
+def test_help_ends_quietly_where_its_reader_is_gone(words: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    ended = subprocess.run([sys.executable, "-m", "mme_vla", *words], stdout=writing, stderr=subprocess.PIPE, text=True)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_refused_run_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(name: str) -> None:
+        raise UserError(f"device={name}: none here")
+
+    monkeypatch.setattr(train_command, "find_device", refuse)
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with pytest.raises(UserError, match="device=cuda"):
+        train_command.main(compose("train", ["train.device=cuda", f"output={folder}"]))
+    assert not folder.exists()
+
+
+def test_arguments_for_the_constructor_of_memory_are_explained() -> None:
+    class Own(Memory):
+        def __init__(self) -> None:
+            super().__init__(32, 48)
+
+    with pytest.raises(TypeError, match=r"Own: Memory.__init__\(\) takes no arguments.*self.budget"):
+        Own()
+
+
+def test_what_the_tutorials_write_is_ignored_by_git() -> None:
+    if not (REPOSITORY / ".git").exists():
+        pytest.skip("no clone")
+    written = ("outputs/x", "examples/last_frames/outputs/x", "examples/two_buttons/data/x", "gallery/x", "runs/x")
+    for path in written:
+        assert subprocess.run(["git", "check-ignore", "-q", path], cwd=REPOSITORY).returncode == 0, path
+
+
+def test_pages_have_no_placeholder_that_a_shell_takes_for_a_redirection() -> None:
+    for page in (REPOSITORY / "README.md", *(REPOSITORY / "docs").glob("*.md")):
+        assert "<time>" not in page.read_text(), page

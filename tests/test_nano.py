@@ -13,7 +13,6 @@ from safetensors.torch import load
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.nano.tower import CLASSES, WEIGHTS
 from mme_vla.commands import nano as nano_command
-from mme_vla.commands.loading import shipped_checkpoint
 from mme_vla.commands.nano import check_counts, with_settings
 from mme_vla.data.waypoints import Motions
 from mme_vla.evaluation.record_log import find_records, read_folders
@@ -187,7 +186,7 @@ def test_a_tasks_own_settings_come_with_its_name_unless_others_are_named(
 
 
 def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
-    policy = MMEPolicy.from_pretrained(shipped_checkpoint("nano") or "")
+    policy = MMEPolicy.from_pretrained("nano")
     assert policy.require_memory().budget == 4
     made = demonstration()
     episode = policy.start_episode(made.goal)

@@ -62,6 +62,7 @@ def served(folder, make=lambda which: a_session(which.episode), episodes=2, **op
     identity = Identity("human", "anna", 0, 1300, {"player": "human"})
     with PlayRun(folder, [an_episode(n) for n in range(episodes)], identity, make) as run, listen("127.0.0.1", 0) as at:
         desk = Desk(run, "anna")
+        desk.address = f"http://127.0.0.1:{at.getsockname()[1]}"
         server = make_server(desk, **options)
         thread = threading.Thread(target=server.run, kwargs={"sockets": [at]})
         thread.start()
@@ -75,9 +76,12 @@ def served(folder, make=lambda which: a_session(which.episode), episodes=2, **op
 # Over HTTP --------------------------------------------------------------------------------------------------------
 
 
-def test_an_episode_is_played_over_http_and_recorded(tmp_path):
+def test_an_episode_is_played_over_http_and_recorded(tmp_path, caplog):
+    caplog.set_level("INFO", "mme_vla.play")
     with served(tmp_path, episodes=1) as page:
         state = page.until("choosing")
+        page.desk._thread.submit(lambda: None).result()
+        assert caplog.messages[-1] == f"VideoUnmask, episode 0: ready at http://127.0.0.1:{page.port}"
         assert [o["label"] for o in state["options"]] == ["a", "b", "c"]
         for name in ("blue", "red"):
             state = page.until("choosing")

@@ -1,5 +1,6 @@
 """docs/your-robot.md, run as it stands on a generated dataset: two arms, 14 numbers, three cameras, no video."""
 
+import json
 import re
 import shlex
 import time
@@ -100,13 +101,17 @@ def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytes
     ]
     folders = [place / "configs"]
     inspect_main(compose("inspect", look[5:], extra_dirs=folders))
-    assert "25" in capsys.readouterr().out, "frames of both episodes"
+    looked = capsys.readouterr().out
+    assert "25" in looked, "frames of both episodes"
+    assert "left_0" in looked and "number 1" not in looked
     cache_main(compose("cache", [*cached[5:], *SMALL, "device=cpu"], extra_dirs=folders))
     assert "2 episodes encoded" in capsys.readouterr().out
     cfg = compose("train", [*training[5:], *SMALL, *BRIEF], extra_dirs=folders)
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     checkpoint = train(cfg, config, Path(config["output"]), begun=time.perf_counter())
     assert "runs/two_arms" in str(checkpoint)
+    summary = json.loads((checkpoint.parents[1] / "summary.json").read_text())
+    assert summary["open_loop"]["names"][0] == "left_0"
 
     acting, asking = blocks("python")
     robot = Robot()

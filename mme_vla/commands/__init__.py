@@ -1,5 +1,7 @@
 """The commands: the only place that reads a command line. `mme-vla NAME` and `python -m mme_vla NAME` run them."""
 
+import os
+import sys
 from importlib import import_module
 
 from mme_vla.config.endings import print_user_errors
@@ -28,7 +30,17 @@ COMMANDS: dict[str, tuple[str, str]] = {
 """Name on the command line → module of this room, and what it does in a line."""
 
 
+_WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}
+"""Options that only print."""
+
+
 def run(module: str) -> None:
-    """Run the command in a module of this room, importing it first: Ctrl-C ends that with a sentence as well."""
+    """Run the command in a module of this package, importing it first: Ctrl-C ends that with a sentence as well.
+
+    A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
+    """
     with print_user_errors():
+        first = os.environ.get("LOCAL_RANK", "0") == "0"
+        if first and sys.stderr.isatty() and _WITHOUT_PYTORCH.isdisjoint(sys.argv[1:]):
+            print("Loading PyTorch and LeRobot …", file=sys.stderr, flush=True)
         import_module(f"{__name__}.{module}").main()

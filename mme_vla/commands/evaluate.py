@@ -79,8 +79,8 @@ def main(cfg: DictConfig) -> None:
     if not settings.render:
         logger.warning("render=false: the policy sees black pictures; only the time of the simulation means anything")
     output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
-    logger.info("%d episodes into %s%s", len(jobs), output, f", shared as {shard.index}/{shard.count}"
-                if shard.count > 1 else "")  # fmt: skip
+    count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
+    logger.info("%s into %s%s", count, output, f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "")
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
     notes["deterministic"] = plain["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}

@@ -1,5 +1,6 @@
 """`python -m mme_vla.inspect`: what is in a checkpoint, a dataset or an episode, and what a memory remembers of it."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -53,6 +54,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
 
     With `trust_plugins` the modules that the checkpoint names are imported.
     """
+    from mme_vla.embodiment.actions import numbered
     from mme_vla.policy.base import Policy
     from mme_vla.policy.run_folders import STATE, resolve_checkpoint
     from mme_vla.training.checkpoint import read_state
@@ -65,7 +67,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
         table.add_row(part, str(len(tensors)), f"{sum(t.numel() for t in tensors):,}", dtypes)
     total = list(policy.parameters())
     table.add_row("all", str(len(total)), f"{sum(t.numel() for t in total):,}", "", style="bold")
-    console.print(table)
+    _show(table, console)
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _plain(section))
@@ -76,17 +78,21 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
         settings.add_row("recipe", _plain(state["config"].get("train", {})))
         settings.add_row("data", _plain(state["config"].get("data", {})))
         settings.add_row("versions", _plain(state["versions"]))
-    console.print(settings)
+    _show(settings, console)
     stats = policy.require_processor().stats
     if stats is not None:
-        numbers = _table("normalisation", "", *(str(i + 1) for i in range(max(len(stats.state), len(stats.actions)))))
         space = policy.embodiment.action
         action = "action delta" if space.relative or space.of_pose else "action"
-        for name, of in (("state", stats.state), (action, stats.actions)):
-            for bound in ("min", "q01", "q99", "max"):
-                if getattr(of, bound) is not None:  # extremes are kept where a policy normalises by them
-                    numbers.add_row(f"{name} {bound}", *(f"{x:.3f}" for x in getattr(of, bound)))
-        console.print(numbers)
+        for title, of, names in (
+            ("state", stats.state, numbered(len(stats.state))),
+            (action, stats.actions, space.names),
+        ):
+            # Extremes are kept where a policy normalises by them.
+            bounds = [bound for bound in ("min", "q01", "q99", "max") if getattr(of, bound) is not None]
+            numbers = _table(f"normalisation of the {title}", "number", *bounds)
+            for i, name in enumerate(names):
+                numbers.add_row(name, *(f"{getattr(of, bound)[i]:.3f}" for bound in bounds))
+            _show(numbers, console)
 
 
 def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) -> None:
@@ -95,6 +101,8 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     Raises:
         UserError: a file is not what its checksum says; all of them are compared.
     """
+    from mme_vla.data.layout import SAMPLE
+
     compared = source.verify()
     table = _table(f"{source.name} ({source.root})", "episode", "task", "frames", "of them video", "seconds", "goal")
     for episode in range(min(len(source), most)):
@@ -105,17 +113,23 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
         table.add_row("…", f"{len(source) - most} more")
     frames, video = int(source.lengths.sum()), int(source.exec_starts.sum())
     table.add_row("all", "", str(frames), str(video), f"{frames / source.fps:.1f}", "", style="bold")
-    console.print(table)
+    _show(table, console)
     subgoals = printable(", ".join(source.subgoal_names)) or "none"
     console.print(
         f"{frames - video} execution steps to train on · {source.fps:g} frames per second · pictures as "
         f"{'video' if source.video_cameras else 'images'} · subgoals: {subgoals}",
         highlight=False,
     )
-    console.print(
-        f"checksums: all {compared} files are as they were written" if compared else
-        "checksums: none, so damage to pictures or numbers cannot be noticed", highlight=False,
-    )  # fmt: skip
+    for what, names in (("state", source.state_names), ("action", source.robot.action.names)):
+        if names:
+            console.print(f"{what}: {len(names)} numbers: {printable(', '.join(names))}", highlight=False)
+    if compared:
+        checksums = f"all {compared} files are as they were written"
+    elif source.root == SAMPLE:
+        checksums = "none, this dataset ships with the library"
+    else:
+        checksums = "none, so damage to pictures or numbers cannot be noticed"
+    console.print(f"checksums: {checksums}", highlight=False)
 
 
 def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Console") -> None:
@@ -128,9 +142,9 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
     table.add_row("execution", f"frames {start} … {length - 1}")
     for name, text in source.subgoals(episode, step).items():
         table.add_row(name, printable(text))
-    table.add_row("state", _numbers(source.states(episode, step, step + 1)[0]))
-    table.add_row("action", _numbers(source.actions(episode, step, step + 1)[0]))
-    console.print(table)
+    table.add_row("state", _numbers(source.states(episode, step, step + 1)[0], source.state_names))
+    table.add_row("action", _numbers(source.actions(episode, step, step + 1)[0], source.robot.action.names))
+    _show(table, console)
 
 
 def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
@@ -185,7 +199,7 @@ def draw_memory(
     table.add_row("remembers", f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames")
     table.add_row("frames", ", ".join(map(str, remembered)))
     table.add_row("stored", f"{len(kept)} frames of {memory.storage.grid}×{memory.storage.grid} tokens")
-    console.print(table)
+    _show(table, console)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
     title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
@@ -211,10 +225,17 @@ def _parts(policy: "Policy") -> dict[str, list[Any]]:
 def _table(title: str, *columns: str) -> "Table":
     from rich.table import Table
 
-    table = Table(title=printable(title), title_justify="left", show_header=any(columns), title_style="bold")
+    table = Table(title=printable(title), show_header=any(columns))
     for i, column in enumerate(columns):
         table.add_column(column, justify="left" if i == 0 or column in ("goal", "values", "task", "") else "right")
     return table
+
+
+def _show(table: "Table", console: "Console") -> None:
+    """Print a table under its title, which may be wider: a path is not broken."""
+    console.print(table.title, style="bold", markup=False, highlight=False, soft_wrap=True)
+    table.title = None
+    console.print(table)
 
 
 def _plain(value: Any) -> str:
@@ -224,5 +245,8 @@ def _plain(value: Any) -> str:
     return printable(str(value))
 
 
-def _numbers(values: np.ndarray) -> str:
-    return "  ".join(f"{x:.3f}" for x in values)
+def _numbers(values: np.ndarray, names: Sequence[str]) -> str:
+    """Numbers behind their names, where they have names."""
+    if not names:
+        return ", ".join(f"{x:.3f}" for x in values)
+    return ", ".join(f"{name}: {x:.3f}" for name, x in zip(names, values, strict=True))

@@ -2,8 +2,6 @@
 
 import logging
 import time
-from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from omegaconf import DictConfig
@@ -31,10 +29,6 @@ _MODEL_KEYS = (
 )
 
 
-SHIPPED = "nano"
-"""`checkpoint=nano`: a policy with four tokens of memory that solves VideoUnmask (docs/nano.md)."""
-
-
 class LoadedPolicy(NamedTuple):
     """A policy on its device. source: the checkpoint folder or repository it is from; None with fresh weights."""
 
@@ -57,15 +51,14 @@ def load_policy(
     """
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
-    from mme_vla.policy.run_folders import LATEST, resolve_checkpoint
+    from mme_vla.policy.run_folders import locate_checkpoint
 
     device = find_device(cfg.device) if device is None else device
     named = words_of(*_MODEL_KEYS)
     if cfg.checkpoint is not None:
         if named:
             raise UserError(f"A checkpoint brings its own model: leave out {' '.join(named)}.")
-        source = shipped_checkpoint(str(cfg.checkpoint)) or Path(str(cfg.checkpoint)).expanduser()
-        where = str(resolve_checkpoint(source)) if source.exists() or source.name == LATEST else str(cfg.checkpoint)
+        where = locate_checkpoint(str(cfg.checkpoint))
         policy = Policy.from_pretrained(
             where, device=device, dtype=cfg.dtype, revision=cfg.revision, trust_plugins=cfg.trust_plugins
         )
@@ -106,13 +99,6 @@ def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) ->
     begun = time.perf_counter()
     policy.compile_sampling(layers=sampling == "compiled")
     logger.info("sampler compiled in %.1f s (sampling=%s)", time.perf_counter() - begun, sampling)
-
-
-def shipped_checkpoint(name: str) -> Path | None:
-    """The folder of the checkpoint that ships with the library under this name; a folder of that name goes first."""
-    if name != SHIPPED or Path(name).exists():
-        return None
-    return Path(str(files("mme_vla").joinpath("assets", SHIPPED)))
 
 
 def words_of(*keys: str) -> list[str]:

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
 from mme_vla.config.devices import find_device
+from mme_vla.errors import UserError
 from mme_vla.files import remove_drafts, write_atomically
 
 if TYPE_CHECKING:
@@ -40,7 +41,12 @@ def main(cfg: DictConfig) -> None:
     if HydraConfig.initialized():
         fresh = Path(HydraConfig.get().runtime.output_dir)
         named = any(word.startswith("output=") for word in HydraConfig.get().overrides.task)
-    train(cfg, {str(key): value for key, value in config.items()}, fresh, begun, named)
+    try:
+        train(cfg, {str(key): value for key, value in config.items()}, fresh, begun, named)
+    except UserError:
+        with suppress(OSError):
+            fresh.rmdir()  # Hydra made it; it stays if it holds anything
+        raise
 
 
 def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, named: bool = True) -> Path:

@@ -11,7 +11,6 @@ import pickle
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 
@@ -175,7 +174,7 @@ def _check_command_line(config_name: str, tree: Path) -> None:
         raise unknown_option(rest[0], sys.argv[1:], known_keys(config_name, tree))
     if args.help:
         extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
-        _show(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
+        print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
         raise SystemExit(0)
     if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
         return  # nothing of this tree is composed
@@ -202,13 +201,6 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
             return {group: name for group, name in words.items() if not group.startswith("hydra/")}
 
     return help_page(config_name, words, trees, chosen)
-
-
-def _show(text: str) -> None:
-    with suppress(BrokenPipeError):  # `--help | head` has read enough
-        print(text, flush=True)
-        return
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def known_keys(config_name: str, tree: Path) -> list[str]:

@@ -1,11 +1,14 @@
 """How every command ends: a sentence and an exit code where the user, the system or the disk ended it."""
 
+import os
+import select
 import signal
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TextIO
 
 from mme_vla.errors import UserError, printable
 from mme_vla.files.trouble import disk_trouble
@@ -22,11 +25,15 @@ def print_user_errors() -> Iterator[None]:
     """Surround a command: what is not a bug ends the process with a sentence instead of a traceback.
 
     A `UserError` ends with code 2, a disk that refuses (full, read-only, too many files) with 1, Ctrl-C with 130 and
-    SIGTERM with 143. Other exceptions pass.
+    SIGTERM with 143. Where the reader of standard output closes it, as `| head` does, the command ends quietly. Other
+    exceptions pass.
     """
     with _terminable():
         try:
             yield
+        except BrokenPipeError:
+            if not _has_no_reader(sys.stdout):
+                raise
         except UserError as error:
             _say(f"Error: {error}", "Error: ")
             raise SystemExit(MISTAKE) from None
@@ -41,6 +48,18 @@ def print_user_errors() -> Iterator[None]:
                 raise
             _say(f"Error: {sentence}", "Error: ")
             raise SystemExit(DISK_TROUBLE) from None
+        finally:
+            try:
+                sys.stdout.flush()
+            except BrokenPipeError:  # what is still to be written has no reader
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _has_no_reader(stream: TextIO) -> bool:
+    """Whether a stream is a pipe whose other end is closed."""
+    poll = select.poll()
+    poll.register(stream, 0)
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 @contextmanager

@@ -93,6 +93,22 @@ def width_of(feature: Mapping[str, Any]) -> int:
     return shape[0] if len(shape) == 1 else 0
 
 
+def names_of(features: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
+    """What a dataset calls the numbers of some features, joined; empty where one of them has no name for each number.
+
+    LeRobot writes a list, or a list under one key such as `motors`.
+    """
+    names: list[str] = []
+    for feature in features:
+        listed = feature.get("names")
+        if isinstance(listed, Mapping) and len(listed) == 1:
+            listed = next(iter(listed.values()))
+        if not isinstance(listed, list | tuple) or len(listed) != width_of(feature):
+            return ()
+        names += map(str, listed)
+    return tuple(names)
+
+
 def _spellings_of(camera: Camera) -> list[str]:
     names = [camera.key, camera.name] if camera.key else [camera.name]
     return [spelling for name in names for spelling in (name, f"observation.images.{name}")]

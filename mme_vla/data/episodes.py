@@ -7,6 +7,7 @@ few numbers an episode.
 import io
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.data.choice_rows import find_choices
-from mme_vla.data.columns import DRAWN, find_columns, width_of
+from mme_vla.data.columns import DRAWN, find_columns, names_of, width_of
 from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.data.layout import (
     SAMPLE,
@@ -41,6 +42,7 @@ class EpisodeSource:
 
     name: short name (the folder's, or `sample`). fps: frames per second.
     robot: whose columns are read. columns: the dataset's column of each camera.
+    state_names: what the dataset calls the numbers of the state; may be empty. Those of the action are the robot's.
     lengths: [e] int64, frames of each episode. exec_starts: [e] int64, its first execution frame (0 without a video).
     """
 
@@ -70,8 +72,10 @@ class EpisodeSource:
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
         info = read_info(self.root)
         features = info["features"]
-        self.robot = robot
         found = find_columns(self.root, features, robot)
+        self.state_names = names_of([features[column] for column in found.state])
+        action_names = names_of([features[column] for column in found.action])
+        self.robot = replace(robot, action=robot.action.with_names(action_names))
         columns, self.columns = list(found.tables), found.cameras
         self.fps = float(info["fps"])
         if robot.fps is not None and robot.fps != self.fps:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from string import ascii_lowercase
 from typing import TYPE_CHECKING, Any, Self
 
@@ -33,7 +33,7 @@ class ActionSpace:
 
     width: w; numbers of an action. key: columns of the dataset that hold them, joined; empty for the usual names.
     space: the benchmark's action space that takes them; None for a robot that is not the benchmark's.
-    names, units: of each number, for plots and reports.
+    names, units: of each number, for plots and reports. Without names a dataset's are taken (`with_names`).
     relative: numbers predicted relative to the state's number at the same place; the others are absolute.
     angles: number → centre in radians; what is predicted lies within π of the centre, so that it does not jump by 2π.
     binary: numbers that are commanded as −1 or 1 and nothing between.
@@ -88,7 +88,7 @@ class ActionSpace:
             width=width,
             key=fields.columns(found.get("key"), f"{where}.key"),
             space=None if found.get("space") is None else str(found["space"]),
-            names=fields.words(found.get("names"), f"{where}.names", width, [f"number {i + 1}" for i in range(width)]),
+            names=fields.words(found.get("names"), f"{where}.names", width, numbered(width)),
             units=fields.words(found.get("units"), f"{where}.units", width, [""] * width),
             relative=fields.places(found.get("relative"), f"{where}.relative", min(width, state_width)),
             angles=fields.centres(found.get("angles"), f"{where}.angles", width),
@@ -116,6 +116,12 @@ class ActionSpace:
             **(chosen if self.choice else {}),  # which robots of earlier versions did not say
             **(posed if self.of_pose else {}),  # likewise
         }
+
+    def with_names(self, names: Sequence[str]) -> Self:
+        """The same space with a dataset's names of the numbers, where it has none of its own."""
+        if len(names) != self.width or self.names != numbered(self.width):
+            return self
+        return replace(self, names=tuple(names))
 
     @property
     def answers(self) -> str | None:
@@ -198,6 +204,11 @@ class ActionSpace:
         out[..., offered] = out[..., offered].scatter(-1, best, 1)
         out[..., list(self.point)] = out[..., list(self.point)].clamp(0, 1)
         return out
+
+
+def numbered(width: int) -> tuple[str, ...]:
+    """Names for numbers that have none."""
+    return tuple(f"number {i + 1}" for i in range(width))
 
 
 def _require(options: Sequence[Option]) -> None:

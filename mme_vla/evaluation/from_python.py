@@ -39,7 +39,7 @@ def evaluate(
     needs nothing of the kind.
 
     Args:
-        policy: one with statistics; or a folder or hub repository to load one from.
+        policy: one with statistics; or what to load one from: a folder, a hub repository, or the shipped `nano`.
         tasks, episodes: as `tasks=` and `episodes=` of the command: `"all"` or names; None for all of the split, a
             number for the first so many, or a list.
         seed: of the policy's noise.
@@ -86,8 +86,7 @@ def load(policy: Policy | str | Path) -> tuple[Policy, str | None]:
     """A policy, and where its weights are from; one that is given keeps to itself."""
     if isinstance(policy, Policy):
         return policy, None
-    from mme_vla.policy.run_folders import resolve_checkpoint
+    from mme_vla.policy.run_folders import locate_checkpoint
 
-    where = Path(policy).expanduser()
-    source = str(resolve_checkpoint(where)) if where.exists() else str(policy)
+    source = locate_checkpoint(policy)
     return Policy.from_pretrained(source), source

@@ -74,6 +74,20 @@ class Memory(nn.Module):
     reporting: bool = False
     float32_products: str = "ieee"
 
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Takes no arguments: a subclass calls `super().__init__()` and then sets the attributes above.
+
+        Raises:
+            TypeError: there are arguments.
+        """
+        if args or kwargs:
+            raise TypeError(
+                f"{type(self).__name__}: Memory.__init__() takes no arguments, got {len(args) + len(kwargs)}. Call "
+                "super().__init__(), then set self.budget, self.capacity and self.storage. Only PerceptualMemory takes "
+                "(d_vision, width, budget, storage)."
+            )
+        super().__init__()
+
     def check_grid(self, views: int) -> None:
         """Make sure that views of views×views tokens can be pooled to what this memory stores.
 

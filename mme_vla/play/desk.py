@@ -34,11 +34,13 @@ class Desk:
     Attributes:
         phase: `loading` (an episode is being set up), `choosing`, `moving`, `ended` (of one episode), `finished` (of
             all), or `broken` (see `error`; `proceed` tries again).
+        address: where the page is served, for the log.
     """
 
     def __init__(self, run: PlayRun, participant: str) -> None:
         self.run, self.participant = run, participant
         self.phase, self.error = "loading", ""
+        self.address = ""
         self.session: ChoiceSession | None = None
         self.session_id = ""
         self._since = time.monotonic()
@@ -140,6 +142,8 @@ class Desk:
             raise
         self.session, self.session_id = session, uuid.uuid4().hex
         self._after(session)
+        if self.phase == "choosing":
+            log.info("%s, episode %d: ready at %s", which.task, which.episode, self.address)
 
     def _move(self, session: ChoiceSession, action: Mapping[str, Any]) -> None:
         session.choose(action)

@@ -206,6 +206,7 @@ def serve(desk: Desk, host: str, port: int) -> None:
         shown = f"[{host}]" if ":" in host else host
         if not is_local(host):
             log.warning("host=%s: whoever reaches this port can play", host)
-        log.info("open http://%s:%d in a browser; Ctrl-C ends", shown, bound.getsockname()[1])
+        desk.address = f"http://{shown}:{bound.getsockname()[1]}"
+        log.info("open %s in a browser; Ctrl-C ends", desk.address)
         with suppress(KeyboardInterrupt):  # uvicorn raises it again when all is closed
             server.run(sockets=[bound])

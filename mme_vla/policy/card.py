@@ -29,7 +29,7 @@ def model_card(policy: nn.Module, config: Mapping[str, Any]) -> str:
     return "\n".join([
         "---", front_matter(name, known), "---", "",
         f"# {name}", "",
-        f"A {type(policy).__name__} of the MME-VLA library"
+        f"A policy of the MME-VLA library (`{type(policy).__name__}`)"
         + (" with a memory of the episode." if config.get("memory") else " without memory."), "",
         *_table(rows), "",
         "## Use", "",

@@ -1,6 +1,7 @@
 """Where a run of training lies on disk: its checkpoints, the newest of them, and what `latest` means."""
 
 import re
+from importlib.resources import files
 from pathlib import Path
 
 from mme_vla.errors import UserError
@@ -30,15 +31,23 @@ def step_of(checkpoint: Path) -> int:
 
 LATEST = "latest"
 """`outputs/<model>/latest` is the run in `outputs/<model>` that wrote a checkpoint last; no folder is called so."""
+SHIPPED = "nano"
+"""The checkpoint that ships with the library: four tokens of memory, solves VideoUnmask (docs/nano.md)."""
 
 
 def find_run(path: Path) -> Path:
-    """`path`, or the newest run where it ends in `latest`, as in `outputs/tokendrop_expert/latest`.
+    """`path`, the newest run where it ends in `latest`, or the shipped checkpoint where it is `nano`.
+
+    A file or folder of that name goes first.
 
     Raises:
-        UserError: there is no run with a checkpoint beside it.
+        UserError: `latest`, and there is no run with a checkpoint beside it.
     """
-    if path.name != LATEST or path.exists():
+    if path.exists():
+        return path
+    if str(path) == SHIPPED:
+        return Path(str(files("mme_vla").joinpath("assets", SHIPPED)))
+    if path.name != LATEST:
         return path
     runs = [run for run in path.parent.glob("*") if checkpoints_in(run / CHECKPOINTS)]
     if not runs:
@@ -51,7 +60,7 @@ def find_run(path: Path) -> Path:
 def resolve_checkpoint(path: Path) -> Path:
     """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
 
-    A path that ends in `latest` stands for the newest run of its folder.
+    A path that ends in `latest` means the newest run of its folder, and `nano` the shipped checkpoint.
 
     Raises:
         UserError: there is no checkpoint.
@@ -66,7 +75,7 @@ def resolve_checkpoint(path: Path) -> Path:
 
 
 def newest_checkpoint(path: Path) -> Path:
-    """The newest checkpoint where `path` is a run, its `checkpoints` folder or ends in `latest`; else `path` itself.
+    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself.
 
     Raises:
         UserError: `latest`, and there is no run with a checkpoint beside it.
@@ -74,3 +83,13 @@ def newest_checkpoint(path: Path) -> Path:
     path = find_run(path)
     found = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
     return found[-1] if found else path
+
+
+def locate_checkpoint(source: str | Path) -> str:
+    """The checkpoint folder that `source` names; `source` itself where it is none on this machine, but on the hub.
+
+    Raises:
+        UserError: a folder without a checkpoint.
+    """
+    path = find_run(Path(source).expanduser())
+    return str(resolve_checkpoint(path)) if path.exists() else str(source)

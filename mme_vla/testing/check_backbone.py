@@ -14,7 +14,7 @@ TOLERANCE = 1e-4
 
 
 def check_backbone(name: str, **sizes: Any) -> None:
-    """Run every check on the backbone that is registered under `name`.
+    """Run every check on the backbone that is registered under `name`, and print a line for each that passed.
 
     Args:
         name: the key in `BACKBONES`. sizes: small ones, as its YAML would give them.
@@ -30,9 +30,13 @@ def check_backbone(name: str, **sizes: Any) -> None:
     batch = _batch(backbone)
     images = batch.images.float() / 127.5 - 1
     check_tokens(backbone, images)
+    print(f"{name}: vision tokens have the right shapes, and do not depend on the batch")
     check_loss(backbone, batch, images)
+    print(f"{name}: the loss is finite, repeats with the same random numbers, and ignores the prompt's padding")
     check_sample(backbone, batch, images)
+    print(f"{name}: a sampled chunk is {backbone.horizon} x {backbone.action_dim}, finite, and repeats")
     check_parts(backbone)
+    print(f"{name}: parts() covers every parameter, vision and action among them")
 
 
 def _batch(backbone: Backbone) -> Batch:

@@ -17,6 +17,8 @@ TOLERANCE = 1e-4
 def check_integration(name: str, memory: str = "framesamp", backbone: str = "tiny", **options: Any) -> None:
     """Run every check on the integration that is registered under `name`, with a memory and a small backbone.
 
+    Prints a line for each that passed.
+
     Args:
         name: the key in `INTEGRATIONS`. memory: the key of a memory to bring in. backbone: a file of configs/backbone.
         options: the integration's own, as its YAML would give them.
@@ -37,9 +39,13 @@ def check_integration(name: str, memory: str = "framesamp", backbone: str = "tin
         assert found is not None
         before = _loss(policy, batch, draws, found)
         check_reach(policy, batch, draws, found, before)
+        print(f"{name}: the tokens of {memory} change the loss, their padding does not")
         check_rows(policy, batch, draws, found, before)
+        print(f"{name}: samples of one batch are independent")
         check_sampling(policy, batch, found)
+        print(f"{name}: sampling agrees with the pass that training makes")
     check_gradients(policy, batch, draws)
+    print(f"{name}: every parameter of the memory and the integration gets a gradient")
 
 
 def build_small(sections: dict[str, Any]) -> MMEPolicy:

@@ -20,7 +20,7 @@ _Kind = TypeVar("_Kind", bound=History)
 
 
 def check_memory(name: str, frames: int = 48, **options: Any) -> None:
-    """Run every check on the memory that is registered under `name`.
+    """Run every check on the memory that is registered under `name`, and print a line for each that passed.
 
     The episode is synthetic: `frames` pictures in which a square moves, the first 20 of them a conditioning video.
 
@@ -35,9 +35,13 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
     memory.eval()
     check_selection(memory, frames)
+    print(f"{name}: select stays in bounds, ignores later frames, repeats, and agrees offline and online")
     check_encoding(memory, frames)
+    print(f"{name}: forward hands over at most {memory.budget} finite tokens, ignores padding, and trains")
     check_streaming(memory, frames)
+    print(f"{name}: streaming gives the same tokens as the full history")
     check_rebuilding(name, options, memory)
+    print(f"{name}: saved weights give the same tokens when they are loaded")
 
 
 class Episode:

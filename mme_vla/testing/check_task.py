@@ -6,7 +6,9 @@ import numpy as np
 
 
 def check_task(task: str, seed: int = 1, difficulty: str | None = None, **options: Any) -> None:
-    """Run every check on the task that is registered under `task`; nothing is rendered.
+    """Run every check on the task that is registered under `task`, and print a line for each that passed.
+
+    Nothing is rendered.
 
     Args:
         task: the key in `TASKS`. seed, difficulty: of the scene. options: the task's own keywords.
@@ -20,11 +22,14 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
     assert all(isinstance(goal, str) and goal for goal in first["goal"]), "every wording of the goal is a text."
     assert first["subtasks"] > 0, "subtasks() must give at least one sub-task."
     assert first["success"], f"the task's own sub-tasks, demonstrated with seed {seed}, do not end in success."
+    print(f"{task}: {first['subtasks']} sub-tasks, demonstrated with seed {seed}, end in success")
     assert np.array_equal(first["qpos"], second["qpos"]), "two demonstrations of one seed differ: a draw is not seeded."
+    print(f"{task}: a second demonstration moves the robot in the same way")
     other = _scene(task, seed + 1, difficulty, options)
     same = _scene(task, seed, difficulty, options)
     assert np.array_equal(same, _scene(task, seed, difficulty, options)), "one seed built two different scenes."
     assert same.shape != other.shape or not np.array_equal(same, other), "two seeds built the same scene."
+    print(f"{task}: a seed builds one scene, and seed {seed + 1} another")
 
 
 def _make(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> Any:

@@ -66,9 +66,9 @@ def worse_than_still(summary: Mapping[str, Any], steps: int) -> str:
     if not worse:
         return ""
     return (
-        f"{worse} of {len(summary['joints'])} joints are predicted worse than by holding still (the robot moves little "
-        f"within a chunk): {steps:,} updates on this data are too few for a policy. They show that everything runs; "
-        "raise train.steps, or train on more data, before evaluating."
+        f"{worse} of {len(summary['names'])} numbers of the action are predicted worse than by holding still (the "
+        f"robot moves little within a chunk): {steps:,} updates on this data are too few for a policy. They show that "
+        "everything runs; raise train.steps, or train on more data, before evaluating."
     )
 
 

@@ -48,7 +48,7 @@ class OpenLoop:
             held = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
             still = {"mean_abs_error_holding_still": held.round(5).tolist()}
         return {
-            "joints": list(self.space.names),
+            "names": list(self.space.names),
             "mean_abs_error": physical.round(5).tolist(),
             "mean_abs_error_normalised": (physical / self.scale).round(5).tolist(),
             **still,
@@ -83,16 +83,16 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     assert stats is not None
     half_range = (stats.actions.q99 - stats.actions.q01) / 2
     kind = "held-out" if held_out else "training"
-    name = samples.sources[source]
+    data = samples.sources[source]
     return OpenLoop(
-        title=f"{kind} episode {episode} of {name.name}: “{name.goal(episode)}”",
+        title=f"{kind} episode {episode} of {data.name}: “{data.goal(episode)}”",
         steps=np.array([step.index for step in recorded]),
         predicted=torch.cat(predicted).numpy(),
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
         scale=np.where(half_range > 0, half_range, 1),
         still=np.stack([step.state for step in recorded]) if _held_by_state(processor.embodiment) else None,
-        space=processor.embodiment.action,
+        space=data.robot.action,
     )
 
 
@@ -149,8 +149,8 @@ def error_lines(summary: Mapping[str, Any]) -> Sequence[str]:
     columns = {"error": "mean_abs_error", "normalised": "mean_abs_error_normalised"}
     if "mean_abs_error_holding_still" in summary:
         columns["holding still"] = "mean_abs_error_holding_still"
-    width = max(map(len, [*summary["joints"], " " * 8]))
+    width = max(map(len, [*summary["names"], " " * 8]))
     lines = ["  ".join([" " * width, *(f"{title:>13}" for title in columns)])]
-    for i, name in enumerate(summary["joints"]):
+    for i, name in enumerate(summary["names"]):
         lines.append("  ".join([f"{name:{width}}", *(f"{summary[key][i]:13.4f}" for key in columns.values())]))
     return lines

@@ -1,7 +1,7 @@
 """The figures of a probe's page, as SVG text."""
 
 from mme_vla.evaluation.probe.findings import Findings
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, picture, svg
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, legend, picture, svg
 
 _ON = {"distract": "episodes before one's own", "delay": "frames that the clock runs ahead",
        "pause": "still frames", "recent": "frames that may be remembered", "drop": "entries taken away"}  # fmt: skip
@@ -17,7 +17,7 @@ def effects(findings: Findings) -> str:
                     label="the policy's own spread")  # fmt: skip
         axes.set_xticks(range(len(arms)), list(arms), rotation=25, ha="right", rotation_mode="anchor")
         axes.set_ylabel("change of the chunk")
-        axes.legend(fontsize=9)
+        legend(canvas, axes, 3)
         return svg(canvas)
 
 
@@ -36,7 +36,7 @@ def decay(findings: Findings) -> str:
             axes.axhline(sum(spread) / len(spread), color=FAINT, lw=1, ls="--", label="own spread")
         axes.set_xlabel("age of the entry (frames)")
         axes.set_ylabel("change without it")
-        axes.legend(fontsize=9)
+        legend(canvas, axes, 3)
         return svg(canvas)
 
 

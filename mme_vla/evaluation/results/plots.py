@@ -60,7 +60,7 @@ def bars(results: Results, kind: str, wide: bool = False) -> str:
         axes.set_ylabel("success (%)")
         axes.set_ylim(0, 100)
         axes.tick_params(axis="x", length=0)
-        _legend(canvas, axes, 6 if wide else 3)
+        legend(canvas, axes, 6 if wide else 3)
         return svg(canvas)
 
 
@@ -113,26 +113,17 @@ def efficiency(results: Results, flops: dict[str, float]) -> str:
                 label = None if known.family in named else f"{_FAMILY_NAMES[known.family]} (paper)"
                 named.add(known.family)
                 axes.scatter(x, y, s=38, facecolors="none", edgecolors=FAMILIES[known.family], lw=1.3, label=label)
-        points = []
         for i, method in enumerate(results.methods):
             if method.model in flops and method.memory_budget is None and method.average.mean is not None:
                 x, average = flops[method.model] / 1e12, method.average
-                style = {"color": _colour(i), "ecolor": INK, "elinewidth": 0.9, "ms": 7}
+                style = {"color": _colour(i), "ecolor": INK, "elinewidth": 0.9, "ms": 7, "label": method.label}
                 axes.errorbar(x, method.average.mean, average.std or 0, fmt="o", **style)  # type: ignore[arg-type]
-                points.append((method.average.mean, x, i))
         axes.set_xlabel("TFLOPs of a sampled chunk at full size (counted)")
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)
         axes.margins(x=0.08)
         axes.grid(True, axis="both", color="#e3e6ec")
-        height, least = axes.get_ylim()[1], -np.inf
-        for y, x, i in sorted(points):
-            least = max(y, least + 0.055 * height)  # labels keep clear of each other
-            place = (max(x for _, x, _ in points) + 0.14, least)
-            arrow = {"arrowstyle": "-", "color": FAINT, "lw": 0.6}
-            label = results.methods[i].label
-            axes.annotate(label, (x, y), place, fontsize=9, color=_colour(i), va="center", arrowprops=arrow)
-        _legend(canvas, axes, 2)
+        legend(canvas, axes, 2)
         return svg(canvas)
 
 
@@ -166,7 +157,7 @@ def budget_curve(results: Results, points: dict[str, list[tuple[int, Figure]]]) 
         axes.set_xlabel("memory tokens")
         axes.set_ylabel("average success (%)")
         axes.set_ylim(bottom=0)
-        _legend(canvas, axes, 2)
+        legend(canvas, axes, 2)
         return svg(canvas)
 
 
@@ -202,7 +193,8 @@ def svg(canvas: "Canvas") -> str:
     return text[text.index("<svg") :]
 
 
-def _legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
+def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
+    """A legend above the panel, clear of what is drawn in it, in so many columns at most."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))  # last, in the bars
