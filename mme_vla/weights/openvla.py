@@ -63,9 +63,9 @@ def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
     if unknown:
         raise UserError(
             f"{folder} holds {listed(unknown)}: model=openvla_oft has no place for these weights, and would act "
-            f"differently without them. Read are {', '.join(f'{name}*_checkpoint.pt' for name in known)}. A vision_backbone "
-            "is of a run with FiLM (use_film), a noisy_action_projector of one with a diffusion head (use_diffusion): "
-            "use a run without them."
+            f"differently without them. Read are {', '.join(f'{name}*_checkpoint.pt' for name in known)}. A "
+            "vision_backbone is of a run with FiLM (use_film), a noisy_action_projector of one with a diffusion head "
+            "(use_diffusion): use a run without them."
         )
     found = {f"{VLA}{name}": tensor for name, tensor in tensors.items()}
     for module in (HEAD, STATE):
