@@ -4,7 +4,7 @@ import json
 import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.files import parse_json, read_text, write_atomically
@@ -91,7 +91,7 @@ class WeightsAndBiases:
         entity: str | None = None,
         group: str | None = None,
         tags: list[str] | None = None,
-        mode: str = "online",
+        mode: Literal["online", "offline", "disabled"] = "online",
     ) -> None:
         self.check()
         import wandb
