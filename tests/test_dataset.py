@@ -11,6 +11,7 @@ from fakes import LastFrames, encode, same
 from h5_files import Recorded, write_file
 from torch.utils.data import DataLoader
 
+from mme_vla.config.composition import compose
 from mme_vla.data.cache.ensure import ensure_cache
 from mme_vla.data.cache.store import VisionCache
 from mme_vla.data.conversion import ConvertOptions, convert
@@ -23,6 +24,8 @@ from mme_vla.errors import UserError
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.subgoal_text import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
+from mme_vla.testing.small import small_policy
+from mme_vla.training.data import prepare_data
 
 PNG = ConvertOptions(images="png")
 
@@ -173,6 +176,16 @@ def test_splits_hold_out_whole_episodes(data, processor) -> None:
     val = TrainingDataset(data[0], processor, episodes=split.val)
     assert (len(train), len(val)) == (31, 12)
     assert {val.locate(i)[:2] for i in range(len(val))} == {(0, 1)}
+
+
+@pytest.mark.parametrize(("named", "held_out"), [([], set()), (["sample"], {(1, 3)})])
+def test_only_the_sample_holds_out_an_episode_by_default(named: list[str], held_out: set, tmp_path: Path) -> None:
+    make_source(tmp_path, "Alpha", [6, 5, 4, 3], [0, 0, 0, 0])
+    sources = ",".join([str(tmp_path / "Alpha"), *named])
+    data = compose("train", [f"data.sources=[{sources}]"]).data
+    split = prepare_data(small_policy("pi05"), data, seed=0, say=lambda line: None)
+    steps = range(0 if split.val is None else len(split.val))
+    assert {split.val.locate(i)[:2] for i in steps} == held_out
 
 
 def test_hashed_splits_are_stable_and_of_the_asked_size() -> None:

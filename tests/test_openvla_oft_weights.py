@@ -49,6 +49,14 @@ def test_a_run_is_written_in_the_published_names_and_read_again(tmp_path: Path) 
     assert equal(policy, other) and other.require_processor().stats is not None
 
 
+@pytest.mark.parametrize("module", ["vision_backbone", "noisy_action_projector"])
+def test_a_run_with_modules_that_no_policy_has_is_refused(module: str, tmp_path: Path) -> None:
+    folder = written(built(), tmp_path / "run")
+    torch.save({"module.featurizer.scale": torch.ones(2)}, folder / f"{module}--150000_checkpoint.pt")
+    with pytest.raises(UserError, match=f"{module}--150000_checkpoint.pt"):
+        load_weights(built(seed=2), folder)
+
+
 def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_path: Path) -> None:
     folder = written(built(), tmp_path / "base")
     for file in folder.glob("*.pt"):

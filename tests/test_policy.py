@@ -43,6 +43,12 @@ def test_tiny_policy_builds_in_under_a_second():
         assert time.process_time() - start < 1.0, name
 
 
+@pytest.mark.parametrize("size", ["position_dim", "position_hidden"])
+def test_a_width_of_zero_is_not_the_default(size):
+    with pytest.raises(UserError, match=rf"memory\.{size}=0: must be at least 1, or null"):
+        build_policy("framesamp_modul", memory={size: 0})
+
+
 @torch.no_grad()
 def test_cached_prefix_equals_the_joint_pass(policy):
     batch = random_batch(policy)

@@ -267,13 +267,6 @@ def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.Capt
     assert "tried again" in capsys.readouterr().err
 
 
-def test_a_launcher_that_is_not_installed_is_named_with_its_extra() -> None:
-    if importlib.util.find_spec("hydra_plugins.hydra_joblib_launcher") is not None:
-        pytest.skip("the extra `sweep` is installed")
-    done = forked.run("mme_vla.evaluate", "--multirun", "launcher=joblib", "model=pi05")
-    assert done.returncode == 2 and "uv sync --inexact --extra sweep" in done.stderr and "Traceback" not in done.stderr
-
-
 @pytest.mark.skipif(
     importlib.util.find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed"
 )

@@ -166,6 +166,13 @@ def test_what_is_no_request_is_refused(message):
         parse(message, 10)
 
 
+def test_a_false_flag_alone_is_told_what_to_send():
+    with pytest.raises(UserError, match=r"reset=false: no request\. Send reset=true, or an observation"):
+        parse({"reset": False}, 10)
+    with pytest.raises(UserError, match="Did you mean 'observation/image'"):
+        parse({"reset": False, "observation_image": PICTURE}, 10)
+
+
 def test_false_flags_beside_an_observation_are_as_good_as_none():
     sent = observation(PICTURE, PICTURE, states(1)[0], reset=False, add_buffer=False)
     assert isinstance(parse(sent, 10), Infer)

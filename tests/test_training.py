@@ -272,6 +272,18 @@ def test_no_checkpoint_there_says_what_one_looks_like(tmp_path: Path) -> None:
         resolve_checkpoint(tmp_path)
 
 
+@pytest.mark.parametrize("files", [["29999/params/_METADATA"], ["29999/params/_METADATA", "history_config.txt"],
+                                   ["79999.zip"]])  # fmt: skip
+def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tmp_path: Path, files: list[str]) -> None:
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    run, step = tmp_path, tmp_path / files[0].split("/")[0]
+    for place in (run, step):
+        with pytest.raises(UserError, match=rf"python -m mme_vla\.weights\.convert {place} \S+_converted"):
+            resolve_checkpoint(place)
+
+
 @pytest.mark.parametrize("name", ["tokendrop_expert", "framesamp_modul", "tokendrop_context"])
 def test_a_memory_starts_from_the_memoryless_policy(tmp_path: Path, name: str) -> None:
     base = policy(seed=5)
@@ -324,6 +336,25 @@ def test_metrics_beyond_the_resumed_step_are_cut_off(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
     open_loggers(tmp_path, {}, 1).close()
     assert read_metrics(tmp_path) == [{"step": 1}]
+
+
+def test_weights_and_biases_records_offline_and_a_resumed_run_keeps_its_id(tmp_path: Path) -> None:
+    pytest.importorskip("wandb", reason="uv sync --inexact --extra wandb")
+    from PIL import Image
+
+    folder = tmp_path / "model" / "run"
+    folder.mkdir(parents=True)
+    Image.new("RGB", (4, 4)).save(folder / "p.png")
+    ids = []
+    for step in (3, 4):
+        opened = open_loggers(folder, {"logger": {"name": "wandb", "mode": "offline"}}, step - 1)
+        opened.write(step, {"train/loss": 0.5})
+        opened.picture(step, "plot", folder / "p.png")
+        opened.close()
+        ids.append((folder / "wandb_id").read_text())
+    assert ids[0] == ids[1] and ids[0]
+    assert [file.stat().st_size > 0 for file in folder.glob(f"wandb/offline-run-*/run-{ids[0]}.wandb")] == [True] * 2
+    assert read_metrics(folder) == [{"step": step, "train/loss": 0.5} for step in (3, 4)]
 
 
 def test_an_absent_wandb_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

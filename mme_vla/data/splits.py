@@ -7,6 +7,7 @@ from hashlib import sha256
 import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.layout import SAMPLE
 from mme_vla.errors import UserError
 
 
@@ -60,6 +61,11 @@ def split_episodes(
     if not sum(map(len, split.train)):
         raise UserError("The split leaves no episode to train on; lower val_fraction or shorten val_episodes.")
     return split
+
+
+def default_val_episodes(sources: Sequence[EpisodeSource]) -> list[str]:
+    """Episodes held out where `data.val_episodes` is null: the sample's episode 3, and none of any other dataset."""
+    return [f"{source.name}/3" for source in sources if source.root.resolve() == SAMPLE]
 
 
 def _by_source(names: Sequence[int | str], sources: Sequence[EpisodeSource]) -> dict[str, list[int]]:

@@ -45,8 +45,11 @@ class FeatureEncoder(nn.Module):
 
     def __init__(self, d_vision: int, width: int, position_dim: int | None = None, position_hidden: int | None = None):
         super().__init__()
-        self.position_dim = position_dim or default_position_dim(d_vision)
-        hidden = position_hidden or self.position_dim
+        for name, size in (("position_dim", position_dim), ("position_hidden", position_hidden)):
+            if size is not None and size < 1:
+                raise UserError(f"memory.{name}={size}: must be at least 1, or null for its default.")
+        self.position_dim = default_position_dim(d_vision) if position_dim is None else position_dim
+        hidden = self.position_dim if position_hidden is None else position_hidden
         self.position = nn.Linear(self.position_dim, hidden)
         self.project = nn.Linear(d_vision + hidden, width)
         for layer in (self.position, self.project):

@@ -68,10 +68,22 @@ def resolve_checkpoint(path: Path) -> Path:
     found = newest_checkpoint(path)
     if found != path or (path / "config.json").is_file():
         return found
+    if _is_released(path):
+        raise UserError(
+            f"{path} is a checkpoint of the released code, in another format. Convert it, then name the new folder: "
+            f"python -m mme_vla.weights.convert {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
+            "where no history_config.txt names the variant)."
+        )
     raise UserError(
         f"No checkpoint at {path}: expected a folder such as outputs/<model>/<date>/checkpoints/step_000500, "
         "or the run folder above it."
     )
+
+
+def _is_released(path: Path) -> bool:
+    """Whether `path` is laid out as a run of the released code, a step of one, its arrays, or the zip of a step."""
+    steps = [path, *(step for step in path.glob("*") if step.stem.isdigit())]
+    return any(step.suffix == ".zip" or step.name == "params" or (step / "params").is_dir() for step in steps)
 
 
 def newest_checkpoint(path: Path) -> Path:

@@ -99,7 +99,13 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     if any(isinstance(key, str) and key.startswith("observation/") for key in message):
         return _observation(message, robot)
     keys = [key for key in message if isinstance(key, str)][:10]
-    near = did_you_mean(keys[0], KNOWN) if keys else f"Known: {', '.join(KNOWN)}."
+    if keys and set(keys) <= set(KNOWN):  # flags: true was handled above
+        raise UserError(
+            f"{' and '.join(f'{key}=false' for key in keys)}: no request. Send reset=true, or an observation with the "
+            "keys observation/image, … or front_rgb_list, …"
+        )
+    unknown = [key for key in keys if key not in KNOWN]
+    near = did_you_mean(unknown[0], KNOWN) if unknown else f"Known: {', '.join(KNOWN)}."
     raise UserError(f"No known request has the keys {keys}. {near}")
 
 

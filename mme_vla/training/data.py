@@ -11,7 +11,7 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.groups import GroupDataset
 from mme_vla.data.keyframe_dataset import KeyframeDataset
 from mme_vla.data.sources import open_sources
-from mme_vla.data.splits import split_episodes
+from mme_vla.data.splits import default_val_episodes, split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.files import check_sums, inside
@@ -53,7 +53,8 @@ def prepare_data(
         UserError: whatever is wrong with the data, before any training.
     """
     sources = open_sources(data["sources"], policy.embodiment)
-    split = split_episodes(sources, data["val_fraction"], data["val_episodes"])
+    val_episodes = default_val_episodes(sources) if data["val_episodes"] is None else data["val_episodes"]
+    split = split_episodes(sources, data["val_fraction"], val_episodes)
     processor, offset = policy.require_processor(), data["action_offset"]
     if stats_from is not None:
         check_sums(stats_from, [STATS_FILE])

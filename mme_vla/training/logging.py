@@ -1,9 +1,10 @@
 """Where the numbers go: a JSON-lines file in every run folder, TensorBoard by default, Weights & Biases on request."""
 
 import json
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.files import parse_json, read_text, write_atomically
@@ -90,7 +91,7 @@ class WeightsAndBiases:
         entity: str | None = None,
         group: str | None = None,
         tags: list[str] | None = None,
-        mode: str = "online",
+        mode: Literal["online", "offline", "disabled"] = "online",
     ) -> None:
         self.check()
         import wandb
@@ -98,7 +99,7 @@ class WeightsAndBiases:
         record = folder / "wandb_id"
         if not record.is_file():
             with write_atomically(record) as draft:
-                draft.write_text(wandb.util.generate_id())
+                draft.write_text(secrets.token_hex(4))
         self._wandb = wandb
         self._run = wandb.init(
             project=project, entity=entity, group=group, tags=tags, mode=mode, dir=str(folder),

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, listed
 from mme_vla.files import inside, read_json
 from mme_vla.policy.base import Policy
 from mme_vla.policy.memoryvla.policy import MemoryVlaPolicy
@@ -55,8 +55,18 @@ def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
     """The model's tensors, and those of the newest head and state token beside it, each behind its module's name.
 
     Raises:
-        UserError: a file beside it is damaged.
+        UserError: a file beside it is damaged, or holds a module that these policies do not have: a vision backbone
+            with FiLM, the projector of a diffusion head.
     """
+    known = tuple(f"{module.rstrip('/')}--" for module in (HEAD, STATE))
+    unknown = sorted(file.name for file in folder.glob("*?--*_checkpoint.pt") if not file.name.startswith(known))
+    if unknown:
+        raise UserError(
+            f"{folder} holds {listed(unknown)}: model=openvla_oft has no place for these weights, and would act "
+            f"differently without them. Read are {', '.join(f'{name}*_checkpoint.pt' for name in known)}. A "
+            "vision_backbone is of a run with FiLM (use_film), a noisy_action_projector of one with a diffusion head "
+            "(use_diffusion): use a run without them."
+        )
     found = {f"{VLA}{name}": tensor for name, tensor in tensors.items()}
     for module in (HEAD, STATE):
         files = sorted(folder.glob(f"{module.rstrip('/')}--*_checkpoint.pt"), key=_step)
