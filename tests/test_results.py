@@ -219,7 +219,9 @@ def test_wrong_records_are_refused() -> None:
             aggregate(wrong, SMALL)
     with pytest.raises(UserError, match="each once"):
         Protocol(("BinFill", "BinFill"))
-    with pytest.raises(UserError, match="RoboMME has no task 'BinFil', and no record is of it. Did you mean 'BinFill'"):
+    with pytest.raises(
+        UserError, match=r"RoboMME has no task 'BinFil', and no record is of it\. Did you mean 'BinFill'"
+    ):
         aggregate(made, Protocol(("BinFill", "BinFil")))
 
 

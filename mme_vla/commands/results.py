@@ -181,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--title", default="RoboMME results", help="of the page")
     parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
     parser.add_argument("--brief", action="store_true", help="print the overview only")
-    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="what a whole run consists of (default: all 16, or your own)")
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)")
     parser.add_argument("--episodes", type=int, help="episodes of a task (default: as the split has)")
     parser.add_argument("--split", help="test, val or train, where there are records of several")
     parser.add_argument("--errors", default="failure", choices=("failure", "missing"),

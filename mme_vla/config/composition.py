@@ -182,9 +182,10 @@ def options_first(words: Sequence[str]) -> list[str]:
     if unknown:
         return list(words)
     options = list(words)
+    options.reverse()
     for override in reversed(args.overrides):
-        del options[len(options) - 1 - options[::-1].index(override)]  # the last: an option's value may be the same word
-    return [*options, *args.overrides]
+        options.remove(override)  # its last occurrence: the value of an option may be the same word
+    return [*reversed(options), *args.overrides]
 
 
 def _check_command_line(config_name: str, tree: Path) -> None:

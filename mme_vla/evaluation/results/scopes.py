@@ -55,7 +55,7 @@ class Protocol:
 
 
 def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
-    """The tasks of a run unless they are named: the benchmark's, if a record is of one of them, and those of one's own."""
+    """The tasks that a run consists of by default: the benchmark's, if a record is of one, and the user's own."""
     names = {record.task for record in records}
     own = tuple(sorted(names - TASK_FACTS.keys()))
     return (*PAPER_ORDER, *own) if names & TASK_FACTS.keys() or not own else own
