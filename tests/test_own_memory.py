@@ -1,10 +1,11 @@
 """The worked example of docs/add-a-memory.md: a memory outside the package builds, streams and trains."""
 
 import json
+import os
 import runpy
+import subprocess
 import sys
 
-import forked
 import numpy as np
 import pytest
 import torch
@@ -54,6 +55,7 @@ def test_every_command_takes_the_plugins_of_its_file(command):
     assert compose(command, ["memory=last_frames"], extra_dirs=[EXAMPLE / "configs"]).plugins == ["last_frames"]
 
 
+@pytest.mark.slow
 def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
     pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
     try:
@@ -66,7 +68,9 @@ def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
         "+memories.last_frames={budget: 4, grid: 1, spacing: 32}",
     ]  # fmt: skip
     words = ["task=VideoUnmask", "model=last_frames_context", "--config-dir", "configs", *settings]
-    done = forked.run("mme_vla.nano", *words, f"output={tmp_path}", cwd=EXAMPLE)
+    command = [sys.executable, "-m", "mme_vla.nano", *words, f"output={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(command, cwd=EXAMPLE, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (record,) = read_folders(find_records([tmp_path]))
     assert (record.model, record.memory_budget) == ("last_frames_context-spacing_32-grid_1", 4)
