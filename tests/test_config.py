@@ -8,10 +8,11 @@ from pathlib import Path
 import forked
 import pytest
 from hydra import initialize_config_dir
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
-from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins
+from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins, options_first
 from mme_vla.config.naming import found_name
 from mme_vla.config.words import join_memories
 from mme_vla.errors import UserError
@@ -76,6 +77,8 @@ def test_a_model_brings_its_memory(tree: Path) -> None:
         ("train.clip.norm.x=1", "'train.clip.norm' is a value"),
         ("train.steps=many", "'train.steps' is a number (default 10)"),
         ("train.clip=1", "'train.clip' is a section with the keys norm"),
+        ("train.clip={nrm: 1}", "Unknown config key 'train.clip.nrm'. In 'train.clip': Did you mean 'norm'?"),
+        ("train.clip={of: 1}", "Known: norm. To add it: +train.clip.of=…"),
         ("fast=1", "'fast' is true or false"),
         ("train=3", "names no config of the group. Known: default."),
         ("=3", "the key is missing"),
@@ -109,6 +112,27 @@ def test_a_broken_file_and_a_missing_folder_are_named(tree: Path) -> None:
         compose("demoo", directory=tree)
     with pytest.raises(UserError, match="nowhere' does not exist"):
         compose("demo", directory=tree / "nowhere")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["a=1", "--config-dir", "b", "c=2", "-m", "d=3"],
+        ["--config-dir=b", "a=1", "c=2", "--multirun", "d=3"],
+        ["-m", "--config-dir", "b", "a=1", "c=2", "d=3"],
+    ],
+)
+def test_options_may_stand_anywhere(words: list[str]) -> None:
+    ordered = options_first(words)
+    assert ordered[-3:] == ["a=1", "c=2", "d=3"]
+    assert sorted(ordered) == sorted(words)
+    args = get_args_parser().parse_args(ordered)
+    assert (args.config_dir, args.multirun, args.overrides) == ("b", True, ["a=1", "c=2", "d=3"])
+
+
+def test_an_options_value_may_equal_a_word() -> None:
+    words = ["--config-dir", "memory", "--help", "memory"]
+    assert options_first(words) == words
 
 
 def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:

@@ -1,7 +1,10 @@
 """The worked example of docs/add-a-memory.md: a memory outside the package builds, streams and trains."""
 
+import json
+import os
 import re
 import runpy
+import subprocess
 import sys
 
 import numpy as np
@@ -9,9 +12,10 @@ import pytest
 import torch
 from conftest import REPOSITORY
 
-from mme_vla import build_policy
-from mme_vla.commands import inspect
+from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
+from mme_vla.envs.rendering_check import render_backend
+from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.testing import check_memory
 from mme_vla.testing.small import open_gates, random_batch, unit_stats
 
@@ -54,11 +58,32 @@ def test_its_file_makes_it_a_choice_for_any_integration_and_beside_another(monke
     assert [type(member).__name__ for member in policy.memory.memories] == ["LastFrames", "FrameSamp"]
 
 
-def test_inspect_draws_what_it_remembers(monkeypatch, tmp_path):
-    monkeypatch.chdir(EXAMPLE)
-    words = ["dataset=sample", "memory=last_frames", "episode=0", "step=100", f"output={tmp_path}"]
-    inspect.main(compose("inspect", words, extra_dirs=[EXAMPLE / "configs"]))
-    assert len(list(tmp_path.glob("*_last_frames.png"))) == 1
+@pytest.mark.parametrize("command", ["train", "evaluate", "serve", "cache", "probe", "inspect", "record"])
+def test_every_command_takes_the_plugins_of_its_file(command):
+    assert compose(command, ["memory=last_frames"], extra_dirs=[EXAMPLE / "configs"]).plugins == ["last_frames"]
+
+
+@pytest.mark.slow
+def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
+    pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
+    try:
+        render_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    settings = [
+        "beside=[]", "also=[]", "drawn_for=[]", "planner=false", "films=false", "split=val", "episodes=1",
+        "max_steps=1", "demonstrations={easy: 2, medium: 0, hard: 0}", "train.steps=1", "train.batch_size=2",
+        "+memories.last_frames={budget: 4, grid: 1, spacing: 32}",
+    ]  # fmt: skip
+    words = ["task=VideoUnmask", "model=last_frames_context", "--config-dir", "configs", *settings]
+    command = [sys.executable, "-m", "mme_vla.nano", *words, f"output={tmp_path}"]
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY)}
+    done = subprocess.run(command, cwd=EXAMPLE, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (record,) = read_folders(find_records([tmp_path]))
+    assert (record.model, record.memory_budget) == ("last_frames_context-grid_1-spacing_32", 4)
+    (weights,) = tmp_path.rglob("step_*/model.safetensors")
+    assert json.loads((weights.parent / "config.json").read_text())["plugins"] == ["last_frames"]
 
 
 def test_own_memory_gets_a_loss_and_acts(policy):

@@ -1,13 +1,14 @@
 """An episode as a sequence of choices, and the runs made of them, against a stand-in environment."""
 
 import json
+from dataclasses import replace
 from itertools import count
 
 import numpy as np
 import pytest
 from play_fakes import BLOCKS, MOTION, VIDEO, BlocksEnv, a_session, an_episode
 
-from mme_vla.commands.play import _by_itself, line
+from mme_vla.commands.play import _by_itself, line, print_summary
 from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError
 from mme_vla.evaluation.record_log import read_records
@@ -190,6 +191,18 @@ def test_a_run_goes_on_where_it_stopped(tmp_path):
     assert [record.episode for record in records] == [0, 1, 2]
     assert (task, successes, episodes) == ("VideoUnmask", sum(r.success for r in records), 3)
     assert (paper["Human"], paper["Gemini-2.5-Pro"]) == (90, 86)
+
+
+def test_own_tasks_are_summed_up_beside_the_benchmarks(tmp_path, capsys):
+    with a_run(tmp_path) as run:
+        for which in (an_episode(0), replace(an_episode(1), task="TwoButtons")):
+            run.save_error(which, "it fell over")
+        assert [(task, count, bool(paper)) for task, _, count, paper in run.summary()] == [
+            ("VideoUnmask", 1, True),
+            ("TwoButtons", 1, False),
+        ]
+        print_summary(run)
+    assert "TwoButtons" in capsys.readouterr().out
 
 
 def test_a_run_of_other_settings_needs_another_folder(tmp_path):

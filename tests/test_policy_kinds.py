@@ -11,7 +11,7 @@ from torch import nn
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
 from mme_vla.config.composition import compose
 from mme_vla.policy.digest import composition_digest
-from mme_vla.policy.kinds import policy_class
+from mme_vla.policy.kinds import policy_class, policy_options
 from mme_vla.processing.normalisers import QuantileStats, RunningStats, normalize, unnormalize
 from mme_vla.training.ema import EMA
 from mme_vla.training.optim import make_optimizer, scheduled_rate
@@ -36,6 +36,23 @@ def test_the_section_policy_says_which_class_is_built() -> None:
     for name in ("dreaming", 5, None):
         with pytest.raises(UserError, match="Unknown policy"):
             policy_class({"policy": {"name": name}})
+
+
+@register("policy", "keeping")
+class KeepingPolicy(MMEPolicy):
+    """A kind of policy with an option of its own beside those of its parent."""
+
+    def __init__(self, *parts: Any, keep: int = 1, **options: Any) -> None:
+        super().__init__(*parts, **options)
+        self.keep = keep
+
+
+def test_a_subclass_takes_the_options_of_its_parents() -> None:
+    own = build_policy("pi05", policy={"name": "keeping", "augment": False})
+    assert isinstance(own, KeepingPolicy) and (own.augment, own.keep) == (False, 1)
+    with pytest.raises(UserError, match=r"policy has no key 'augmnt'\. Did you mean 'augment'"):
+        policy_options(KeepingPolicy, {"policy": {"augmnt": False}})
+    assert policy_options(KeepingPolicy, {"policy": {"keep": 3, "augment": False}}) == {"keep": 3, "augment": False}
 
 
 def test_a_kind_comes_back_as_what_it_was(tmp_path: Any) -> None:

@@ -21,7 +21,7 @@ from mme_vla.evaluation.results.compare import compare, compare_all
 from mme_vla.evaluation.results.cost_table import chunk_flops
 from mme_vla.evaluation.results.demo import demo_records
 from mme_vla.evaluation.results.intervals import bootstrap, effective_trials, holm, mean_std, sign_test, wilson
-from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.scopes import Protocol, tasks_of
 from mme_vla.evaluation.results.submission import policy_facts, training_details
 from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
 from mme_vla.evaluation.run_file import claim_run
@@ -210,7 +210,7 @@ def test_difficulties_cut_across_tasks() -> None:
 def test_wrong_records_are_refused() -> None:
     made = records("a", {"BinFill": [1]})
     for wrong, message in (
-        ([replace(made[0], task="BinFil")], "Did you mean 'BinFill'"),
+        ([replace(made[0], task="BinFil")], "None of the 1 records"),
         ([*made, replace(made[0], split="val")], "several splits"),
         ([*made, replace(made[0], model="b", seed=9)], "different benchmarks"),
         ([replace(made[0], episode=90)], "None of the 1 records"),
@@ -220,6 +220,33 @@ def test_wrong_records_are_refused() -> None:
             aggregate(wrong, SMALL)
     with pytest.raises(UserError, match="each once"):
         Protocol(("BinFill", "BinFill"))
+    with pytest.raises(
+        UserError, match=r"RoboMME has no task 'BinFil', and no record is of it\. Did you mean 'BinFill'"
+    ):
+        aggregate(made, Protocol(("BinFill", "BinFil")))
+
+
+def test_own_tasks_form_a_group_beside_the_benchmark() -> None:
+    benchmark, own = records("a", {"BinFill": [1, 0]}), records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]})
+    (alone,) = aggregate(own, Protocol(tasks_of(own), 2, samples=100)).methods
+    assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean, alone.complete) == (75.0, 75.0, True)
+    tasks = ("BinFill", "TwoButtons", "Stay")
+    both = aggregate([*benchmark, *own], Protocol(tasks, 2, samples=100))
+    (method,) = both.methods
+    assert (method.average.mean, method.figures["suite"]["Own tasks"].mean) == (50.0, 75.0)
+    assert method.figures["task"]["TwoButtons"].mean == 100.0 and method.complete
+    assert both.notes == []
+    assert tasks_of([*benchmark, *own]) == (*PAPER_ORDER, "Stay", "TwoButtons")
+
+
+def test_the_command_shows_and_compares_own_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with RecordLog(tmp_path / "episodes.jsonl") as log:
+        for record in [*records("pi05", {"TwoButtons": [1, 0]}), *records("b", {"TwoButtons": [0, 0]})]:
+            log.append(record)
+    page = tmp_path / "page.html"
+    main(["--brief", "--episodes", "2", str(tmp_path), "--html", str(page), "--samples", "100"])
+    shown = capsys.readouterr().out
+    assert "Own tasks" in shown and "50.00" in shown and "TwoButtons" in page.read_text()
 
 
 # Comparison

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli, config_dir
+from mme_vla.config.composition import cli, command_trees, config_dir
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.files import read_json, write_json
 
@@ -64,11 +64,15 @@ def command(cfg: DictConfig) -> None:
     check_names(config["task"], "mme_vla", "waypoint", None, None)
     check_counts(config["demonstrations"])
     require_simulator()
-    run({str(key): value for key, value in config.items()})
+    run({str(key): value for key, value in config.items()}, command_trees()[1:])
 
 
-def run(config: Mapping[str, Any]) -> Path:
-    """All stages of a run; the path of its page; of a folder, where other commands are to go on there."""
+def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
+    """All stages of a run; the path of its page; of a folder, where other commands are to go on there.
+
+    Args:
+        config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.
+    """
     from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
     from mme_vla.nano.evaluating import film, run_episodes
@@ -81,11 +85,12 @@ def run(config: Mapping[str, Any]) -> Path:
     words = ["backbone=nano", f"embodiment={config['embodiment']}", "policy.augment=false", f"seed={config['seed']}"]
     words += config["overrides"]
     models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
-    composed = {model: compose_policy(model, config["memories"], words) for model in models}
+    how = (config["memories"], words, extra_dirs, config["plugins"])
+    composed = {model: compose_policy(model, *how) for model in models}
     drawn_for = [model for model in config["drawn_for"] if model not in composed]
     minutes = _Minutes(folder / "minutes.json")
     with minutes.of("demonstrations"):
-        others = [compose_policy(model, config["memories"], words) for model in drawn_for]
+        others = [compose_policy(model, *how) for model in drawn_for]
         memories = [each["memory"] for each in (*composed.values(), *others)]
         robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
         asked = robot.action.execute

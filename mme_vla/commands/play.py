@@ -132,13 +132,16 @@ def print_summary(run: PlayRun) -> None:
     rows = run.summary()
     if not rows:
         return
-    methods = list(rows[0][3])
+    methods = list(rows[0][3])  # empty for the user's own tasks, which come last
     table = Table("task", "episodes", run.identity.model, *(f"{method} (paper)" for method in methods))
     for task, successes, count, paper in rows:
-        table.add_row(task, str(count), f"{100 * successes / count:.1f}", *(f"{paper[m]:.0f}" for m in methods))
+        table.add_row(
+            task, str(count), f"{100 * successes / count:.1f}", *(f"{paper[m]:.0f}" if paper else "–" for m in methods)
+        )
     rates = [100 * successes / count for _, successes, count, _ in rows]
     if len(rows) > 1:
-        means = [sum(paper[m] for *_, paper in rows) / len(rows) for m in methods]
+        reported = [paper for *_, paper in rows if paper]
+        means = [sum(paper[m] for paper in reported) / len(reported) for m in methods]
         table.add_section()
         table.add_row("mean of tasks", str(sum(count for _, _, count, _ in rows)), f"{sum(rates) / len(rates):.2f}",
                       *(f"{mean:.2f}" for mean in means))  # fmt: skip

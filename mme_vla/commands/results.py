@@ -19,7 +19,7 @@ from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.demo import demo_records
 from mme_vla.evaluation.results.process_scores import process_tables
-from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.results.scopes import Protocol, tasks_of
 from mme_vla.evaluation.results.stress import Curves, stress_curves, stress_figures, stress_table
 from mme_vla.evaluation.results.submission import read_runs, training_details
 from mme_vla.evaluation.results.tables import (
@@ -36,7 +36,7 @@ from mme_vla.evaluation.results.tables import (
     to_markdown,
 )
 from mme_vla.evaluation.rollout.subgoal_score import subgoal_tables
-from mme_vla.evaluation.suites import PAPER_ORDER, TEST_EPISODES
+from mme_vla.evaluation.suites import TEST_EPISODES
 
 DEMO = (
     ("pi05", None),
@@ -56,7 +56,7 @@ EXAMPLES = (
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Read, aggregate, compare, print, write."""
-    args = _parser().parse_args(arguments)
+    args = _parser().parse_intermixed_args(arguments)
     with print_user_errors():
         run(args)
 
@@ -73,8 +73,8 @@ def run(args: argparse.Namespace) -> None:
         raise UserError("Name files or folders of episode records, or --demo for made-up ones (not both).")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     protocol = Protocol(
-        tuple(args.tasks or PAPER_ORDER), args.episodes or _episodes(records, args.split), args.errors, args.confidence,
-        args.samples, args.seed,
+        tuple(args.tasks or tasks_of(records)), args.episodes or _episodes(records, args.split), args.errors,
+        args.confidence, args.samples, args.seed,
     )  # fmt: skip
     if args.stress:
         show_curves(stress_curves(records, args.confidence, args.conflicts), args)
@@ -182,7 +182,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--title", default="RoboMME results", help="of the page")
     parser.add_argument("--stress", action="store_true", help="success over the dials of split=stress:… instead")
     parser.add_argument("--brief", action="store_true", help="print the overview only")
-    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="what a whole run consists of (default: all 16)")
+    parser.add_argument("--tasks", nargs="+", metavar="TASK", help="of a whole run (default: all 16, and your own)")
     parser.add_argument("--episodes", type=int, help="episodes of a task (default: as the split has)")
     parser.add_argument("--split", help="test, val or train, where there are records of several")
     parser.add_argument("--errors", default="failure", choices=("failure", "missing"),

@@ -104,12 +104,16 @@ def _name_under_hydra(*, _root_: DictConfig) -> str:
     """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on the run's folder."""
     if not HydraConfig.initialized():
         return str(_root_.name)  # `compose` and the command have set it
-    running = HydraConfig.get()
-    trees = [Path(source.path) for source in running.runtime.config_sources if source.schema == "file"]
-    # A job's main tree is asked first, whatever the order in which Hydra searches.
-    main = [Path(s.path) for s in running.runtime.config_sources if s.provider == "main" and s.schema == "file"]
-    ordered = tuple(dict.fromkeys(tree.resolve() for tree in (*main, *trees)))
-    return true_name(_root_, str(running.job.config_name), ordered) if ordered else str(_root_.name)
+    trees = command_trees()
+    return true_name(_root_, str(HydraConfig.get().job.config_name), trees) if trees else str(_root_.name)
+
+
+def command_trees() -> tuple[Path, ...]:
+    """Folders of YAML files that the running command reads: its own, then those of `--config-dir`."""
+    sources = [source for source in HydraConfig.get().runtime.config_sources if source.schema == "file"]
+    # The command's own comes first, whatever the order in which Hydra searches.
+    sources.sort(key=lambda source: source.provider != "main")
+    return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))
 
 
 OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
@@ -151,7 +155,7 @@ def cli[T](
                 import_plugins(cfg)
                 return main(cfg)
             tree = directory or config_dir()
-            sys.argv[1:] = several_memories(plugins.trust_as_override(sys.argv[1:]))
+            sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
             with print_user_errors():
                 _check_command_line(config_name, tree)
                 start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
@@ -168,10 +172,25 @@ def cli[T](
     return decorate
 
 
+def options_first(words: Sequence[str]) -> list[str]:
+    """Move the options of a command line before its overrides: Hydra's parser takes no other order.
+
+    A command line with an unknown option stays as it is.
+    """
+    args, unknown = get_args_parser().parse_known_intermixed_args(words)
+    if unknown:
+        return list(words)
+    options = list(words)
+    options.reverse()
+    for override in reversed(args.overrides):
+        options.remove(override)  # its last occurrence: the value of an option may be the same word
+    return [*reversed(options), *args.overrides]
+
+
 def _check_command_line(config_name: str, tree: Path) -> None:
-    args, rest = get_args_parser().parse_known_args()
-    if rest:
-        raise unknown_option(rest[0], sys.argv[1:], known_keys(config_name, tree))
+    args, unknown = get_args_parser().parse_known_intermixed_args()
+    if unknown:
+        raise unknown_option(unknown[0], sys.argv[1:], known_keys(config_name, tree))
     if args.help:
         extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
         print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))

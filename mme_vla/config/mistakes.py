@@ -99,6 +99,11 @@ class ConfigTree:
         key = (unknown[1] or unknown[2]) if unknown else ""
         if not key or key.startswith("hydra."):
             return text
+        for value in (o.value() for o in self.values if o.key_or_group == key):
+            known = _select(defaults, key)
+            if isinstance(value, Mapping) and isinstance(known, Mapping):
+                key = next((f"{key}.{name}" for name in paths(value) if _select(known, name) is None), key)
+                return _unknown_key(key, defaults, ()) + f" To add it: +{key}=…"
         return _unknown_key(key, defaults, self.loader.list_groups(""))
 
     def check_kinds(self) -> None:

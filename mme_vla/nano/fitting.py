@@ -8,7 +8,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from mme_vla.config.composition import compose
+from mme_vla.config.composition import compose, import_plugins
+from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
 from mme_vla.files import read_json_lines, write_json
 from mme_vla.nano.demonstrations import Demonstration
@@ -31,17 +32,30 @@ HELD_OUT = 10
 """One demonstration in so many only measures the loss."""
 
 
-def compose_policy(model: str, memories: Mapping[str, Mapping[str, Any]], words: Sequence[str]) -> dict[str, Any]:
-    """The configuration of one model at nano size, plain.
+def compose_policy(
+    model: str,
+    memories: Mapping[str, Mapping[str, Any]],
+    words: Sequence[str],
+    extra_dirs: Sequence[Path] = (),
+    plugins: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Compose one model at nano size, as plain values, and import its plugins.
 
     Args:
         model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
         words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
+        extra_dirs: further trees, as `--config-dir` adds them. plugins: modules that the model needs beside its own.
+
+    Raises:
+        UserError: as `compose` and `import_plugins`.
     """
-    found = compose("policy", [f"model={model}", *words])
-    memory = None if found.memory is None else str(found.memory.name)
+    base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
+    memory = None if base.memory is None else str(base.memory.name)
     chosen = [f"memory.{key}={value}" for key, value in memories.get(memory or "", {}).items()]
-    config = OmegaConf.to_container(compose("policy", [f"model={model}", *words, *chosen]), resolve=True)
+    composed = compose("policy", [f"model={model}", *words, *chosen], extra_dirs=extra_dirs)
+    composed.plugins = list(dict.fromkeys([*plugins, *plugins_of(composed, model)]))
+    import_plugins(composed)
+    config = OmegaConf.to_container(composed, resolve=True)
     assert isinstance(config, dict)
     return {str(key): value for key, value in config.items()}
 

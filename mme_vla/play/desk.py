@@ -94,7 +94,7 @@ class Desk:
         }  # fmt: skip
         if phase == "finished":
             state["summary"] = [
-                {"task": task, "successes": successes, "episodes": count, "human": paper["Human"]}
+                {"task": task, "successes": successes, "episodes": count, "human": paper.get("Human")}
                 for task, successes, count, paper in run.summary()
             ]
         which = session.episode if session is not None else todo[0] if todo else None

@@ -120,13 +120,16 @@ class PlayRun:
         return record
 
     def summary(self) -> list[tuple[str, int, int, dict[str, float]]]:
-        """(task, successes, episodes, the paper's rates by method in percent), tasks in the paper's order."""
+        """(task, successes, episodes, the paper's rates by method in percent), tasks in the paper's order.
+
+        The user's own tasks come last, without rates.
+        """
         known = {row["method"]: row for row in paper_table("oracle_planner")}
         rows = []
-        for task in PAPER_ORDER:
+        for task in dict.fromkeys((*PAPER_ORDER, *(record.task for record in self.records))):
             played = [record for record in merge(self.records, "last") if record.task == task]
             if played:
-                paper = {method: float(row[task]) for method, row in known.items()}
+                paper = {method: float(row[task]) for method, row in known.items() if task in row}
                 rows.append((task, sum(record.success for record in played), len(played), paper))
         return rows
 

@@ -53,12 +53,25 @@ def policy_class_for[P](asked: type[P], config: Mapping[str, Any], source: str) 
 def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
     """The section `policy`, whose keys beside `name` are the constructor's keyword-only arguments.
 
+    Where a constructor takes `**options`, those of its parent class count too.
+
     Raises:
         UserError: another key.
     """
     options = {key: value for key, value in config.get("policy", {}).items() if key != "name"}
-    known = [p.name for p in inspect.signature(cls).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    known = _keyword_options(cls)
     for key in options:
         if key not in known:
             raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
     return options
+
+
+def _keyword_options(cls: type) -> list[str]:
+    known: list[str] = []
+    for owner in cls.__mro__:
+        if "__init__" in vars(owner):
+            parameters = inspect.signature(vars(owner)["__init__"]).parameters.values()
+            known += [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+                break
+    return list(dict.fromkeys(known))

@@ -16,8 +16,8 @@ from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, RunKey, by_run
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.intervals import Interval, bootstrap, mean_std, task_interval, wilson
 from mme_vla.evaluation.results.paper import PaperMethod, PaperResult
-from mme_vla.evaluation.results.scopes import Protocol, Scope, scopes
-from mme_vla.evaluation.suites import DIFFICULTIES, MAX_STEPS, PAPER_ORDER, task_facts
+from mme_vla.evaluation.results.scopes import Protocol, Scope, scopes, tasks_of
+from mme_vla.evaluation.suites import DIFFICULTIES, MAX_STEPS, PAPER_ORDER, TASK_FACTS
 
 USUAL_BUDGET = 512
 
@@ -52,16 +52,21 @@ class Run:
     protocol: Protocol
 
     @property
+    def averaged(self) -> list[EpisodeRecord]:
+        """The records that the average is over."""
+        return [record for key, record in self.records.items() if key.task in self.protocol.averaged]
+
+    @property
     def expected(self) -> int:
-        return len(self.protocol.tasks) * self.protocol.episodes
+        return len(self.protocol.averaged) * self.protocol.episodes
 
     @property
     def complete(self) -> bool:
-        return len(self.records) == self.expected
+        return len(self.averaged) == self.expected
 
     @property
     def outcomes(self) -> dict[str, int]:
-        return dict(count_outcomes(self.records.values()))
+        return dict(count_outcomes(self.averaged))
 
     def successes(self, task: str) -> list[bool] | None:
         """Outcomes of a task's episodes in order, or None if some are missing."""
@@ -127,17 +132,20 @@ def aggregate(
     """Make all figures.
 
     Args:
-        records: of any number of runs; they are merged here. split: only these; needed if there are several.
+        records: of any number of runs; they are merged here. protocol: its tasks are `tasks_of(records)` by default.
+        split: only these; needed if there are several.
         conflicts: see `merge`.
 
     Raises:
         UserError: nothing to average, an unknown task, several splits, or records that contradict each other.
     """
-    protocol = protocol or Protocol()
     records = list(records)
+    protocol = protocol or Protocol(tasks_of(records))
     merged = merge(records, conflicts)
-    for task in {record.task for record in merged}:
-        task_facts(task)
+    known = {*PAPER_ORDER, *(record.task for record in merged)}
+    for task in protocol.tasks:
+        if task not in known:
+            raise UserError(f"RoboMME has no task {task!r}, and no record is of it. {did_you_mean(task, known)}")
     splits = sorted({record.split for record in merged})
     if split is None and len(splits) > 1:
         raise UserError(f"These are results of several splits ({', '.join(splits)}): choose one with --split.")
@@ -207,11 +215,11 @@ def _method(
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
     difficulties = {key: record.difficulty for run in runs for key, record in run.records.items()}
-    whole = {task for task in protocol.tasks for run in runs if run.successes(task) is not None}
+    whole = {task for task in protocol.averaged for run in runs if run.successes(task) is not None}
     for level in DIFFICULTIES:
-        seen = {key.task for key, of in difficulties.items() if of == level}
+        seen = {key.task for key, of in difficulties.items() if of == level} & set(protocol.averaged)
         # A task without the level is left out; one that is not whole yet may have it, and keeps the figure incomplete.
-        tasks = tuple(task for task in protocol.tasks if task in seen or task not in whole)
+        tasks = tuple(task for task in protocol.averaged if task in seen or task not in whole)
         if seen:
             figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
             method.figures.setdefault("difficulty", {})[level] = figure
@@ -264,11 +272,11 @@ def _figure(
 
 def _reported(known: PaperMethod | None, scope: Scope, protocol: Protocol) -> PaperResult | None:
     """The paper's number, where it is about the same tasks."""
-    if known is None:
+    if known is None or not TASK_FACTS.keys() >= set(scope.tasks):
         return None
     if scope.kind == "task":
         return paper.per_task(known.name)[scope.name]
-    if len(protocol.tasks) < len(PAPER_ORDER):
+    if not set(protocol.tasks) >= set(PAPER_ORDER):
         return None
     if scope.kind == "average":
         return paper.average(known.name)
@@ -291,7 +299,7 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
     for method in methods:
         for run in method.runs:
             if not run.complete:
-                notes.append(f"Incomplete, not averaged: {run.key} has {len(run.records)} of {run.expected} episodes.")
+                notes.append(f"Incomplete, not averaged: {run.key} has {len(run.averaged)} of {run.expected} episodes.")
             errors = run.outcomes["error"]
             if errors:
                 notes.append(f"{run.key}: {errors} episodes ended in an error and count as failures.")

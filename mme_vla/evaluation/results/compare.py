@@ -93,10 +93,12 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
     common = [key for key in rates[0] if key in rates[1]]
     if not common:
         raise UserError(f"{first.label} and {second.label} have no episode in common: there is nothing to pair.")
+    shared = [task for task in protocol.tasks if any(key.task == task for key in common)]
+    tasks = [task for task in shared if task in protocol.averaged] or shared
+    common = [key for key in common if key.task in tasks]
     by_task = {
         task: np.array([[side[key] for side in rates] for key in common if key.task == task])  # episodes × 2
-        for task in protocol.tasks
-        if any(key.task == task for key in common)
+        for task in tasks
     }
     means = 100 * np.mean([values.mean(0) for values in by_task.values()], axis=0)
     gaps = {task: values[:, 0] - values[:, 1] for task, values in by_task.items()}
@@ -112,7 +114,7 @@ def compare(first: Method, second: Method, protocol: Protocol) -> Comparison:
                 _interval(inside, protocol),
             )
     return Comparison(
-        first.label, second.label, len(common), len(protocol.tasks) * protocol.episodes, float(means[0]),
+        first.label, second.label, len(common), len(protocol.averaged) * protocol.episodes, float(means[0]),
         float(means[1]), float(means[0] - means[1]), _interval(gaps, protocol), wins, losses, p, p,
         p < 1 - protocol.confidence, suites, first.repeated + second.repeated, first.flipped + second.flipped,
     )  # fmt: skip

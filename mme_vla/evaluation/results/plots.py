@@ -9,7 +9,7 @@ import numpy as np
 
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
-from mme_vla.evaluation.suites import SUITES, TASK_FACTS
+from mme_vla.evaluation.suites import OWN, SUITES, task_facts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -71,7 +71,8 @@ def heat_map(results: Results) -> str:
     for method in results.methods:
         rows.append((method.label, [method.figures["task"][task].mean for task in tasks]))
         if method.paper is not None:
-            rows.append(("paper", [paper.per_task(method.paper.name)[task].mean for task in tasks]))
+            reported = [method.figures["task"][task].paper for task in tasks]
+            rows.append(("paper", [None if result is None else result.mean for result in reported]))
     values = np.array([[np.nan if v is None else v for v in row] for _, row in rows], float)
     with picture((0.62 * len(tasks) + 2.4, 0.34 * len(rows) + 1.7)) as (canvas, (axes,)):
         axes.imshow(values, cmap="GnBu", vmin=0, vmax=100, aspect="auto")
@@ -92,7 +93,7 @@ def heat_map(results: Results) -> str:
             if rows[edge][0] != "paper":
                 axes.axhline(edge - 0.5, color="white", lw=3)
         boundary = 0
-        for suite in SUITES:
+        for suite in results.protocol.suites:
             boundary += len(results.protocol.choose("suite", suite))
             if 0 < boundary < len(tasks) and list(tasks) == sorted(tasks, key=_suite_of):
                 axes.axvline(boundary - 0.5, color="white", lw=3)
@@ -207,7 +208,7 @@ def _colour(i: int) -> str:
 
 
 def _suite_of(task: str) -> int:
-    return SUITES.index(TASK_FACTS[task].suite)
+    return (*SUITES, OWN).index(task_facts(task).suite)
 
 
 def _folded(name: str) -> str:

@@ -46,7 +46,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     protocol = results.protocol
     methods, runs = len(results.methods), sum(len(method.runs) for method in results.methods)
     sub = f"{methods} method{'s' * (methods > 1)}, {runs} run{'s' * (runs > 1)} of "
-    sub += f"{len(protocol.tasks)} tasks × {protocol.episodes} episodes · {datetime.now(UTC):%Y-%m-%d}"
+    sub += f"{len(protocol.averaged)} tasks × {protocol.episodes} episodes · {datetime.now(UTC):%Y-%m-%d}"
     parts = [f"<h1>{escape(title)}</h1><p class=sub>{sub}</p>"]
     if results.notes:
         parts.append("<div class=note>" + "".join(f"<p>{escape(note)}</p>" for note in results.notes) + "</div>")

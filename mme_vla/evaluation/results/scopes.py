@@ -1,18 +1,20 @@
 """What a whole run consists of, and the sets of tasks that figures are made over."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from mme_vla.errors import UserError
-from mme_vla.evaluation.records import EpisodeKey
-from mme_vla.evaluation.suites import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TEST_EPISODES, task_facts
+from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord
+from mme_vla.evaluation.suites import GROUPS, OWN, PAPER_ORDER, SUITES, TASK_FACTS, TEST_EPISODES, task_facts
 
 
 @dataclass(frozen=True)
 class Protocol:
     """What a whole run consists of, and how its figures are made.
 
-    tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task.
+    tasks, episodes: a run is complete with episodes 0 … episodes − 1 of every task; where some are the benchmark's, of
+        these: tasks of one's own have figures of their own, beside the average.
     errors: whether an episode that ended in an error is a `failure`, as in the official evaluation, or `missing`.
     confidence, samples, seed: of the intervals; samples and seed are the bootstrap's.
     """
@@ -25,8 +27,6 @@ class Protocol:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for task in self.tasks:
-            task_facts(task)
         if not self.tasks or len(set(self.tasks)) < len(self.tasks):
             raise UserError(f"tasks={list(self.tasks)} must name at least one task, each once.")
         if self.episodes < 1:
@@ -39,9 +39,26 @@ class Protocol:
     def expects(self, key: EpisodeKey) -> bool:
         return key.task in self.tasks and 0 <= key.episode < self.episodes
 
+    @property
+    def averaged(self) -> tuple[str, ...]:
+        """The tasks that the average is over: the benchmark's, or all where none is the benchmark's."""
+        return tuple(task for task in self.tasks if task in TASK_FACTS) or self.tasks
+
+    @property
+    def suites(self) -> list[str]:
+        """The suites that take part; `OWN` is the last."""
+        return [suite for suite in (*SUITES, OWN) if self.choose("suite", suite)]
+
     def choose(self, attribute: str, value: str) -> list[str]:
         """The tasks of a suite or group that take part."""
-        return [task for task in self.tasks if getattr(TASK_FACTS[task], attribute) == value]
+        return [task for task in self.tasks if getattr(task_facts(task), attribute) == value]
+
+
+def tasks_of(records: Iterable[EpisodeRecord]) -> tuple[str, ...]:
+    """The tasks that a run consists of by default: the benchmark's, if a record is of one, and the user's own."""
+    names = {record.task for record in records}
+    own = tuple(sorted(names - TASK_FACTS.keys()))
+    return (*PAPER_ORDER, *own) if names & TASK_FACTS.keys() or not own else own
 
 
 class Scope(NamedTuple):
@@ -55,7 +72,7 @@ class Scope(NamedTuple):
 def scopes(protocol: Protocol) -> list[Scope]:
     """Everything figures are made of, whole tasks at a time (difficulties cut across them)."""
     found = [Scope("task", task, (task,)) for task in protocol.tasks]
-    found += [Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in SUITES]
+    found += [Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites]
     found += [Scope("group", group, tuple(protocol.choose("group", group))) for group in GROUPS]
-    found += [Scope("average", "average", protocol.tasks)]
+    found += [Scope("average", "average", protocol.averaged)]
     return [scope for scope in found if scope.tasks]

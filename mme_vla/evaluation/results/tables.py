@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mme_vla.errors import printable
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.suites import PAPER_SEEDS, SUITES
+from mme_vla.evaluation.suites import PAPER_SEEDS
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable
@@ -55,7 +55,7 @@ def show_paper(figure: Figure) -> str:
 
 def overview(results: Results) -> Table:
     """Methods × suites, as the paper's suite table."""
-    suites = [suite for suite in SUITES if results.protocol.choose("suite", suite)]
+    suites = results.protocol.suites
     level = f"{100 * results.protocol.confidence:g} %"
     columns = ["method", "runs", "episodes", *suites, "average", level, "paper"]
     rows = []
@@ -91,13 +91,11 @@ def detail(method: Method, results: Results) -> Table:
             strong.add(len(rows))
         rows.append([name, show(figure), span(figure), show_paper(figure), gap])
 
-    for suite in SUITES:
-        tasks = results.protocol.choose("suite", suite)
-        for task in tasks:
+    for suite in results.protocol.suites:
+        for task in results.protocol.choose("suite", suite):
             add(task, method.figures["task"][task])
-        if tasks:
-            add(suite, method.figures["suite"][suite], True)
-            rules.add(len(rows))
+        add(suite, method.figures["suite"][suite], True)
+        rules.add(len(rows))
     for kind in ("group", "difficulty"):
         for name, figure in method.figures.get(kind, {}).items():
             add(name, figure)
@@ -119,7 +117,7 @@ def runs_table(results: Results) -> Table:
                     method.label,
                     str(run.key.checkpoint),
                     str(run.key.model_seed),
-                    f"{len(run.records)} of {run.expected}",
+                    f"{len(run.averaged)} of {run.expected}",
                 ]
                 + [str(outcomes[name]) for name in ("success", "fail", "timeout", "error")]
                 + [rate]
@@ -154,7 +152,7 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
         runs.sort(key=lambda run: (order.get(run.key.model_seed, len(order)), run.key.model_seed))
         columns = ["Task", *(f"Seed {run.key.model_seed}" for run in runs), "Average"]
         values: list[list[float | str]] = []
-        for task in results.protocol.tasks:
+        for task in results.protocol.averaged:
             row: list[float | str] = []
             for run in runs:
                 outcomes = run.successes(task)
@@ -167,7 +165,7 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
             values.append(row)
         whole = [[row[i] for row in values] for i in range(len(runs))]
         values.append([_mean(column) for column in whole])
-        names = [*results.protocol.tasks, "**Average**"]
+        names = [*results.protocol.averaged, "**Average**"]
         rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(names, values, strict=True)]
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))
     return tables

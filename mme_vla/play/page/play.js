@@ -198,7 +198,7 @@ function showOutcome() {
   } else {
     $("outcome-title").textContent = "All episodes are played. Thank you!";
     $("outcome-text").textContent = (state.summary ?? [])
-      .map((row) => `${row.task}: ${row.successes} of ${row.episodes} solved (people in the paper: ${row.human} %)`).join("; ");
+      .map((row) => `${row.task}: ${row.successes} of ${row.episodes} solved${row.human === null ? "" : ` (people in the paper: ${row.human} %)`}`).join("; ");
   }
   $("next").hidden = phase === "finished";
   const key = `${state.session} ${phase}`;
