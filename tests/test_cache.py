@@ -47,15 +47,11 @@ def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> 
 
 @pytest.mark.parametrize("keep_every", [1, 4])
 @pytest.mark.parametrize("scored", [False, True])
-@pytest.mark.parametrize(
-    ("dtype", "batch_size", "tolerance"),
-    [("float32", 1, 0), ("bfloat16", 1, 0), ("float32", 3, 1e-6)],  # other batches may add in another order
-)
-def test_cached_and_online_histories_are_the_same(
-    source, tmp_path, keep_every, scored, dtype, batch_size, tolerance
-) -> None:
+# In batches of other sizes MKL may add in another order.
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("bfloat16", 0)])
+def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype, tolerance) -> None:
     memory = LastFrames(keep_every=keep_every, scored=scored)
-    cache = ensure(source, memory, tmp_path, dtype=dtype, batch_size=batch_size)
+    cache = ensure(source, memory, tmp_path, dtype=dtype)
     assert cache.width == WIDTH
     for episode in range(3):
         history = cache.history(episode)
