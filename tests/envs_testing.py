@@ -5,6 +5,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+from sapien.physx import PhysxArticulationLinkComponent, PhysxCollisionShapeBox
 
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.subtasks import SubTask
@@ -41,3 +42,45 @@ def setup(folder: Path, task: str, episode: int, key: str) -> object:
     """One entry of an official episode's setup, e.g. `task_goal`."""
     with h5py.File(folder / f"record_dataset_{task}.h5") as file:
         return file[f"episode_{episode}/setup/{key}"][()]
+
+
+def arm_presses_on_box(env: Task) -> bool:
+    """Return whether a box of the arm, such as a finger, exerts force on a box of another body."""
+    return any(
+        any(isinstance(body, PhysxArticulationLinkComponent) for body in contact.bodies)
+        and all(isinstance(shape, PhysxCollisionShapeBox) for shape in contact.shapes)
+        and any(point.impulse.any() for point in contact.points)
+        for contact in env.scene.get_contacts()
+    )
+
+
+def replay(env: Task, folder: Path, episode: int) -> np.ndarray:
+    """Replay an official episode and compare it with its recording.
+
+    PhysX computes contacts between two boxes with the instruction `rcpps`, whose result differs between makers of CPUs.
+    Until the first such contact of the arm, joints must equal the recorded ones to the last bit. In the whole episode
+    the order of sub-tasks and the success must be the recorded ones.
+
+    Returns:
+        The largest difference of a joint position at each step [steps]: radians, for the fingers metres.
+    """
+    keys = ("action/joint_action", "obs/joint_state", "obs/gripper_state", "info/simple_subgoal_online")
+    actions, arm, fingers, texts = (recorded(folder, type(env).__name__, episode, key) for key in keys)
+    joints, subtasks, contacts, success = [], [], [], False
+
+    def note_contact() -> None:
+        if arm_presses_on_box(env):
+            contacts.append(len(joints))
+
+    env._after_simulation_step = note_contact
+    for action in actions.astype(np.float32):
+        *_, info = env.step(action)
+        joints.append(env.qpos)
+        subtasks.append(env.progress.shown.text)
+        success = bool(info["success"])
+    del env._after_simulation_step
+    error = np.abs(np.array(joints) - np.hstack([arm, fingers])).max(1)
+    assert contacts and error[: contacts[0]].max() == 0
+    assert list(dict.fromkeys(subtasks)) == list(dict.fromkeys(text.decode() for text in texts))
+    assert success == recorded(folder, type(env).__name__, episode, "info/is_completed")[-1]
+    return error

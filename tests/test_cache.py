@@ -47,8 +47,9 @@ def ensure(source: EpisodeSource, memory: LastFrames, root: Path, **options) -> 
 
 @pytest.mark.parametrize("keep_every", [1, 4])
 @pytest.mark.parametrize("scored", [False, True])
-@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
-def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype) -> None:
+# In batches of other sizes MKL may add in another order.
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-6), ("bfloat16", 0)])
+def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, scored, dtype, tolerance) -> None:
     memory = LastFrames(keep_every=keep_every, scored=scored)
     cache = ensure(source, memory, tmp_path, dtype=dtype)
     assert cache.width == WIDTH
@@ -62,7 +63,7 @@ def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, 
             online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
             cached, streamed = memory.recall(history, t), memory.recall(online, t)
             for one, other in zip(cached.tensors(), streamed.tensors(), strict=True):
-                assert one.dtype == other.dtype and torch.equal(one, other)
+                torch.testing.assert_close(one, other, rtol=0, atol=tolerance)
         assert (len(history), history.exec_start) == (len(online), online.exec_start)
 
 

@@ -146,11 +146,12 @@ def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
 
 
 def test_the_same_words_give_the_same_configuration_and_one_of_ones_own_each_time() -> None:
-    one, other = (compose("train", ["model=framesamp_modul", "train.steps=3"]) for _ in range(2))
+    words = ["model=framesamp_modul", "train.steps=3", "output=runs/one"]  # the default folder's name holds the time
+    one, other = (compose("train", words) for _ in range(2))
     assert one == other
     one.train.steps = 7
     one.memory.budget = 64
-    again = compose("train", ["model=framesamp_modul", "train.steps=3"])
+    again = compose("train", words)
     assert again == other and again.train.steps == 3
 
 

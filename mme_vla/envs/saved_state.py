@@ -2,8 +2,8 @@
 
 A simulator's positions and velocities are not all of its state: contacts, the solver's last solution and the script's
 own memory belong to it, and a state without them goes on otherwise. But the same scene and actions always give the
-same episode, to the last bit. So a state is its scene and its actions; restoring it plays them again without pictures,
-at some two milliseconds a control step.
+same episode, to the last bit on CPUs of one maker. So a state is its scene and its actions; restoring it plays them
+again without pictures, at some two milliseconds a control step.
 """
 
 from collections.abc import Sequence
