@@ -15,9 +15,8 @@ import numpy as np
 
 from mme_vla.envs import make_env
 from mme_vla.envs.make import make_task
-from mme_vla.envs.metadata import episode
+from mme_vla.envs.metadata import TASK_NAMES, episode
 from mme_vla.envs.recording.recorder import RecordedStep, Recorder
-from mme_vla.envs.task_names import TASK_NAMES
 
 SPACES = {"joint_angle": "joint_action", "ee_pose": "eef_action", "waypoint": "waypoint_action", "multi_choice": ""}
 

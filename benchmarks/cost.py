@@ -19,7 +19,7 @@ from mme_vla.config.composition import compose
 from mme_vla.evaluation.analyses.cost import count_model
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS, NEURAL, random_batch
-from mme_vla.training.console import resident_gib
+from mme_vla.training.logging import resident_gib
 from mme_vla.types import Batch
 
 TERA = 1e12

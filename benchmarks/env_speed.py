@@ -18,8 +18,8 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
 
 from mme_vla.envs import make_env, make_vec_env
-from mme_vla.envs.rendering_check import render_backend
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES
+from mme_vla.envs.rendering import render_backend
 
 HOLD = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)
 

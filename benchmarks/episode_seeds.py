@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.envs.make import make_task
-from mme_vla.envs.metadata import SPLITS, EpisodeSpec, episode, formula
+from mme_vla.envs.metadata import SPLITS, TASK_NAMES, EpisodeSpec, episode, formula
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.task_names import TASK_NAMES
 
 MOST_TRIES = 20
 

@@ -30,9 +30,8 @@ from timing import machine
 from torch import Tensor, distributed
 from torch.nn import functional
 
-from mme_vla.backbone.layers.attention import attend, look
-from mme_vla.backbone.layers.blocks import Span
-from mme_vla.backbone.layers.sight import Sight
+from mme_vla.backbone.attention import attend, look
+from mme_vla.backbone.blocks import Sight, Span
 from mme_vla.integration.base import MEMORY_VISIBILITY
 
 GOAL_MFU, GOAL_CHUNK_MS = 0.5, 15.0

@@ -26,8 +26,7 @@ from mme_vla import MMEPolicy, build_policy
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.training import parallel
 from mme_vla.training.checkpoint import trainable
-from mme_vla.training.ema import EMA
-from mme_vla.training.optim import clip_gradients, make_optimizer
+from mme_vla.training.optim import EMA, clip_gradients, make_optimizer
 from mme_vla.training.settings import TrainSettings
 from mme_vla.types import Batch
 

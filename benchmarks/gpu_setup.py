@@ -11,8 +11,7 @@ from torch import Tensor, distributed
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla import MMEPolicy, build_policy
-from mme_vla.evaluation.analyses.cost import flops
-from mme_vla.evaluation.analyses.meta_shapes import RememberedShapes
+from mme_vla.evaluation.analyses.cost import RememberedShapes, flops
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.types import Batch
 

@@ -50,7 +50,7 @@ def results(folder: Path) -> dict[str, str]:
 
 
 def _train(inputs: Path, folder: Path) -> None:
-    from mme_vla.commands.train import main
+    from mme_vla.cli.train import main
     from mme_vla.config.composition import compose
 
     words = [*SMALL, *RECIPE, f"data.cache.root={inputs}", f"output={folder / 'run'}", "resume=auto"]
@@ -58,7 +58,7 @@ def _train(inputs: Path, folder: Path) -> None:
 
 
 def _cache(inputs: Path, folder: Path) -> None:
-    from mme_vla.commands.cache import main as run
+    from mme_vla.cli.cache import main as run
     from mme_vla.config.composition import compose
 
     run(compose("cache", [*SMALL, f"data.cache.root={folder}", "device=cpu"]))
@@ -72,7 +72,7 @@ def _write_demonstrations(folder: Path) -> None:
 
 
 def _convert(inputs: Path, folder: Path) -> None:
-    from mme_vla.commands.convert import main as run
+    from mme_vla.cli.convert import main as run
     from mme_vla.config.composition import compose
 
     run(compose("convert", [f"input={inputs}", f"output={folder / 'dataset'}"]))
@@ -124,7 +124,7 @@ class _Recorder:
 
 
 def _record(inputs: Path, folder: Path) -> None:
-    import mme_vla.commands.record as module
+    import mme_vla.cli.record as module
     import mme_vla.envs.recording.recorder as recorder
     from mme_vla.config.composition import compose
 

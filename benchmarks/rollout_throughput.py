@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 from timing import machine
 
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.envs.vector.pool import VecEnv
+from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts

@@ -14,9 +14,9 @@ from pathlib import Path
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import DIALS
 from mme_vla.envs.recording.recorder import Recorder
 from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.variants import DIALS
 from mme_vla.play import OraclePlayer
 from mme_vla.play.game import MAX_CHOICES, EpisodeId
 from mme_vla.play.players import play

@@ -25,8 +25,7 @@ from mme_vla.subgoal import Gemini, Memer, QwenVL
 from mme_vla.subgoal.finetuning.collecting import Demonstration, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes
 from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
-from mme_vla.subgoal.words.parsing import mark_points, write_boxes
-from mme_vla.subgoal.words.prompts import memer_answer
+from mme_vla.subgoal.text import mark_points, memer_answer, write_boxes
 
 TERA = 1e12
 RUN = 16  # actions executed of a chunk

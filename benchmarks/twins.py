@@ -9,8 +9,8 @@ import numpy as np
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.task_names import TASK_NAMES
 
 
 def demonstrate(task: str, episode: int, in_view: bool) -> tuple[bool, np.ndarray]:

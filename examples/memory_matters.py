@@ -36,7 +36,7 @@ from mme_vla.config.composition import compose, print_user_errors
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.past_views import past_views, stack_past
+from mme_vla.processing.images import past_views, stack_past
 from mme_vla.testing.small import ALL_BEYOND, NEURAL, cached_history
 from mme_vla.types import Batch, PastViews
 

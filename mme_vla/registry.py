@@ -92,29 +92,45 @@ class Registry[T]:
         return iter(sorted({*self._entries, *self._shipped}))
 
 
-MEMORIES: Registry[Any] = Registry("memory")
-INTEGRATIONS: Registry[Any] = Registry("integration")
+MEMORIES: Registry[Any] = Registry(
+    "memory",
+    {
+        **{name: f"mme_vla.memory.{name}" for name in ("framesamp", "tokendrop", "ttt", "rmt", "joined")},
+        **{
+            name: f"mme_vla.memory.extensions.{name}"
+            for name in ("actions", "bank", "gist", "learned_topk", "moment", "retrieval", "spacetime")
+        },
+    },
+)
+INTEGRATIONS: Registry[Any] = Registry(
+    "integration", {name: f"mme_vla.integration.{name}" for name in ("context", "modulator", "expert", "film")}
+)
 BACKBONES: Registry[Any] = Registry(
-    "backbone", {name: f"mme_vla.backbone.{name}.backbone" for name in ("pi05", "openvla", "nano")}
+    "backbone",
+    {
+        "pi05": "mme_vla.backbone.pi05",
+        "nano": "mme_vla.backbone.nano",
+        "openvla": "mme_vla.methods.openvla_oft.model",
+    },
 )
 POLICIES: Registry[Any] = Registry(
     "policy",
     {
         "mme": "mme_vla.policy.mme",
-        "diffusion_policy": "mme_vla.policy.diffusion.policy",
-        "sam2act_plus": "mme_vla.policy.sam2act.waypoint_policy",
-        "openvla": "mme_vla.policy.openvla",
-        "memoryvla": "mme_vla.policy.memoryvla.policy",
+        "diffusion_policy": "mme_vla.methods.diffusion_policy.policy",
+        "sam2act_plus": "mme_vla.methods.sam2act.policy",
+        "openvla": "mme_vla.methods.openvla_oft.policy",
+        "memoryvla": "mme_vla.methods.memoryvla.policy",
     },
 )
 PROCESSORS: Registry[Any] = Registry(
     "processor",
     {
         "pi05": "mme_vla.processing.processor",
-        "diffusion_policy": "mme_vla.policy.diffusion.processing",
-        "sam2act_plus": "mme_vla.policy.sam2act.cloud_processing",
-        "openvla": "mme_vla.processing.openvla",
-        "memoryvla": "mme_vla.policy.memoryvla.processing",
+        "diffusion_policy": "mme_vla.methods.diffusion_policy.processor",
+        "sam2act_plus": "mme_vla.methods.sam2act.processor",
+        "openvla": "mme_vla.methods.openvla_oft.processor",
+        "memoryvla": "mme_vla.methods.memoryvla.processor",
     },
 )
 SUBGOALS: Registry[Any] = Registry("subgoal predictor")

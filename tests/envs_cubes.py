@@ -7,8 +7,8 @@ import pytest
 import sapien
 from envs_unmask import wait
 
-from mme_vla.envs.recording.demonstration import demonstrate
-from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.recording.recorder import demonstrate
+from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Button, Cube, Disc, H
 from mme_vla.envs.scene.placement import TRIALS, Region

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.backbone.config import BackboneConfig
 
 
 def reduce_sizes(monkeypatch: pytest.MonkeyPatch, sizes: BackboneConfig) -> Any:

@@ -13,21 +13,21 @@ import torch
 from plugin_packages import plugin
 from torch import distributed
 
-from mme_vla.data.cache import ensure
-from mme_vla.data.layout import SAMPLE
+from mme_vla.data import cache_building
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.testing.small import SMALL_VISION, small_policy
 
 
 def main(folder: Path) -> None:
     distributed.init_process_group("gloo")
-    build, built = ensure.build_cache, 0
+    build, built = cache_building.build_cache, 0
 
     def counting(*args: Any, **options: Any) -> Any:
         nonlocal built
         built += 1
         return build(*args, **options)
 
-    ensure.build_cache = counting  # type: ignore[assignment]
+    cache_building.build_cache = counting  # type: ignore[assignment]
     policy = small_policy("tokendrop_modul", backbone={"vision": SMALL_VISION})
     config = SimpleNamespace(
         model="tokendrop_modul", exec_starts=None, cache_root=str(folder / "caches"), cache_local=False,

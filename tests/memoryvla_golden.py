@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.memoryvla.dit import DitConfig
-from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig, TowerConfig
-from mme_vla.memory.bank import MemoryBank
-from mme_vla.policy.memoryvla.core import MemoryVlaConfig, MemoryVlaCore
-from mme_vla.weights.name_tables import read
-from mme_vla.weights.names.memoryvla import memoryvla_piece, memoryvla_table
+from mme_vla.memory.extensions.bank import MemoryBank
+from mme_vla.methods.memoryvla.action_head import DitConfig
+from mme_vla.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
+from mme_vla.methods.memoryvla.weights import memoryvla_piece, memoryvla_table
+from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
+from mme_vla.weights.tables import read
 
 OPTIONS = {"consolidate_type": "consolidation", "fusion_type": "fusion", "update_fused": "store_fused"}
 RENAMED = OPTIONS | {"use_timestep_pe": "time_code", "retrieval_layers": "retrieval_layers"}

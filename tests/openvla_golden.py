@@ -9,11 +9,11 @@ import torch
 from baselines import rule_weight
 from torch import Tensor
 
-from mme_vla.backbone.openvla.backbone import OpenVlaBackbone
+from mme_vla.methods.openvla_oft.model import OpenVlaBackbone
+from mme_vla.methods.openvla_oft.weights import VLA, openvla_name
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.types import Batch, HistoryTokens
-from mme_vla.weights.names.openvla import VLA, openvla_name
 
 WRAPPER = "base_model.model."  # peft's, before every name of the model it wraps
 END = 2

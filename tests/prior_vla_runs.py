@@ -7,7 +7,7 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from mme_vla.commands.train import train
+from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
 from mme_vla.training.logging import read_metrics
 

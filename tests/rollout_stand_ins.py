@@ -11,7 +11,7 @@ from typing import Any
 
 from rollout_scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 
-from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
 from mme_vla.evaluation.rollout.evaluation import Evaluation, evaluate

@@ -26,8 +26,7 @@ from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.run_folders import resolve_checkpoint
 from mme_vla.testing.small import open_gates
 from mme_vla.training.checkpoint import trainable
-from mme_vla.training.console import ProgressLine
-from mme_vla.training.logging import Loggers, open_loggers
+from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.optim import clip_gradients, make_optimizer
 from mme_vla.training.parallel import ParallelSettings, gathered, is_sharded, shard, whole_number

@@ -18,10 +18,10 @@ FOLDER = "MME_VLA_TESTS_COMPOSED"
 @functools.cache
 def share() -> None:
     """Let what this process, and its forks, compose be found by the others."""
-    from mme_vla.config import composition, mistakes, naming
+    from mme_vla.config import composition, errors, naming
 
     composition._composed_once = _shared(composition._composed_once.__wrapped__)  # type: ignore[assignment]
-    mistakes._remembered = _shared(mistakes._remembered.__wrapped__)  # type: ignore[assignment]
+    errors._remembered = _shared(errors._remembered.__wrapped__)  # type: ignore[assignment]
     naming._cached_sections = _shared(naming._cached_sections.__wrapped__)  # type: ignore[assignment]
 
 

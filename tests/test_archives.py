@@ -8,12 +8,12 @@ import huggingface_hub
 import pytest
 import torch
 
-from mme_vla.commands.weights import convert
+from mme_vla.cli.weights import convert
 from mme_vla.errors import UserError
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy, unit_stats
-from mme_vla.training.start import start_from
+from mme_vla.training.runs import start_from
 from mme_vla.weights import load_weights
 from mme_vla.weights.source import open_source
 

@@ -6,9 +6,8 @@ from test_sight import TABLES, blocks_of, validity
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.layers.attention import attend, look, part_of
-from mme_vla.backbone.layers.blocks import Visibility
-from mme_vla.backbone.layers.sight import Sight
+from mme_vla.backbone.attention import attend, look, part_of
+from mme_vla.backbone.blocks import Sight, Visibility
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 
 OTHERS = ["flex", "varlen"]

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
-from mme_vla.memory.bank import CONSOLIDATIONS, MemoryBank
+from mme_vla.memory.extensions.bank import CONSOLIDATIONS, MemoryBank
 from mme_vla.testing.check_memory import check_memory
 from mme_vla.testing.small import random_batch, small_policy
 

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from mme_vla.policy import batching
-from mme_vla.policy.batching import Act, Read, Turns
+from mme_vla.policy import scheduler
+from mme_vla.policy.scheduler import Act, Read, Turns
 
 
 @dataclass(eq=False)
@@ -29,7 +29,7 @@ def steps(turns: Turns) -> list[str]:
 
 def test_short_frames_come_first_then_one_batch_then_a_piece_of_a_long_video(monkeypatch):
     now = iter(range(1000))
-    monkeypatch.setattr(batching.time, "perf_counter", lambda: 0.0 if next(now) % 3 < 2 else 1.0)
+    monkeypatch.setattr(scheduler.time, "perf_counter", lambda: 0.0 if next(now) % 3 < 2 else 1.0)
     turns: Turns = Turns(max_batch=2)
     turns.reading.extend([Frames("v", 3), Frames("a", 1), Frames("w", 3), Frames("b", 1), Frames("c", 1)])
     assert steps(turns) == ["read a", "read b", "read c", "act ab", "read v"]
@@ -42,7 +42,7 @@ def test_short_frames_come_first_then_one_batch_then_a_piece_of_a_long_video(mon
 
 def test_long_videos_get_as_much_time_as_the_rest_of_the_turn(monkeypatch):
     clock = [0.0]
-    monkeypatch.setattr(batching.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(scheduler.time, "perf_counter", lambda: clock[0])
     turns: Turns = Turns(max_batch=8)
     turns.acting.append("a")
     turns.reading.append(Frames("v", 100))

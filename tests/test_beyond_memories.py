@@ -11,12 +11,12 @@ import torch
 from mme_vla import UserError
 from mme_vla.data.sources import open_sources
 from mme_vla.memory.base import stack_history
-from mme_vla.memory.gist import Gist
+from mme_vla.memory.extensions.actions import LSTMLayer
+from mme_vla.memory.extensions.gist import Gist
+from mme_vla.memory.extensions.learned_topk import LearnedTopK
+from mme_vla.memory.extensions.moment import Moment
+from mme_vla.memory.extensions.retrieval import Retrieval, chunks_of
 from mme_vla.memory.history import CachedHistory
-from mme_vla.memory.learned_topk import LearnedTopK
-from mme_vla.memory.moment import Moment
-from mme_vla.memory.own_actions import LSTMLayer
-from mme_vla.memory.retrieval import Retrieval, chunks_of
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import (

@@ -10,11 +10,9 @@ import torch
 from fakes import WIDTH, LastFrames, encode
 from h5_files import write_file
 
-from mme_vla.data.cache import building as cache_build
-from mme_vla.data.cache import store
-from mme_vla.data.cache.building import build_cache, clear_cache, estimate
-from mme_vla.data.cache.ensure import ensure_cache
-from mme_vla.data.cache.store import (
+from mme_vla.data import cache as store
+from mme_vla.data import cache_building as cache_build
+from mme_vla.data.cache import (
     FINGERPRINT,
     CacheMissingError,
     VisionCache,
@@ -23,13 +21,14 @@ from mme_vla.data.cache.store import (
     score_file,
     token_file,
 )
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.cache_building import build_cache, clear_cache, ensure_cache, estimate
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
 
-COMMAND = "python -m mme_vla.data.cache model=mine data=here"
+COMMAND = "mme-vla cache model=mine data=here"
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +97,7 @@ def test_drafts_of_a_killed_build_are_removed_by_the_next(source, tmp_path) -> N
     memory = LastFrames(scored=True)
     build = tmp_path / "build.py"
     build.write_text(
-        "import os, sys; from pathlib import Path; import numpy as np; from mme_vla.data.cache.building import _draft;"
+        "import os, sys; from pathlib import Path; import numpy as np; from mme_vla.data.cache_building import _draft;"
         "_draft(Path(sys.argv[1]), np.save, np.zeros(3)); os.kill(os.getpid(), 9)"
     )
     folder = cache_folder(tmp_path, source, expected := fingerprint(source, memory.storage, "abc", "float32"))

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.pi05 import flow
-from mme_vla.commands.loading import prepare_sampling
-from mme_vla.policy import graphs
-from mme_vla.policy.graphs import CapturedSampling, GraphSampler
+from mme_vla.backbone import flow
+from mme_vla.cli.loading import prepare_sampling
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.speed import graphs
+from mme_vla.speed.graphs import CapturedSampling, GraphSampler
 from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.types import Batch
 

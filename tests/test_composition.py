@@ -9,7 +9,7 @@ from hydra._internal.sources_registry import SourcesRegistry
 
 from mme_vla import UserError
 from mme_vla.config.composition import cli, compose
-from mme_vla.config.repository import remembered_files
+from mme_vla.config.hydra_engine import remembered_files
 
 MEMORY = ["model=framesamp_modul", "memory.budget=5"]
 

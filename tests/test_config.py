@@ -13,8 +13,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins, options_first
-from mme_vla.config.naming import found_name
-from mme_vla.config.words import join_memories
+from mme_vla.config.naming import found_name, join_memories
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [

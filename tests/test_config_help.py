@@ -9,9 +9,8 @@ import forked
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla.config.comments import COMMANDS, choices, defaults, keys
 from mme_vla.config.composition import compose, config_dir, help_text
-from mme_vla.config.help import near_keys
+from mme_vla.config.help import COMMANDS, choices, defaults, keys, near_keys
 from mme_vla.errors import UserError
 
 MODULES = {name: words.removeprefix("python -m ") for name, words in COMMANDS.items() if "python" in words}

@@ -11,12 +11,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.files import SUMS, check_sums, write_sums
 from mme_vla.policy.tensor_files import load_tensors, save_tensors
 from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
-from mme_vla.training.ema import EMA
+from mme_vla.training.optim import EMA
 from mme_vla.training.settings import KeepRule
+from mme_vla.utils import SUMS, check_sums, write_sums
 from mme_vla.weights import load_weights, start_from
 
 DEEP = "[" * 100_000

@@ -12,11 +12,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from benchmarks.fuzz_targets import data, texts
-from mme_vla.data.cache.store import VisionCache, sum_file, token_file
+from mme_vla.data.cache import VisionCache, sum_file, token_file
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.layout import SAMPLE
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.errors import UserError
-from mme_vla.files import write_sums
+from mme_vla.utils import write_sums
 
 FRAMES, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"
 
@@ -97,7 +97,7 @@ def test_what_stands_in_a_files_place_is_said_without_waiting_and_without_the_hu
 
 @pytest.mark.parametrize("template", ["../{video_key}.mp4", "{video_key.__class__}", "{chunk_index:99999999d}", 7])
 def test_a_template_of_videos_stays_in_the_dataset(copy: Path, template: object) -> None:
-    from mme_vla.data.table_files import video_file
+    from mme_vla.data.tables import video_file
 
     with pytest.raises(UserError, match=r"video_path|outside"):
         video_file(copy, template, "image", 0, 0)
@@ -138,7 +138,7 @@ def test_a_flipped_bit_in_cached_tokens_is_found_when_the_episode_is_first_read(
 
 
 def test_each_process_compares_an_episode_once(cache: Path, monkeypatch) -> None:
-    from mme_vla.files import checksums
+    from mme_vla.utils import checksums
 
     asked: list[Path] = []
     real = checksums.file_sum
@@ -165,7 +165,7 @@ def test_a_cache_without_sums_still_opens(cache: Path) -> None:
     ],
 )  # fmt: skip
 def test_rows_of_another_form_are_refused_by_line(tmp_path: Path, row: str) -> None:
-    from mme_vla.subgoal.finetuning.examples import read_rows
+    from mme_vla.subgoal.finetuning.rows import read_rows
 
     (tmp_path / "rows.jsonl").write_text(row + "\n")
     with pytest.raises(UserError, match=r"rows.jsonl, line 1"):

@@ -10,10 +10,10 @@ import torch
 from torch.distributed import checkpoint as dcp
 
 from mme_vla.errors import UserError
-from mme_vla.files import sum_line
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy
 from mme_vla.training.shards import RAW, SHARDS, read_weights, shard_files
+from mme_vla.utils import sum_line
 
 
 @pytest.fixture(scope="module")

@@ -9,12 +9,10 @@ import pytest
 from benchmarks.fuzz_targets import texts
 from mme_vla.envs import metadata
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import RECORDS, read_records
-from mme_vla.evaluation.run_file import read_run
-from mme_vla.files import sealed, unsealed
-from mme_vla.processing.limits import check_reach
-from mme_vla.processing.normalisers import QuantileStats
+from mme_vla.evaluation.store import RECORDS, read_records, read_run
+from mme_vla.processing.normalise import QuantileStats, check_reach
 from mme_vla.processing.prompt import checked_text
+from mme_vla.utils import sealed, unsealed
 
 
 def test_a_digit_that_changed_in_a_record_is_found(tmp_path: Path) -> None:

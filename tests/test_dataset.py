@@ -12,17 +12,17 @@ from h5_files import Recorded, write_file
 from torch.utils.data import DataLoader
 
 from mme_vla.config.composition import compose
-from mme_vla.data.cache.ensure import ensure_cache
-from mme_vla.data.cache.store import VisionCache
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.cache import VisionCache
+from mme_vla.data.cache_building import ensure_cache
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset, collate
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.data.splits import split_episodes
+from mme_vla.data.sources import split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.processing.processor import Processor
-from mme_vla.processing.subgoal_text import SubgoalText
+from mme_vla.processing.prompt import SubgoalText
 from mme_vla.processing.tokenizer import Tokenizer
 from mme_vla.testing.small import small_policy
 from mme_vla.training.data import prepare_data

@@ -18,13 +18,13 @@ from rollout_stand_ins import JOBS, InlineEnvs, roll
 from serving_fakes import Served, acted_directly, challenge, course
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, load_weights
-from mme_vla.commands.inspect import show_checkpoint
-from mme_vla.commands.train import train
-from mme_vla.commands.weights import convert
+from mme_vla.cli.inspect import show_checkpoint
+from mme_vla.cli.train import train
+from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
-from mme_vla.policy.diffusion.policy import DiffusionPolicy
+from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import moving_frames, unit_stats
 

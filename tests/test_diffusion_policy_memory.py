@@ -12,9 +12,9 @@ from omegaconf import OmegaConf
 pytest.importorskip("diffusers")
 
 from mme_vla import Policy, UserError, build_policy
-from mme_vla.commands.train import train
+from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
-from mme_vla.policy.diffusion.policy import DiffusionPolicy
+from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import moving_frames, unit_stats
 from mme_vla.types import HistoryTokens
 

@@ -13,19 +13,16 @@ from torch import Tensor
 
 pytest.importorskip("diffusers")
 
-from mme_vla.backbone.diffusion import ddpm
-from mme_vla.backbone.diffusion.keypoints import SpatialSoftmax, cell_centres
-from mme_vla.backbone.diffusion.unet import ConditionedUnit, StepSinusoid
 from mme_vla.embodiment.robomme import ROBOMME_JOINT
+from mme_vla.methods.diffusion_policy import model
+from mme_vla.methods.diffusion_policy.model import ConditionedUnit, SpatialSoftmax, StepSinusoid, cell_centres
+from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
+from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, text_features
+from mme_vla.methods.diffusion_policy.weights import diffusion_adapter
 from mme_vla.policy.build import build_policy
-from mme_vla.policy.diffusion.policy import DiffusionPolicy
-from mme_vla.policy.diffusion.processing import DiffusionBatch
-from mme_vla.policy.diffusion.text import text_features
-from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats, normalize, unnormalize
-from mme_vla.training.ema import EMA
-from mme_vla.training.optim import clip_gradients, make_optimizer, scheduled_rate
+from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.settings import TrainSettings
-from mme_vla.weights.diffusion_policy import diffusion_adapter
 
 SINGLE, SAMPLES, GRADIENTS = 2e-5, 1e-4, 1e-3
 
@@ -113,7 +110,7 @@ def test_the_condition_and_the_loss_of_every_golden_model(golden: Any) -> None:
             condition = policy.condition(batch, corner=corner)
         close(condition, arrays["out/global_cond_train"])
         draws = {"noise": arrays["in/noise"], "step": torch.tensor(about["timesteps"])}
-        noisy = ddpm.add_noise(policy._schedule(), batch.actions, draws["noise"], draws["step"])
+        noisy = model.add_noise(policy._schedule(), batch.actions, draws["noise"], draws["step"])
         close(noisy, arrays["out/noisy_action"])
         close(policy.backbone.unet(noisy, draws["step"], condition), arrays["out/predicted_noise"])
         loss, _ = policy(batch, draws, corner)
@@ -194,7 +191,7 @@ def test_the_released_size_to_the_number_and_what_it_computes(folder: Path) -> N
 
 def test_the_schedule_and_single_steps_of_it(folder: Path) -> None:
     arrays, _ = case(folder, "units")
-    schedule = ddpm.noise_schedule(len(arrays["schedule/betas"]))
+    schedule = model.noise_schedule(len(arrays["schedule/betas"]))
     for name in ("betas", "alphas_cumprod"):
         close(getattr(schedule, name), arrays[f"schedule/{name}"], 1e-6)
     schedule.set_timesteps(len(arrays["schedule/betas"]))
@@ -205,7 +202,7 @@ def test_the_schedule_and_single_steps_of_it(folder: Path) -> None:
     assert steps
     for step in steps:
         x, eps, z = (arrays[f"ddpm/{name}"] for name in ("x", "eps", "z"))
-        close(ddpm.denoise_once(schedule, eps, step, x, z), arrays[f"ddpm/prev_at_{step}"])
+        close(model.denoise_once(schedule, eps, step, x, z), arrays[f"ddpm/prev_at_{step}"])
         close(schedule.step(eps, step, x).pred_original_sample, arrays[f"ddpm/x0_at_{step}"])
 
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from mme_vla import MMEPolicy, UserError
 from mme_vla.backbone.base import Hook
-from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Block
-from mme_vla.backbone.pi05.sizes import ExpertConfig
+from mme_vla.backbone.blocks import PI05_VISIBILITY, Block
+from mme_vla.backbone.config import ExpertConfig
 from mme_vla.config.composition import compose
 from mme_vla.integration.base import Integration, required
 from mme_vla.memory.framesamp import FrameSamp
@@ -214,7 +214,7 @@ def test_loading_one_whole_says_which_tensors_have_no_released_names(released: t
 
 
 def test_the_memoryless_ports_start_an_own_integration_too(tmp_path: Path) -> None:
-    from mme_vla.commands.weights import convert
+    from mme_vla.cli.weights import convert
 
     small_policy("pi05", seed=5).save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")

@@ -13,10 +13,10 @@ from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import check_benchmark, embodiment_of
-from mme_vla.files import SUMS
 from mme_vla.processing.processor import Processor
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 from mme_vla.training import runs
+from mme_vla.utils import SUMS
 
 SHIPPED = sorted(path.stem for path in (config_dir() / "embodiment").glob("*.yaml"))
 TINY = {"vision": {**SMALL_VISION, "patch_size": 16}}

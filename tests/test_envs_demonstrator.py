@@ -12,10 +12,9 @@ import sapien
 from envs_testing import Scene, recorded
 from scipy.spatial.transform import Rotation
 
-from mme_vla.envs.recording.demonstration import demonstrate
-from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError
-from mme_vla.envs.robot.grasping import failing_offset, grasp_orientation
-from mme_vla.envs.robot.stick_skills import arc
+from mme_vla.envs.recording.recorder import demonstrate
+from mme_vla.envs.robot.gripper_skills import failing_offset, grasp_orientation
+from mme_vla.envs.robot.stick_skills import Demonstrator, PlanningError, arc
 from mme_vla.envs.scene.objects import (
     PEG_COLOUR,
     build_aperture_box,

@@ -6,8 +6,8 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from mme_vla.envs.make import make_task
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.subtasks import Progress, SubTask
-from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.errors import UserError
 
 STEPS, LOOK = 80, 4

@@ -8,8 +8,8 @@ import pytest
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla.envs import make_env
-from mme_vla.envs.drawing import Drawing
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 
 HOLD = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4, 1], np.float32)

@@ -15,7 +15,11 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 h5py = pytest.importorskip("h5py")
 
-from mme_vla.envs import make, make_env, rendering_check  # noqa: E402
+from mme_vla.envs import (  # noqa: E402
+    make,
+    make_env,
+    rendering,
+)
 from mme_vla.envs.grounding import Grounding, centroid, ground, project  # noqa: E402
 from mme_vla.envs.observations import AngleTrack, front_extrinsic  # noqa: E402
 from mme_vla.envs.robot.control import PlanningError  # noqa: E402
@@ -303,11 +307,11 @@ def test_missing_or_old_vulkan_says_what_to_install(
 
     fake = SimpleNamespace(render=SimpleNamespace(get_device_summary=describe), Device=device)
     monkeypatch.setitem(sys.modules, "sapien", fake)  # type: ignore[arg-type]
-    monkeypatch.setattr(rendering_check, "mesa_version", lambda: mesa)
-    rendering_check.render_backend.cache_clear()
+    monkeypatch.setattr(rendering, "mesa_version", lambda: mesa)
+    rendering.render_backend.cache_clear()
     with pytest.raises(UserError, match=f"{words}[\\s\\S]*install_vulkan.sh"):
-        rendering_check.render_backend()
-    rendering_check.render_backend.cache_clear()
+        rendering.render_backend()
+    rendering.render_backend.cache_clear()
 
 
 class _Builder:

@@ -9,8 +9,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
 from mme_vla.envs import make_env
-from mme_vla.envs.meshes import CELL, coarsen, read_stl, stl_bytes
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import CELL, coarsen, read_stl, render_backend, stl_bytes
 from mme_vla.envs.robot import robots
 from mme_vla.errors import UserError
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from mme_vla.envs import metadata
-from mme_vla.envs.metadata import EpisodeSpec, episode, episodes, formula
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec, episode, episodes, formula
 from mme_vla.errors import UserError
 
 

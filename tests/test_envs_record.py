@@ -10,16 +10,16 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
-from mme_vla.commands import gallery as show
-from mme_vla.commands import record
+from mme_vla.cli import gallery as show
+from mme_vla.cli import record
 from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.recorder import Recorder
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
-from mme_vla.files.media import GAP, MARGIN, TILE
+from mme_vla.utils.media import GAP, MARGIN, TILE
 
 SHORT = record.Job("PatternLock", 0, seed=0, difficulty="easy", recovery=None, retries=3)  # a single move
 ONE_OF_EACH_SUITE = {"StopCube": "easy", "VideoUnmask": "easy", "PickHighlight": "easy", "RouteStick": "easy"}

@@ -6,8 +6,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
 from mme_vla.envs import make_env, rendering
-from mme_vla.envs.rendering import renderer_works
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend, renderer_works
 from mme_vla.errors import UserError
 
 

@@ -9,7 +9,7 @@ pytest.importorskip("mani_skill", reason="the simulator is not installed: uv syn
 h5py = pytest.importorskip("h5py")
 
 from mme_vla.envs import make_env  # noqa: E402
-from mme_vla.envs.rendering_check import render_backend  # noqa: E402
+from mme_vla.envs.rendering import render_backend  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 
 

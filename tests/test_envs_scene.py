@@ -15,7 +15,7 @@ from envs_testing import Scene, recorded, replay, setup
 
 from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.robot.robots import description
 from mme_vla.envs.scene.objects import (
     build_aperture_box,

@@ -11,10 +11,9 @@ import sapien
 from envs_testing import Scene
 from PIL import Image
 
-from mme_vla.envs import shaders
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs import rendering as shaders
+from mme_vla.envs.rendering import PACK, render_backend, without_table
 from mme_vla.envs.scene import stage
-from mme_vla.envs.shaders import PACK, without_table
 from mme_vla.errors import UserError
 
 STOCK = Path(sapien.__file__).parent / "vulkan_shader" / PACK

@@ -10,7 +10,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from mme_vla.envs import make_env
 from mme_vla.envs.interface import RoboMMEEnv
-from mme_vla.envs.rewards import REWARDS
+from mme_vla.envs.scores import REWARDS
 from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError
 
@@ -74,7 +74,7 @@ def test_a_restored_episode_goes_on_to_the_last_bit(
 
 def test_the_newest_frame_is_drawn_and_the_drawing_stays_what_it_was() -> None:
     pytest.importorskip("sapien")
-    from mme_vla.envs.rendering_check import render_backend
+    from mme_vla.envs.rendering import render_backend
 
     try:
         render_backend()

@@ -10,11 +10,10 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from envs_unmask import make, wait
 
 from mme_vla.envs import metadata
-from mme_vla.envs.language import number, ordinal
 from mme_vla.envs.make import load_tasks, make_env
+from mme_vla.envs.metadata import DIALS, TASK_NAMES, read_variant
+from mme_vla.envs.subtasks import number, ordinal
 from mme_vla.envs.task import Task
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.envs.variants import DIALS, read_variant
 from mme_vla.errors import UserError
 from mme_vla.registry import TASKS
 

@@ -12,10 +12,10 @@ import pyarrow.parquet as pq
 import pytest
 from h5_files import write_file
 
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.data.layout import SAMPLE
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.sources import open_sources
 from mme_vla.errors import UserError
 

@@ -7,25 +7,24 @@ from pathlib import Path
 
 import pytest
 
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.claims import CLAIMS, Claims
 from mme_vla.evaluation.forecast import Durations, earlier_records
-from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.waiting import Waiting
+from mme_vla.evaluation.rollout.runner import Waiting
+from mme_vla.evaluation.store import CLAIMS, Claims, RecordLog
 
 JOBS = [Job("BinFill", "test", i) for i in range(4)]
 
 TAKE_TWO = """
 import os, signal, sys
 from pathlib import Path
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.evaluation.claims import Claims
-from mme_vla.evaluation.record_log import RecordLog
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.store import Claims
+from mme_vla.evaluation.store import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
 folder = Path(sys.argv[1])
 log = RecordLog(folder / "episodes-0of2.jsonl")

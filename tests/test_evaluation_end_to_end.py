@@ -15,9 +15,9 @@ from conftest import REPOSITORY
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import read_records
+from mme_vla.evaluation.store import read_records
 
 EPISODES = ["tasks=[PickXtimes,StopCube]", "episodes=2", "max_steps=18", "max_batch=1", "flow_steps=3"]
 ONE, TWO = "workers=1", "workers=2"  # each worker computes for seconds before its first picture

@@ -23,7 +23,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.evaluation.store import find_records, read_folders
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 FOLDER = REPOSITORY / "tests" / "extras"
@@ -60,42 +60,42 @@ NANO = (
 SUFFICE = [
     Case((), f"{TRAIN} output=run", "checkpoint"),
     Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
-    Case((), f"mme_vla.data.cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
-    Case((), "mme_vla.data.convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
-    Case((), "mme_vla.data.exec_starts input=record_dataset_Alpha.h5 output=starts.json", "2 episodes"),
-    Case((), f"mme_vla.weights.convert {STEP} lerobot --to lerobot", ""),
-    Case((), "mme_vla.subgoal.build input=sample output=rows sets=[simple]", "simple"),
+    Case((), f"mme_vla cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
+    Case((), "mme_vla convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
+    Case((), "mme_vla exec-starts input=record_dataset_Alpha.h5 output=starts.json", "2 episodes"),
+    Case((), f"mme_vla weights {STEP} lerobot --to lerobot", ""),
+    Case((), "mme_vla subgoal-build input=sample output=rows sets=[simple]", "simple"),
     Case((), "mme_vla.results --demo --brief", "Made-up records"),
     Case((), "mme_vla.analyse selection --output kept.mp4 --every 128", "wrote kept.mp4"),
-    Case((), "mme_vla.processing.train_tokenizer run", "tokenizer.model"),
-    Case((), "mme_vla.data.sample --help", "full"),
+    Case((), "mme_vla train-tokenizer run", "tokenizer.model"),
+    Case((), "mme_vla sample --help", "full"),
     Case((), f"mme_vla.probe model=framesamp_modul backbone=tiny {TINY} recordings=sample recorded=1 with=[shuffle] "
              "draws=2 moments=1 scan=false output=probed", "shuffle"),
     Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
-    Case(("harness",), "mme_vla.serving.vla_eval --help", "flow_steps"),
-    Case(("orbax",), f"mme_vla.weights.convert {STEP} jax --to released", ""),
+    Case(("harness",), "mme_vla harness --help", "flow_steps"),
+    Case(("orbax",), f"mme_vla weights {STEP} jax --to released", ""),
     Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
                          "train.open_loop_chunks=0 output=diffused", "checkpoint"),
     Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
-    Case(("vlm",), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
+    Case(("vlm",), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
                    "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
     Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
     Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
                    "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
     Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
-    Case(("sim",), "mme_vla.nano.vision_pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
+    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
                    "output=tower", "nano_vision.safetensors", draws=True),
-    Case(("sim",), "mme_vla.envs.record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
+    Case(("sim",), "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
          "recorded: 1 episodes", draws=True),
-    Case(("sim",), "mme_vla.envs.show task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
+    Case(("sim",), "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
     Case(("sim",), f"{PLAY} player=random", "records:"),
     Case(("sim", "play"), f"{PLAY}2 port=0", "open http", wait="ready at http"),
 ]  # fmt: skip
 
 NEED = [
     Case((), "mme_vla.evaluate model=pi05 backbone=tiny", "sim", 2),
-    Case((), "mme_vla.envs.record task=PickXtimes episodes=1 output=recorded2", "sim", 2),
-    Case((), "mme_vla.envs.show task=PickXtimes", "sim", 2),
+    Case((), "mme_vla record task=PickXtimes episodes=1 output=recorded2", "sim", 2),
+    Case((), "mme_vla gallery task=PickXtimes", "sim", 2),
     Case((), f"{PLAY} player=random", "sim", 2),
     Case(("play",), PLAY, "sim", 2),
     Case(("sim",), PLAY, "play", 2),
@@ -104,9 +104,9 @@ NEED = [
     Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
     Case((), f"{PLAY} player=openai", "openai", 2),
     Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
-    Case((), "mme_vla.serving.vla_eval --help", "harness", 2),
-    Case((), f"mme_vla.weights.convert {STEP} jax2 --to released", "orbax", 2),
-    Case((), "mme_vla.subgoal.train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
+    Case((), "mme_vla harness --help", "harness", 2),
+    Case((), f"mme_vla weights {STEP} jax2 --to released", "orbax", 2),
+    Case((), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
     Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
     Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
     Case((), "mme_vla.train model=diffusion_policy output=run4", "baselines", 2),
@@ -144,7 +144,7 @@ def ended(folder: Path) -> dict[Case, tuple[int, str]]:
 
 
 def can_draw() -> bool:
-    from mme_vla.envs.rendering_check import render_backend
+    from mme_vla.envs.rendering import render_backend
 
     try:
         render_backend()

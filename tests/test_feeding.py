@@ -9,17 +9,17 @@ import pytest
 import torch
 from test_training import RECIPE, policy
 
-from mme_vla.backbone.layers.recomputing import KEPT, checkpoint_options
 from mme_vla.config.composition import compose
 from mme_vla.data.ahead import ahead
-from mme_vla.data.cache.building import PAGE, save_aligned
+from mme_vla.data.cache_building import PAGE, save_aligned
 from mme_vla.errors import UserError
-from mme_vla.files import files_to_hold
 from mme_vla.memory.history import FrameScores
 from mme_vla.memory.tokendrop import FIRST_FRAME_SCORE, THRESHOLD, ranked_patches
 from mme_vla.policy.finetune import apply_finetuning, cast_frozen
-from mme_vla.training.reading_ahead import readers, size_of
+from mme_vla.speed.recompute import KEPT, checkpoint_options
+from mme_vla.training.order import readers, size_of
 from mme_vla.training.settings import TrainSettings
+from mme_vla.utils import files_to_hold
 
 
 def test_reading_ahead_is_bounded_in_bytes() -> None:

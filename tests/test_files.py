@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mme_vla.errors import UserError, brief, listed
-from mme_vla.files import (
+from mme_vla.utils import (
     SUMS,
     FolderLock,
     check_sums,
@@ -130,7 +130,7 @@ def test_the_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
 
 
 def test_a_folder_belongs_to_one_process_until_that_ends_however_it_ends(tmp_path: Path) -> None:
-    hold = "import sys; from pathlib import Path; from mme_vla.files import FolderLock\n"
+    hold = "import sys; from pathlib import Path; from mme_vla.utils import FolderLock\n"
     hold += "FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
     other = subprocess.Popen(
         [sys.executable, "-c", hold, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

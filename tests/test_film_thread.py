@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mme_vla.evaluation.rollout.film import BEHIND, EpisodeVideo
-from mme_vla.files.media import Film, film_bytes, film_frame
+from mme_vla.evaluation.rollout.video import BEHIND, EpisodeVideo
+from mme_vla.utils.media import Film, film_bytes, film_frame
 
 VIEWS = [[np.full((32, 48, 3), shade, np.uint8)] * 2 for shade in range(0, 240, 3)]
 

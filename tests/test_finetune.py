@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.commands.weights import convert
+from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose, config_dir
 from mme_vla.policy.finetune import apply_finetuning, merge_adapters
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy

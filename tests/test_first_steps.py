@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla import Memory, commands
-from mme_vla.commands import train as train_command
+from mme_vla import Memory, cli
+from mme_vla.cli import train as train_command
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
@@ -21,8 +21,8 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import Table, print_table
 from mme_vla.policy.run_folders import find_run, resolve_checkpoint
 from mme_vla.testing.small import small_policy
-from mme_vla.training.finish import worse_than_still
-from mme_vla.training.start import weights_to_start_from
+from mme_vla.training.loop import worse_than_still
+from mme_vla.training.runs import weights_to_start_from
 
 
 def test_latest_is_the_run_that_wrote_a_checkpoint_last(tmp_path: Path) -> None:
@@ -122,8 +122,8 @@ def test_a_terminal_gets_a_line_before_the_imports(
         before.append(standard_error.getvalue())
         return SimpleNamespace(main=lambda: None)
 
-    monkeypatch.setattr(commands, "import_module", slow_import)
-    commands.run("train")
+    monkeypatch.setattr(cli, "import_module", slow_import)
+    cli.run("train")
     assert before[0].startswith(said) and bool(before[0]) == bool(said)
 
 

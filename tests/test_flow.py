@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
-from mme_vla.backbone.pi05 import flow
+from mme_vla.backbone import flow
 from mme_vla.testing.small import random_batch, small_policy
 
 CPU = torch.device("cpu")

@@ -7,8 +7,8 @@ from functools import cache
 import pytest
 
 from mme_vla import Policy, build_policy
-from mme_vla.weights.name_tables import write
 from mme_vla.weights.released import released_derived, released_table, released_unread
+from mme_vla.weights.tables import write
 
 VARIANTS = {
     "pi05": "pi05_baseline",

@@ -4,15 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from mme_vla.commands.results import main
+from mme_vla.cli.results import main
 from mme_vla.envs import metadata
-from mme_vla.envs.metadata import FURTHER, FURTHER_EPISODES, MORE
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import FURTHER, FURTHER_EPISODES, MORE, TASK_NAMES
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.store import RecordLog
 
 
 def test_they_go_on_where_the_rule_of_the_test_split_ends() -> None:

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy
-from mme_vla.policy.diffusion.policy import DiffusionPolicy
+from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import random_batch, small_policy
-from mme_vla.training.window import Window
+from mme_vla.training.logging import Window
 from mme_vla.types import send
 
 

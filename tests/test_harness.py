@@ -18,7 +18,7 @@ from vla_eval.runners.base import ModelActError  # noqa: E402
 from vla_eval.runners.sync_runner import SyncEpisodeRunner  # noqa: E402
 from vla_eval.specs import IMAGE_RGB, LANGUAGE, RAW  # noqa: E402
 
-from mme_vla.commands.harness import main  # noqa: E402
+from mme_vla.cli.harness import main  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 from mme_vla.policy.mme import MMEPolicy  # noqa: E402
 from mme_vla.serving import harness  # noqa: E402
@@ -163,7 +163,7 @@ def test_a_robot_that_moves_by_waypoints_is_refused() -> None:
 
 
 def test_the_command_shows_the_harnesss_words() -> None:
-    done = forked.run("mme_vla.serving.vla_eval", "--help")
+    done = forked.run("mme_vla", "harness", "--help")
     assert done.returncode == 0, done.stderr
     assert "--args.checkpoint" in done.stdout and "--args.flow_steps" in done.stdout
 

@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.processing.pictures import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
+from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8, to_unit_range
 
 
 def cases(tensors: dict[str, Tensor], output: str) -> list[tuple[Tensor, Tensor]]:

@@ -8,7 +8,7 @@ from PIL import Image
 from rich.console import Console
 
 from mme_vla import UserError, build_policy
-from mme_vla.commands.inspect import (
+from mme_vla.cli.inspect import (
     build_memory,
     check_place,
     draw_memory,
@@ -19,8 +19,8 @@ from mme_vla.commands.inspect import (
 )
 from mme_vla.config.composition import compose
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.memory_picture import memory_sheet
-from mme_vla.files.media import MARGIN, TILE
+from mme_vla.data.memory_image import memory_sheet
+from mme_vla.utils.media import MARGIN, TILE
 
 
 @pytest.fixture

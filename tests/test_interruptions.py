@@ -10,14 +10,14 @@ from pathlib import Path
 import pytest
 from h5_files import write_file
 
-from mme_vla import commands
-from mme_vla.config.endings import print_user_errors
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla import cli
+from mme_vla.config.errors import print_user_errors
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.envs.recording.recorded import Job, Wanted
+from mme_vla.envs.recording.outputs import Job, Wanted
 from mme_vla.errors import UserError
-from mme_vla.files import PLAN, FolderLock, claim_plan, draft_of, drop_plan, remove_drafts, write_json
 from mme_vla.training.runs import MAY_DIFFER, SUMMARY, check_content, claim_run
+from mme_vla.utils import PLAN, FolderLock, claim_plan, draft_of, drop_plan, remove_drafts, write_json
 
 PNG = ConvertOptions(images="png")
 CONFIG = {"train": {"steps": 3}, "seed": 1}
@@ -27,7 +27,7 @@ CONFIG = {"train": {"steps": 3}, "seed": 1}
 def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str, code: int, words: str) -> None:
     script = f"""
         import signal
-        from mme_vla.config.endings import print_user_errors
+        from mme_vla.config.errors import print_user_errors
         signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the parent did with it
         with print_user_errors(), print_user_errors():
             signal.raise_signal(signal.{number})
@@ -42,9 +42,9 @@ def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sente
     def interrupted(name: str) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "import_module", interrupted)
+    monkeypatch.setattr(cli, "import_module", interrupted)
     with pytest.raises(SystemExit) as ended:
-        commands.run("train")
+        cli.run("train")
     assert ended.value.code == 130
     assert "Stopped by Ctrl-C" in capsys.readouterr().err
 

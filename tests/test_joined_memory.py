@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.commands import inspect
+from mme_vla.cli import inspect
 from mme_vla.config.composition import compose
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.joined import JoinedMemory, finer

@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from safetensors.torch import save_file
 
 from mme_vla import MMEPolicy, UserError, load_weights
-from mme_vla.commands.weights import convert
+from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose
 from mme_vla.testing.small import small_policy
 from mme_vla.weights import transfer

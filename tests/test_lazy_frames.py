@@ -5,8 +5,7 @@ import pytest
 import torch
 
 from mme_vla import UserError
-from mme_vla.memory.history import OnlineHistory, StorageSpec
-from mme_vla.memory.lazy import LazyHistory
+from mme_vla.memory.history import LazyHistory, OnlineHistory, StorageSpec
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import moving_frames, small_policy
 

@@ -10,7 +10,7 @@ import pytest
 from h5_files import write_file
 from lerobot_commands import EVAL, TRAIN, VIZ, LeRobot, lerobot
 
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 
 pytest.importorskip("mani_skill", reason="lerobot-eval runs the simulator: uv sync --inexact --extra sim")

@@ -11,7 +11,7 @@ import torch
 from lerobot_pi05 import reduce_sizes
 from safetensors.torch import save_file
 
-from mme_vla.commands.weights import convert
+from mme_vla.cli.weights import convert
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.tokenizer import PALIGEMMA, Tokenizer

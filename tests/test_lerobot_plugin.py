@@ -13,7 +13,7 @@ from h5_files import write_file
 from plugin_packages import plugin
 
 from mme_vla import Policy
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes

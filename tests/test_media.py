@@ -9,8 +9,8 @@ import pytest
 
 from mme_vla.embodiment import ROBOMME_JOINT, Camera
 from mme_vla.evaluation.rollout.environment import ChunkEnv
-from mme_vla.evaluation.rollout.film import EpisodeVideo
-from mme_vla.files.media import (
+from mme_vla.evaluation.rollout.video import EpisodeVideo
+from mme_vla.utils.media import (
     BORDER,
     CAPTION,
     RED,

@@ -5,12 +5,11 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.memoryvla.diffusion import Schedule
-from mme_vla.backbone.memoryvla.dit import Dit, DitConfig
-from mme_vla.backbone.openvla.prismatic import Prismatic
-from mme_vla.memory.bank import BankState, MemoryBank, groups_of, runs_of
-from mme_vla.policy.memoryvla.core import MemoryVlaConfig, MemoryVlaCore
-from mme_vla.weights.names.memoryvla import memoryvla_table
+from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of, runs_of
+from mme_vla.methods.memoryvla.action_head import Dit, DitConfig, Schedule
+from mme_vla.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
+from mme_vla.methods.memoryvla.weights import memoryvla_table
+from mme_vla.methods.prismatic import Prismatic
 
 
 def moments(count: int, tokens: int = 3, width: int = 8, seed: int = 0) -> tuple[Tensor, Tensor]:

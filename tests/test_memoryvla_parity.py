@@ -11,9 +11,9 @@ from golden import error
 from memoryvla_golden import about, arrays, bank, core, golden_name
 from torch import Tensor
 
-from mme_vla.backbone.memoryvla.diffusion import Schedule
-from mme_vla.memory.bank import BankState, MemoryBank, groups_of, runs_of
-from mme_vla.policy.memoryvla.core import MemoryVlaCore, cognition_token
+from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of, runs_of
+from mme_vla.methods.memoryvla.action_head import Schedule
+from mme_vla.methods.memoryvla.model import MemoryVlaCore, cognition_token
 
 TOLERANCE, LONG = 1e-4, 1e-3  # of the largest entry: single modules; gradients, ten steps of sampling, acting
 ROLES = ["cog", "per"]

@@ -10,11 +10,11 @@ import torch
 from prior_vla_runs import losses, run
 
 from mme_vla import UserError, build_policy
-from mme_vla.data.groups import GroupDataset
+from mme_vla.data.dataset import GroupDataset
 from mme_vla.data.sources import open_sources
+from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
+from mme_vla.methods.memoryvla.processor import GroupBatch
 from mme_vla.policy.base import Policy
-from mme_vla.policy.memoryvla.policy import MemoryVlaPolicy
-from mme_vla.policy.memoryvla.processing import GroupBatch
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import unit_stats
 

@@ -7,11 +7,10 @@ import torch
 from safetensors.torch import save_file
 
 from mme_vla import UserError, build_policy
+from mme_vla.methods.memoryvla.weights import memoryvla_adapter
+from mme_vla.methods.openvla_oft.weights import VLA, openvla_adapter
 from mme_vla.policy.base import Policy
 from mme_vla.weights.load import load_weights, transfer
-from mme_vla.weights.memoryvla import memoryvla_adapter
-from mme_vla.weights.names.openvla import VLA
-from mme_vla.weights.openvla import openvla_adapter
 from mme_vla.weights.source import detect_format
 from mme_vla.weights.writers import WRITERS, check_target
 

@@ -11,13 +11,13 @@ from conftest import REPOSITORY
 from safetensors.torch import load
 
 from mme_vla import UserError, build_policy
-from mme_vla.backbone.nano.tower import CLASSES, WEIGHTS
-from mme_vla.commands import nano as nano_command
-from mme_vla.commands.nano import check_counts, with_settings
+from mme_vla.backbone.nano_vision import CLASSES, WEIGHTS
+from mme_vla.cli import nano as nano_command
+from mme_vla.cli.nano import check_counts, with_settings
 from mme_vla.data.waypoints import Motions
-from mme_vla.evaluation.record_log import find_records, read_folders
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.intervals import wilson
+from mme_vla.evaluation.results.aggregate import wilson
+from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, SparseHistory, statistics

@@ -8,11 +8,11 @@ from test_nano import demonstration, nano
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 from mme_vla.nano.demonstrations import record
+from mme_vla.nano.evaluating import Replay, replay
 from mme_vla.nano.learning import Decisions, statistics
-from mme_vla.nano.planner import Replay, replay
 
 SCENE = {"seed": 3_000_001, "difficulty": "easy"}
 

@@ -6,9 +6,9 @@ from conftest import REPOSITORY
 from mme_vla import build_policy
 from mme_vla.config.composition import compose
 from mme_vla.envs.episodes import choose_episodes
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.nano.demonstrations import record
 
 ROBOT = build_policy("pi05", backbone="tiny", embodiment="robomme_choice_front").embodiment

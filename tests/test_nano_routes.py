@@ -14,7 +14,7 @@ from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.recording.frames import DECISIONS as AT_DECISIONS
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy

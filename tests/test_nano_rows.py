@@ -8,16 +8,16 @@ import torch
 from test_nano import demonstration
 
 from mme_vla import UserError, build_policy
-from mme_vla.commands.nano import demonstrate
+from mme_vla.cli.nano import demonstrate
 from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.files import write_json
 from mme_vla.nano import demonstrations
 from mme_vla.nano.demonstrations import Demonstration, Scene
 from mme_vla.nano.fitting import DONE
 from mme_vla.nano.learning import Decisions, off_by, statistics
 from mme_vla.nano.page import write_page
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.utils import write_json
 
 SMALL = {"framesamp": {"every": 8}, "tokendrop": {"stride": 8}, "ttt": {"stride": 16}, "rmt": {"stride": 16}}
 

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats, normalize, unnormalize
-from mme_vla.processing.padding import pad_width
+from mme_vla.processing.base import pad_width
+from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats, normalize, unnormalize
 
 
 def golden_stats(tensors: dict[str, Tensor]) -> NormStats:

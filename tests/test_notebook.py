@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 
 pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")

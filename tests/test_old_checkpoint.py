@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from rich.console import Console
 
 from mme_vla import MMEPolicy
-from mme_vla.commands.inspect import show_checkpoint
-from mme_vla.commands.train import main
+from mme_vla.cli.inspect import show_checkpoint
+from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
 
 FOLDER = REPOSITORY / "tests" / "data" / "before_the_rooms"

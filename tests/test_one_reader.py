@@ -16,4 +16,4 @@ def test_no_module_but_the_room_of_files_parses_json() -> None:
             imported = isinstance(node, ast.ImportFrom) and node.module == "json" and "load" in ast.unparse(node)
             if parses or imported:
                 wrong.append(f"{file.relative_to(PACKAGE)}:{node.lineno}")
-    assert wrong == [], "use mme_vla.files.read_json, read_json_lines, parse_json or plain"
+    assert wrong == [], "use mme_vla.utils.read_json, read_json_lines, parse_json or plain"

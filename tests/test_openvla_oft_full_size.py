@@ -9,11 +9,11 @@ import torch
 from baselines import baselines_folder
 from openvla_golden import WRAPPER
 
-from mme_vla.backbone.openvla.backbone import OpenVlaBackbone
+from mme_vla.methods.openvla_oft.model import OpenVlaBackbone
+from mme_vla.methods.openvla_oft.weights import HEAD, STATE, VLA, openvla_name
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.weights.names.openvla import HEAD, STATE, VLA, openvla_name
 
 OFT = {"rank": 32, "alpha": 16.0, "init": "gaussian"}
 

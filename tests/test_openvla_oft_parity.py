@@ -12,12 +12,12 @@ from golden import error
 from openvla_golden import batch, case, fused, golden_name, policy
 from torch import Tensor
 
-from mme_vla.backbone.layers.attention import additive_mask
-from mme_vla.backbone.openvla.backbone import OpenVlaBackbone, TokenSequence, absolute_error
-from mme_vla.backbone.openvla.prismatic import Prismatic
-from mme_vla.backbone.openvla.sizes import FusedVisionConfig, LlamaConfig, TowerConfig
-from mme_vla.processing.clipped_quantiles import ClippedQuantiles
-from mme_vla.weights.names.openvla import VLA, openvla_name
+from mme_vla.backbone.attention import additive_mask
+from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
+from mme_vla.methods.openvla_oft.model import OpenVlaBackbone, TokenSequence, absolute_error
+from mme_vla.methods.openvla_oft.processor import ClippedQuantiles
+from mme_vla.methods.openvla_oft.weights import VLA, openvla_name
+from mme_vla.methods.prismatic import Prismatic
 
 TOLERANCE = 3e-5  # of the largest entry
 GRADIENT = 1e-3

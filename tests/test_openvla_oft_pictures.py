@@ -13,10 +13,10 @@ from openvla_golden import case
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.openvla.vision import HALF, OPENVLA
-from mme_vla.processing import openvla_pictures as pictures
-from mme_vla.processing.clipped_quantiles import ClippedQuantiles
-from mme_vla.processing.pictures import to_unit_range
+from mme_vla.methods.openvla_oft import processor as pictures
+from mme_vla.methods.openvla_oft.processor import ClippedQuantiles
+from mme_vla.methods.prismatic import HALF, OPENVLA
+from mme_vla.processing.images import to_unit_range
 
 FLOAT, ONE_LEVEL = 1e-5, 1e-3  # of the largest entry; share of values that may be off by one level
 

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError, build_policy
+from mme_vla.methods.openvla_oft.policy import OpenVlaPolicy
+from mme_vla.methods.openvla_oft.processor import OpenVlaProcessor
 from mme_vla.policy.base import Policy
-from mme_vla.policy.openvla import OpenVlaPolicy
-from mme_vla.processing.openvla import OpenVlaProcessor
 from mme_vla.testing import check_backbone
 from mme_vla.testing.small import random_batch, unit_stats
 from mme_vla.types import Batch

@@ -12,10 +12,10 @@ from mme_vla.config.composition import compose
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.sources import open_sources
 from mme_vla.data.statistics import compute_norm_stats
+from mme_vla.methods.openvla_oft.policy import OpenVlaPolicy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.openvla import OpenVlaPolicy
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.testing.small import random_batch
 

@@ -8,11 +8,11 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from mme_vla import UserError, build_policy
+from mme_vla.methods.openvla_oft.weights import VLA, openvla_name
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import apply_finetuning, merge_adapters
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.load import load_weights, transfer
-from mme_vla.weights.names.openvla import VLA, openvla_name
 from mme_vla.weights.source import detect_format
 from mme_vla.weights.writers import WRITERS, check_target
 

@@ -10,8 +10,7 @@ from torch import nn
 
 from mme_vla.errors import UserError
 from mme_vla.testing.small import small_policy
-from mme_vla.training.ema import EMA
-from mme_vla.training.optim import clip_gradients, learning_rate, make_optimizer
+from mme_vla.training.optim import EMA, clip_gradients, learning_rate, make_optimizer
 from mme_vla.training.order import BatchOrder, generator_for, seed_of
 from mme_vla.training.settings import TrainSettings
 

@@ -11,7 +11,7 @@ import torch
 from conftest import REPOSITORY
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.evaluation.record_log import read_records
+from mme_vla.evaluation.store import read_records
 from mme_vla.testing import check_backbone
 from mme_vla.testing.small import random_batch
 

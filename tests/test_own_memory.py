@@ -14,8 +14,8 @@ from conftest import REPOSITORY
 
 from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
-from mme_vla.envs.rendering_check import render_backend
-from mme_vla.evaluation.record_log import find_records, read_folders
+from mme_vla.envs.rendering import render_backend
+from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.testing import check_memory
 from mme_vla.testing.small import open_gates, random_batch, unit_stats
 

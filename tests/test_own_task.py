@@ -7,10 +7,10 @@ import pytest
 from conftest import REPOSITORY
 
 from mme_vla import UserError, evaluate, make_env
-from mme_vla.commands import record
+from mme_vla.cli import record
 from mme_vla.config.composition import compose
 from mme_vla.config.plugins import import_plugins
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.rendering import render_backend
 from mme_vla.testing import check_task
 from mme_vla.testing.small import SMALL_VISION, small_policy
 

@@ -7,16 +7,16 @@ import pytest
 import torch
 from golden import error, load, params, vision_config
 
-from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.memory.encoder import position_features
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.tokendrop import TokenDrop, most_changed, ranked_patches
 from mme_vla.memory.ttt import TTT
-from mme_vla.processing.pictures import resize_with_pad
-from mme_vla.weights.name_tables import read
+from mme_vla.processing.images import resize_with_pad
 from mme_vla.weights.names.jax_backbone import _vision
+from mme_vla.weights.tables import read
 
 TOLERANCE = 1e-4
 

@@ -86,8 +86,8 @@ def test_gradients_equal_the_released_model(case):
         golden.batch(tensors), tensors["in/noise"], tensors["in/time"], golden.memory_tokens(policy, tensors)
     )
     loss.backward()
-    from mme_vla.weights.name_tables import write
     from mme_vla.weights.released import released_table, released_unread
+    from mme_vla.weights.tables import write
 
     gradients = {name: p.grad if p.grad is not None else torch.zeros_like(p) for name, p in policy.named_parameters()}
     released = write(released_table(policy), released_unread(policy), gradients)

@@ -7,11 +7,11 @@ import pytest
 import torch
 from golden import error, load, params
 
+from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.rmt import RMTLayer
-from mme_vla.memory.sampling import recurrent_frames
 from mme_vla.memory.ttt import TTTLayer
-from mme_vla.weights.name_tables import read
 from mme_vla.weights.names.jax_memory import layer_names, rotary_table
+from mme_vla.weights.tables import read
 
 TOLERANCE = 1e-4
 BF16_TOLERANCE = 2e-2

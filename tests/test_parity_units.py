@@ -7,19 +7,18 @@ import pytest
 import torch
 from golden import error, load, params, vision_config
 
-from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.blocks import Span, attention_mask, token_positions
-from mme_vla.backbone.layers.norms import AdaRMSNorm, RMSNorm, rms_normalise
-from mme_vla.backbone.layers.rope import rotate, rotation
-from mme_vla.backbone.pi05 import flow
-from mme_vla.backbone.pi05.gemma import JointBlock
-from mme_vla.backbone.pi05.siglip import VisionTower, pool_grid
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.backbone import flow
+from mme_vla.backbone.attention import additive_mask, attend
+from mme_vla.backbone.blocks import Span, attention_mask, token_positions
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.gemma import JointBlock
+from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, rms_normalise, rotate, rotation
+from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.integration.base import MEMORY_VISIBILITY
 from mme_vla.integration.modulator import ModulatorLayer
 from mme_vla.memory.base import token_positions as patch_positions
 from mme_vla.memory.encoder import FeatureEncoder, position_features
-from mme_vla.weights.name_tables import Piece, linear, prefixed, read
+from mme_vla.weights.tables import Piece, linear, prefixed, read
 
 TOLERANCE = 1e-4
 

@@ -9,8 +9,8 @@ from rollout_scripted_env import VIDEO, ScriptedEnv, make_scripted_env
 from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
 from mme_vla import UserError
-from mme_vla.envs.drawing import Drawing
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy

@@ -19,7 +19,7 @@ from browser import Browser
 from play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
 
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import read_records
+from mme_vla.evaluation.store import read_records
 from mme_vla.play import web
 from mme_vla.play.desk import Desk
 from mme_vla.play.run import Identity, PlayRun

@@ -9,13 +9,13 @@ import pytest
 from play_fakes import BLOCKS, MOTION, VIDEO, a_session
 
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import read_records
+from mme_vla.evaluation.store import read_records
 from mme_vla.play import GeminiPlayer, OraclePlayer, QwenPlayer, build_player
 from mme_vla.play.game import Option
 from mme_vla.play.players import play
-from mme_vla.play.questions import parse_choice
+from mme_vla.play.vlm_players import parse_choice
 from mme_vla.subgoal.models.qwen3vl import Answer
-from mme_vla.subgoal.words.parsing import MalformedAnswer
+from mme_vla.subgoal.text import MalformedAnswer
 
 OPTIONS = (Option("a", "press the block", True), Option("b", "wait", False))
 

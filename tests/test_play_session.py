@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from play_fakes import BLOCKS, MOTION, VIDEO, BlocksEnv, a_session, an_episode
 
-from mme_vla.commands.play import _by_itself, line, print_summary
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.cli.play import _by_itself, line, print_summary
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import read_records
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.store import read_records
 from mme_vla.play import ChoiceSession, RandomPlayer, Reveal
 from mme_vla.play.players import play
 from mme_vla.play.run import Identity, PlayRun, choose_episodes

@@ -12,15 +12,14 @@ import torch
 from conftest import REPOSITORY
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.commands import analyse, inspect
-from mme_vla.commands.weights import convert
+from mme_vla.cli import analyse, inspect
+from mme_vla.cli.weights import convert
 from mme_vla.config import plugins
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.plugins import TRUST_FLAG, TRUST_WORD, imported_plugins, trust_as_flag, trust_as_override
 from mme_vla.config.plugins import import_plugins as import_modules
 from mme_vla.envs import metadata
-from mme_vla.evaluation.rollout.evaluation import evaluate
-from mme_vla.evaluation.rollout.plan import choose_episodes
+from mme_vla.evaluation.rollout.evaluation import choose_episodes, evaluate
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
@@ -32,7 +31,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 from mme_vla.memory.history import StorageSpec
-from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.registry import MEMORIES
 
 

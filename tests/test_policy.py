@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from mme_vla import UserError, build_policy
-from mme_vla.files import SUMS
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.pictures import to_unit_range
+from mme_vla.processing.images import to_unit_range
 from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
+from mme_vla.utils import SUMS
 
 TOLERANCE = 2e-5
 FEW_TOKENS = {"vision": {**SMALL_VISION, "patch_size": 8}}

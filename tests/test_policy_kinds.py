@@ -10,11 +10,9 @@ from torch import nn
 
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, register
 from mme_vla.config.composition import compose
-from mme_vla.policy.digest import composition_digest
-from mme_vla.policy.kinds import policy_class, policy_options
-from mme_vla.processing.normalisers import QuantileStats, RunningStats, normalize, unnormalize
-from mme_vla.training.ema import EMA
-from mme_vla.training.optim import make_optimizer, scheduled_rate
+from mme_vla.policy.saving import composition_digest, policy_class, policy_options
+from mme_vla.processing.normalise import QuantileStats, RunningStats, normalize, unnormalize
+from mme_vla.training.optim import EMA, make_optimizer, scheduled_rate
 from mme_vla.training.runs import _completed, differing_keys
 from mme_vla.training.settings import TrainSettings
 

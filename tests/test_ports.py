@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from mme_vla import UserError, build_policy
-from mme_vla.commands.weights import convert
+from mme_vla.cli.weights import convert
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.weights import detect_format, load_weights

@@ -13,17 +13,17 @@ from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
 from serving_fakes import Served, challenge
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.commands.train import train
+from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_values import EpisodeRef
+from mme_vla.data.hdf5_episode import EpisodeRef
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_motions
 from mme_vla.embodiment import Embodiment
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.environment import make_rollout_env
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer

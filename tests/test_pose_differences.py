@@ -15,12 +15,12 @@ from serving_fakes import Served, challenge
 
 from mme_vla import UserError
 from mme_vla.config.composition import compose
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.embodiment import Embodiment
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.policy.base import Policy
 
 NAME = "robomme_ee_delta"

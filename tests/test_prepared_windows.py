@@ -7,10 +7,10 @@ from rollout_stand_ins import InlineEnvs, quick_policy, roll
 from serving_fakes import Served, acted_directly, course, observation, wait_until
 from test_recurrent import RandomHistory, make, same_memory, window  # noqa: F401  (a fixture)
 
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
+from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.joined import JoinedMemory
-from mme_vla.memory.sampling import recurrent_frames
-from mme_vla.policy.batching import Act, Prepare, Turns
+from mme_vla.policy.scheduler import Act, Prepare, Turns
 from mme_vla.testing.small import moving_frames
 
 STEPS = 6

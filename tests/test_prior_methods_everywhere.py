@@ -16,21 +16,20 @@ from rollout_scripted_env import ScriptedEnv, make_scripted_env
 from rollout_stand_ins import InlineEnvs, roll
 from serving_fakes import Served, challenge
 
-from mme_vla.commands.inspect import show_checkpoint
+from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.sources import open_sources
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.probe import lines
-from mme_vla.evaluation.probe.arms import read_arms
-from mme_vla.evaluation.probe.lines import MomentLine
-from mme_vla.evaluation.probe.offline import OfflineSettings, probe_offline
-from mme_vla.evaluation.probe.recordings import all_recordings
-from mme_vla.evaluation.results.cost_table import counted
-from mme_vla.evaluation.results.paper import average, paper_method
+from mme_vla.evaluation.results.paper import average, counted, paper_method
 from mme_vla.policy.base import Policy
+from mme_vla.probing import lines
+from mme_vla.probing.arms import read_arms
+from mme_vla.probing.lines import MomentLine
+from mme_vla.probing.offline import OfflineSettings, probe_offline
+from mme_vla.probing.recordings import all_recordings
 
 SIDE, POSE = 64, np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
 LLAMA = [*TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32"]

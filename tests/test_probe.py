@@ -10,12 +10,12 @@ from probe_stand_ins import made_up, probed, reader
 from rollout_stand_ins import quick_policy
 
 from mme_vla.errors import UserError
-from mme_vla.evaluation.probe.arms import UNPROBED, choose_arms, read_arm
-from mme_vla.evaluation.probe.channels import channel_of
-from mme_vla.evaluation.probe.findings import Findings
-from mme_vla.evaluation.probe.lines import EntryLine, MomentLine
-from mme_vla.evaluation.probe.measure import compare_chunks
-from mme_vla.evaluation.probe.probed import ProbedPolicy
+from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
+from mme_vla.probing.channels import channel_of
+from mme_vla.probing.lines import EntryLine, MomentLine
+from mme_vla.probing.offline import compare_chunks
+from mme_vla.probing.probed import ProbedPolicy
+from mme_vla.probing.report import Findings
 
 NEURAL_ARMS = ["drop:all", "shuffle", "swap", "delay:16", "recent:8", "oracle", "pause:8", "distract:1", "nodemo"]
 

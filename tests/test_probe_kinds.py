@@ -10,13 +10,12 @@ from rollout_stand_ins import quick_policy
 
 from mme_vla import build_policy
 from mme_vla.errors import UserError
-from mme_vla.evaluation.probe.arms import UNPROBED, choose_arms, read_arm
-from mme_vla.evaluation.probe.channels import channel_of
-from mme_vla.evaluation.probe.feed import Feed
-from mme_vla.evaluation.probe.lending import Lenders
-from mme_vla.evaluation.probe.probed import ProbedPolicy
 from mme_vla.memory.history import OnlineHistory
-from mme_vla.memory.sam2act.keyframe_bank import BankState
+from mme_vla.methods.sam2act.memory import BankState
+from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
+from mme_vla.probing.channels import channel_of
+from mme_vla.probing.interventions import Feed
+from mme_vla.probing.probed import Lenders, ProbedPolicy
 from mme_vla.testing.small import unit_stats
 
 JOINED: list[dict[str, Any]] = [{"name": "framesamp", "budget": 64}, {"name": "ttt", "budget": 64}]

@@ -8,18 +8,17 @@ from probe_stand_ins import made_up
 from rollout_scripted_env import make_far_env
 from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
 
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.probe.arms import read_arm
-from mme_vla.evaluation.probe.findings import Findings
-from mme_vla.evaluation.probe.lines import LINES
-from mme_vla.evaluation.probe.offline import OfflineSettings
-from mme_vla.evaluation.probe.online import named
-from mme_vla.evaluation.probe.probe_page import table_of
-from mme_vla.evaluation.probe.probed import ProbedPolicy
-from mme_vla.evaluation.probe.probing import Probe, Wanted, probed_folder, run_probe
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.probing.arms import read_arm
+from mme_vla.probing.lines import LINES
+from mme_vla.probing.offline import OfflineSettings
+from mme_vla.probing.online import named
+from mme_vla.probing.probed import ProbedPolicy
+from mme_vla.probing.report import Findings, table_of
+from mme_vla.probing.run import Probe, Wanted, probed_folder, run_probe
 
 JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
 
@@ -65,7 +64,7 @@ def test_arms_are_paired_with_the_unprobed_run_and_both_probes_share_a_page(tmp_
 
 
 def test_shards_of_a_probe_meet_in_one_page(tmp_path: Path) -> None:
-    from mme_vla.evaluation.rollout.plan import Shard
+    from mme_vla.evaluation.rollout.evaluation import Shard
 
     policy, recordings = quick_policy("framesamp_modul").eval(), made_up()
     for index in range(2):

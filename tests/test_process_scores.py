@@ -15,18 +15,18 @@ from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks
-from mme_vla.envs.process import ProcessScore, process_score
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.scene.motions import COVER_STEPS
+from mme_vla.envs.scores import ProcessScore, process_score
 from mme_vla.envs.subtasks import OPERATIONS, Progress, SubTask
 from mme_vla.envs.task import Task
-from mme_vla.envs.task_names import TASK_NAMES
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.tasks.video_unmask import VideoUnmask
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
-from mme_vla.evaluation.results.process_scores import process_of, process_tables
+from mme_vla.evaluation.results.curves import process_of, process_tables
 from mme_vla.evaluation.results.report import html_report
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.registry import TASKS

@@ -10,7 +10,7 @@ import torch
 
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import NormStats, QuantileStats
+from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.processing.processor import Processor
 from mme_vla.processing.tokenizer import Tokenizer
 

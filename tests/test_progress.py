@@ -6,9 +6,9 @@ import sys
 import numpy as np
 import pytest
 
-from mme_vla.data import progress as module
-from mme_vla.data.progress import progress
-from mme_vla.training.console import resident_gib
+from mme_vla.data import console as module
+from mme_vla.data.console import progress
+from mme_vla.training.logging import resident_gib
 
 
 def test_without_a_terminal_a_line_now_and_then_says_what_is_done_and_what_is_left(monkeypatch, capsys) -> None:
@@ -33,7 +33,7 @@ def test_nothing_to_do_says_nothing(capsys, total: int) -> None:
 
 def test_the_memory_of_a_run_is_its_own_and_not_that_of_the_process_it_was_started_by() -> None:
     held = np.ones(60_000_000)  # 460 MiB, which a child's getrusage would begin with
-    code = "from mme_vla.training.console import resident_gib; print(resident_gib())"
+    code = "from mme_vla.training.logging import resident_gib; print(resident_gib())"
     alone = float(subprocess.check_output([sys.executable, "-c", code]))
     assert 0 < alone < resident_gib() - 0.3
     del held

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from h5_files import write_file
 
-from mme_vla.commands.exec_starts import main
-from mme_vla.data.cache.ensure import ensure_cache
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.cli.exec_starts import main
+from mme_vla.data.cache_building import ensure_cache
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.first_frames import first_frames, marked_episodes
+from mme_vla.data.exec_starts import first_frames, marked_episodes
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
 from mme_vla.testing.small import small_policy

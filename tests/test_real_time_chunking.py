@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from mme_vla.backbone.pi05.overlap import STRONGEST, agreeing, overlap_weights, strength
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.speed.rtc import STRONGEST, agreeing, overlap_weights, strength
 from mme_vla.testing.small import moving_frames, small_policy
 from mme_vla.types import Overlap
 

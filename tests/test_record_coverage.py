@@ -9,15 +9,14 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from h5_files import write_file
 
-from mme_vla.commands import record
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.cli import record
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_task
-from mme_vla.envs.metadata import MORE, EpisodeSpec
+from mme_vla.envs.metadata import MORE, TASK_NAMES, EpisodeSpec
 from mme_vla.envs.recording import coverage
-from mme_vla.envs.recording.recorded import Wanted
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.recording.outputs import Wanted
 
 
 def test_more_episodes_have_seeds_that_no_split_has() -> None:

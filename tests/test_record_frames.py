@@ -9,19 +9,19 @@ from omegaconf import OmegaConf
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
-from mme_vla.commands.record import record_episode
+from mme_vla.cli.record import record_episode
 from mme_vla.config.composition import compose
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import open_episode
-from mme_vla.data.hdf5_values import EpisodeRef
+from mme_vla.data.hdf5_episode import EpisodeRef
 from mme_vla.embodiment import Embodiment
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.make import make_task
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.envs.recording.recorded import Job
+from mme_vla.envs.recording.outputs import Job
 from mme_vla.envs.recording.recorder import RecordedStep, Recorder
-from mme_vla.envs.rendering_check import render_backend
+from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 
 POSES = [np.full(7, float(i), np.float32) for i in range(3)]

@@ -9,9 +9,8 @@ from typing import Any
 import pytest
 
 from mme_vla import UserError
-from mme_vla.evaluation.record_log import RecordLog, find_records, read_records
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, Seconds, by_run, finished, merge
-from mme_vla.evaluation.run_file import claim_run, fingerprint, read_run
+from mme_vla.evaluation.store import RecordLog, claim_run, find_records, fingerprint, read_records, read_run
 
 
 def record(**changes: Any) -> EpisodeRecord:

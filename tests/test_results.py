@@ -11,21 +11,27 @@ import numpy as np
 import pytest
 
 from mme_vla import UserError
-from mme_vla.commands import results as results_command
-from mme_vla.commands.results import main
-from mme_vla.evaluation.record_log import RecordLog
+from mme_vla.cli import results as results_command
+from mme_vla.cli.results import main
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.results.aggregate import Results, aggregate
+from mme_vla.evaluation.results.aggregate import (
+    Results,
+    aggregate,
+    bootstrap,
+    effective_trials,
+    holm,
+    mean_std,
+    sign_test,
+    wilson,
+)
 from mme_vla.evaluation.results.compare import compare, compare_all
-from mme_vla.evaluation.results.cost_table import chunk_flops
 from mme_vla.evaluation.results.demo import demo_records
-from mme_vla.evaluation.results.intervals import bootstrap, effective_trials, holm, mean_std, sign_test, wilson
-from mme_vla.evaluation.results.scopes import Protocol, tasks_of
+from mme_vla.evaluation.results.paper import chunk_flops
+from mme_vla.evaluation.results.scopes import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES, Protocol, tasks_of
 from mme_vla.evaluation.results.submission import policy_facts, training_details
 from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
-from mme_vla.evaluation.run_file import claim_run
-from mme_vla.evaluation.suites import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES
+from mme_vla.evaluation.store import RecordLog, claim_run
 from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS
 
 # Where the paper's suite and group tables differ from the means of its own per-task table.

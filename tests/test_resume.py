@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from mme_vla import MMEPolicy, UserError
-from mme_vla.commands.train import main
+from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
 from mme_vla.training.logging import read_metrics
 

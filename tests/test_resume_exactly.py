@@ -8,7 +8,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from mme_vla.commands.train import main
+from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
 from mme_vla.policy.tensor_files import assign_tensors, load_tensors, take_memory
 

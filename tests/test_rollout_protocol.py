@@ -6,8 +6,8 @@ import torch
 from rollout_scripted_env import VIDEO, make_far_env
 from rollout_stand_ins import JOBS, InlineEnvs, quick_policy, roll
 
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.evaluation.rollout.running_episode import RunningEpisode, episode_seed
+from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.rollout.episode import RunningEpisode, episode_seed
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.subgoal import build_predictor
 from mme_vla.testing.small import cached_history

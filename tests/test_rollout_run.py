@@ -13,18 +13,23 @@ from rollout_scripted_env import make_far_env, make_mortal_env
 from rollout_stand_ins import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
 
 from mme_vla import UserError
-from mme_vla.commands.evaluate import choose_device
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.evaluation.claims import Claims
-from mme_vla.evaluation.record_log import find_records, read_records
+from mme_vla.cli.evaluate import choose_device
+from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.rollout.evaluation import checkpoint_label, default_output, memory_budget
-from mme_vla.evaluation.rollout.plan import Shard, choose_episodes, choose_shard
+from mme_vla.evaluation.rollout.evaluation import (
+    Shard,
+    checkpoint_label,
+    choose_episodes,
+    choose_shard,
+    default_output,
+    memory_budget,
+)
 from mme_vla.evaluation.rollout.progress import RolloutProgress
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.files.media import BORDER, RED, film_frame
+from mme_vla.evaluation.store import Claims, find_records, read_records
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch
+from mme_vla.utils.media import BORDER, RED, film_frame
 
 TESTS = Path(__file__).resolve().parent
 
@@ -204,7 +209,7 @@ def test_impossible_settings_are_refused_by_name() -> None:
 def test_environments_that_cannot_begin_stop_the_run() -> None:
     class Broken(InlineEnvs):
         def start(self, worker, job, **how):
-            from mme_vla.envs.vector.jobs import Reply
+            from mme_vla.envs.vector.pool import Reply
 
             self._replies.append(Reply.of_failure(worker, job, True, self.kind, "no scene"))
 

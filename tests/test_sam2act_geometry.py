@@ -5,8 +5,8 @@ import pytest
 import torch
 from sam2act_golden import load, meta, relative_error
 
-from mme_vla.backbone.sam2act import heatmaps, render, rotations, views
-from mme_vla.backbone.sam2act.geometry import Cube, shift_and_turn, unproject, zoom, zoom_back
+from mme_vla.methods.sam2act import geometry, render
+from mme_vla.methods.sam2act.geometry import Cube, shift_and_turn, unproject, zoom, zoom_back
 
 TOLERANCE = 1e-5
 
@@ -53,25 +53,25 @@ def test_a_closer_look_and_back(golden: dict[str, np.ndarray]) -> None:
 def test_points_stand_where_the_virtual_cameras_see_them(golden: dict[str, np.ndarray]) -> None:
     points = tensor(golden["project/points"])
     side = meta()["sizes"]["res"]
-    assert relative_error(views.project(points, side), golden["project/pixels"]) < TOLERANCE
-    assert relative_error(views.project(points, 224), golden["project/pixels_224"]) < TOLERANCE
+    assert relative_error(geometry.project(points, side), golden["project/pixels"]) < TOLERANCE
+    assert relative_error(geometry.project(points, 224), golden["project/pixels_224"]) < TOLERANCE
 
 
 def test_targets_are_cut_gaussians_that_sum_to_one(golden: dict[str, np.ndarray]) -> None:
     pixels, side = tensor(golden["target/pixels"]), golden["target/sigma1.5"].shape[-1]
-    assert relative_error(heatmaps.targets(pixels, side), golden["target/sigma1.5"]) < TOLERANCE
-    sharp = heatmaps.targets(pixels, side, sigma=-1)
+    assert relative_error(geometry.targets(pixels, side), golden["target/sigma1.5"]) < TOLERANCE
+    sharp = geometry.targets(pixels, side, sigma=-1)
     assert relative_error(sharp.flatten(1), golden["target/sigma-1"]) < TOLERANCE
 
 
 def test_maps_are_read_between_pixels(golden: dict[str, np.ndarray]) -> None:
-    values = heatmaps.read_maps(tensor(golden["pick/maps"]), tensor(golden["pick/pixels"]))
+    values = geometry.read_maps(tensor(golden["pick/maps"]), tensor(golden["pick/pixels"]))
     assert relative_error(values, golden["pick/values"]) < TOLERANCE
 
 
 def test_three_heatmaps_agree_on_a_point(golden: dict[str, np.ndarray]) -> None:
     logits = tensor(golden["waypoint/logits"])
-    finder = heatmaps.PointFinder(logits.shape[-1])
+    finder = geometry.PointFinder(logits.shape[-1])
     assert relative_error(finder.find(logits), golden["waypoint/points"]) < TOLERANCE
     maps = logits[0, :, 0].flatten(1).softmax(-1).view_as(logits[0, :, 0])
     assert relative_error(finder.scores(maps).flatten(), golden["waypoint/scores_first"]) < TOLERANCE
@@ -82,22 +82,22 @@ def test_three_heatmaps_agree_on_a_point(golden: dict[str, np.ndarray]) -> None:
 
 def test_the_loss_of_heatmaps(golden: dict[str, np.ndarray]) -> None:
     logits, target = tensor(golden["waypoint/logits"])[:, :, 0], tensor(golden["heat_loss/target"])
-    losses = heatmaps.soft_cross_entropy(logits, target.transpose(1, 2).view_as(logits))
+    losses = geometry.soft_cross_entropy(logits, target.transpose(1, 2).view_as(logits))
     assert relative_error(losses, golden["heat_loss/per_sample_view"]) < TOLERANCE
     assert relative_error(losses.mean(), golden["heat_loss/mean"]) < TOLERANCE
 
 
 def test_rotations_are_the_bins_of_the_original(golden: dict[str, np.ndarray]) -> None:
     count = 72
-    bins = rotations.to_bins(tensor(golden["rotation/quaternions_xyzw"]), count)
+    bins = geometry.to_bins(tensor(golden["rotation/quaternions_xyzw"]), count)
     assert np.array_equal(bins.numpy(), golden["rotation/bins"])
-    assert relative_error(rotations.from_bins(bins, count), golden["rotation/back_xyzw"]) < TOLERANCE
+    assert relative_error(geometry.from_bins(bins, count), golden["rotation/back_xyzw"]) < TOLERANCE
 
 
 def test_rotations_go_to_bins_and_back_within_half_a_bin() -> None:
     drawn = torch.randn(200, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     quaternions = torch.nn.functional.normalize(drawn, dim=1)
-    back = rotations.from_bins(rotations.to_bins(quaternions, 360), 360)
+    back = geometry.from_bins(geometry.to_bins(quaternions, 360), 360)
     turn = 2 * torch.rad2deg(torch.acos((quaternions * back).sum(1).abs().clamp(max=1)))
     assert turn.max() < 2  # three angles, each off by half a degree at most
 
@@ -130,7 +130,7 @@ def test_points_that_are_no_numbers_or_out_of_sight_leave_no_trace() -> None:
 def test_virtual_pictures_have_ten_channels_of_known_meaning() -> None:
     points = torch.rand(50, 3) - 0.5
     seen = render.virtual_pictures(points, torch.rand(50, 3), 14)
-    assert seen.shape == (views.VIEWS, 10, 14, 14)
+    assert seen.shape == (geometry.VIEWS, 10, 14, 14)
     assert seen[:, 7].flatten(1).unique(dim=1).flatten().tolist() == [-1, 0, 1]
     assert torch.equal(seen[0, 8, :, 3], torch.linspace(-1, 1, 14))
     assert torch.equal(seen[2, 9, 5], torch.linspace(-1, 1, 14))

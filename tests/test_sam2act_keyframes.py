@@ -10,15 +10,22 @@ import pytest
 import torch
 from h5_files import pose_at, write_file
 
-from mme_vla.backbone.sam2act.geometry import Cube
-from mme_vla.data import keyframe_dataset
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data import keyframes
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.keyframe_dataset import KeyframeDataset, KeyframeSample
-from mme_vla.data.keyframes import EpisodeKeyframes, Link, file_of, motions_of, write_keyframes
+from mme_vla.data.keyframes import (
+    EpisodeKeyframes,
+    KeyframeDataset,
+    KeyframeSample,
+    Link,
+    file_of,
+    motions_of,
+    write_keyframes,
+)
 from mme_vla.errors import UserError
-from mme_vla.policy.sam2act.scene import Shot, cloud_of, cloud_pictures
+from mme_vla.methods.sam2act.geometry import Cube
+from mme_vla.methods.sam2act.processor import Shot, cloud_of, cloud_pictures
 
 LENGTHS, VIDEOS = [32, 14], [12, 0]
 
@@ -160,7 +167,7 @@ def drawn_shares(
         chains = [[Link(place, place, place) for place in range(count)] for count in source.chains[number]]
         return SimpleNamespace(chains=chains)
 
-    monkeypatch.setattr(keyframe_dataset, "EpisodeKeyframes", kept)
+    monkeypatch.setattr(keyframes, "EpisodeKeyframes", kept)
     data = KeyframeDataset([source], Plain(), length)
     found: Counter[str] = Counter()
     places: Counter[tuple[int, int]] = Counter()

@@ -9,19 +9,14 @@ import torch
 from sam2act_golden import drawn, drawn_weight, load, meta, relative_error
 from torch import Tensor, nn
 
-from mme_vla.backbone.sam2act.convex import ConvexUp
-from mme_vla.backbone.sam2act.heatmaps import PointFinder, heatmap_loss
-from mme_vla.backbone.sam2act.picture_encoder import AdaptedProjection
-from mme_vla.backbone.sam2act.render import constant_channels
-from mme_vla.backbone.sam2act.sizes import EncoderSizes, SAM2ActSizes
-from mme_vla.backbone.sam2act.transformer import Look
-from mme_vla.backbone.sam2act.views import VIEWS
-from mme_vla.memory.sam2act.keyframe_bank import BankState, KeyframeBank
-from mme_vla.memory.sam2act.keyframe_encoder import MemoryEncoder, sine_positions
-from mme_vla.memory.sam2act.memory_attention import MemoryAttention
-from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
-from mme_vla.weights.name_tables import read
-from mme_vla.weights.names.sam2act import RATES, released_names
+from mme_vla.methods.sam2act.config import EncoderSizes, SAM2ActSizes
+from mme_vla.methods.sam2act.geometry import VIEWS, PointFinder, heatmap_loss
+from mme_vla.methods.sam2act.image_encoder import AdaptedProjection
+from mme_vla.methods.sam2act.memory import BankState, KeyframeBank, MemoryAttention, MemoryEncoder, sine_positions
+from mme_vla.methods.sam2act.model import ConvexUp, Look, SAM2ActNetwork
+from mme_vla.methods.sam2act.names import RATES, released_names
+from mme_vla.methods.sam2act.render import constant_channels
+from mme_vla.weights.tables import read
 
 MODULE, NETWORK, GRADIENT = 1e-4, 5e-4, 2e-3
 TINY_ENCODER = EncoderSizes(width=8, heads=1, blocks=(1, 1, 2, 1), windows=(8, 4, 4, 2), global_blocks=(3,), lora=2)

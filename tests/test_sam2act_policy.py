@@ -10,18 +10,18 @@ import torch
 from h5_files import write_file
 from omegaconf import OmegaConf
 
-from mme_vla.commands.train import train
+from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.data.keyframe_dataset import KeyframeDataset
+from mme_vla.data.keyframes import KeyframeDataset
 from mme_vla.errors import UserError
+from mme_vla.methods.sam2act.policy import SAM2ActPolicy
+from mme_vla.methods.sam2act.processor import KeyframeBatch
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.sam2act.batches import KeyframeBatch
-from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
 from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.training.logging import read_metrics
 

@@ -8,11 +8,11 @@ import torch
 from rollout_scripted_env import ScriptedEnv
 from rollout_stand_ins import InlineEnvs, roll
 
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.environment import ChunkEnv
+from mme_vla.methods.sam2act.policy import SAM2ActPolicy
 from mme_vla.policy.build import build_policy
-from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
 
 MOTION, SIZE = 40, 64
 DOWN = np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)

@@ -7,21 +7,20 @@ import pytest
 import torch
 from torch import nn
 
-from mme_vla.backbone.sam2act.sizes import SAM2ActSizes
 from mme_vla.errors import UserError
-from mme_vla.policy.build import build_policy
-from mme_vla.policy.sam2act.stages import STAGES, select_trained
-from mme_vla.policy.sam2act.two_looks import SAM2ActNetwork
-from mme_vla.policy.sam2act.waypoint_policy import SAM2ActPolicy
-from mme_vla.weights.load import load_weights
-from mme_vla.weights.names.sam2act import (
+from mme_vla.methods.sam2act.config import SAM2ActSizes
+from mme_vla.methods.sam2act.model import SAM2ActNetwork
+from mme_vla.methods.sam2act.names import (
     PICTURES,
     RATES,
     released_copies,
     released_names,
     released_unread,
 )
-from mme_vla.weights.sam2act_files import WEIGHTS, sam2act_adapter, write_sam2act
+from mme_vla.methods.sam2act.policy import STAGES, SAM2ActPolicy, select_trained
+from mme_vla.methods.sam2act.weights import WEIGHTS, sam2act_adapter, write_sam2act
+from mme_vla.policy.build import build_policy
+from mme_vla.weights.load import load_weights
 from mme_vla.weights.source import detect_format
 
 FULL = {

@@ -7,10 +7,9 @@ import pytest
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import open_episode
-from mme_vla.data.hdf5_episode import RawEpisode
-from mme_vla.data.hdf5_values import EpisodeRef
-from mme_vla.data.layout import SAMPLE
-from mme_vla.data.shipped_sample import EPISODES
+from mme_vla.data.hdf5_episode import EpisodeRef, RawEpisode
+from mme_vla.data.lerobot_files import SAMPLE
+from mme_vla.data.sample import EPISODES
 
 
 def test_the_sample_is_small_and_documented() -> None:

@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
 
-from mme_vla.commands.loading import load_policy
+from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 from mme_vla.serving import Client, Limits, pack, unpack
-from mme_vla.serving.http_sessions import BusyError
 from mme_vla.serving.requests import AddBuffer, Reset
-from mme_vla.serving.session import NoEpisodeError
+from mme_vla.serving.session import BusyError, NoEpisodeError
 
 LOGGER = logging.getLogger(__name__)
 CLOSE = {"rtol": 1e-4, "atol": 1e-5}

@@ -12,17 +12,16 @@ from test_probe_online import actions
 from test_stress_results import records
 
 from mme_vla.envs.make import make_env
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.probe.arms import read_arm
-from mme_vla.evaluation.probe.before import with_sessions
-from mme_vla.evaluation.probe.offline import OfflineSettings
-from mme_vla.evaluation.probe.probed import ProbedPolicy
-from mme_vla.evaluation.probe.probed_episode import ProbedEpisode
-from mme_vla.evaluation.probe.probing import Wanted, run_probe
-from mme_vla.evaluation.results.stress import stress_curves
+from mme_vla.evaluation.results.curves import stress_curves
 from mme_vla.evaluation.rollout.evaluation import evaluate
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.probing.arms import read_arm
+from mme_vla.probing.offline import OfflineSettings
+from mme_vla.probing.online import with_sessions
+from mme_vla.probing.probed import ProbedEpisode, ProbedPolicy
+from mme_vla.probing.run import Wanted, run_probe
 
 SPLIT = "stress:sessions=2"
 JOBS = [Job("VideoUnmask", SPLIT, 0), Job("PickXtimes", SPLIT, 1)]

@@ -8,11 +8,9 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.layers import attention
-from mme_vla.backbone.layers.attention import ALIGNMENT, BIG_NEGATIVE, sight_mask
-from mme_vla.backbone.layers.blocks import PI05_VISIBILITY, Span, Visibility, attention_mask
-from mme_vla.backbone.layers.sight import Sight
-from mme_vla.backbone.pi05 import gemma
+from mme_vla.backbone import attention, gemma
+from mme_vla.backbone.attention import ALIGNMENT, BIG_NEGATIVE, sight_mask
+from mme_vla.backbone.blocks import PI05_VISIBILITY, Sight, Span, Visibility, attention_mask
 from mme_vla.integration.base import MEMORY_VISIBILITY, memory_visibility
 from mme_vla.testing.small import random_batch, small_policy
 

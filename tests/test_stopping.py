@@ -11,10 +11,8 @@ import torch
 from test_training import loggers, policy, trainer
 
 from mme_vla.policy.run_folders import resolve_checkpoint
-from mme_vla.training.console import ProgressLine
-from mme_vla.training.logging import read_metrics
+from mme_vla.training.logging import ProgressLine, Window, read_metrics
 from mme_vla.training.stopping import stop_asked
-from mme_vla.training.window import Window
 
 ASKED_ONCE = """
 import os, signal, sys

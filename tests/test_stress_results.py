@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from mme_vla.commands.results import main
+from mme_vla.cli.results import main
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import RecordLog
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.stress import stress_curves, stress_figures
+from mme_vla.evaluation.results.curves import stress_curves, stress_figures
+from mme_vla.evaluation.store import RecordLog
 
 
 def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:

@@ -6,7 +6,7 @@ from collections import defaultdict
 
 from conftest import REPOSITORY
 
-from mme_vla.envs.variants import DIALS, SESSIONS
+from mme_vla.envs.metadata import DIALS, SESSIONS
 
 ACTORS = ("demonstrator", "oracle")
 

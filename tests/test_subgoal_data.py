@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from conftest import REPOSITORY
 
-from mme_vla.commands import subgoal_build
-from mme_vla.data.conversion import ConvertOptions, convert
+from mme_vla.cli import subgoal_build
+from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
-from mme_vla.files import SUMS
 from mme_vla.subgoal.clips import Clip, read_image, sample_video
 from mme_vla.subgoal.finetuning import collecting as module
 from mme_vla.subgoal.finetuning.collecting import build, open_input
 from mme_vla.subgoal.finetuning.labels import Labels, keyframes, resting_frames, selected_steps, transitions, windows
 from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
-from mme_vla.subgoal.finetuning.swift import command, write_arguments
+from mme_vla.subgoal.finetuning.training import command, write_arguments
+from mme_vla.utils import SUMS
 
 SETS = {
     "simple": "qwenvl_simple_subgoal",
@@ -153,7 +153,7 @@ def test_another_build_is_not_overwritten(built, h5):
 
 
 def test_a_dataset_that_does_not_tell_its_tasks_is_asked_for_them(tmp_path):
-    from mme_vla.data.layout import SAMPLE
+    from mme_vla.data.lerobot_files import SAMPLE
 
     copy = shutil.copytree(SAMPLE, tmp_path / "dataset")
     (copy / "meta" / "robomme_episodes.json").unlink()

@@ -11,10 +11,10 @@ from chat_server import Answer, chat_server, failure, says
 from omegaconf import OmegaConf
 from rollout_stand_ins import quick_policy
 
-from mme_vla.commands.evaluate import choose_subgoals, report_usage
+from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.config.composition import compose
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.subgoal.words.notebook_prompts import MONITOR
+from mme_vla.subgoal.notebook import MONITOR
 
 pytest.importorskip("openai", reason="needs the extra openai")
 SECRET = "sk-not-a-real-key"

@@ -11,17 +11,16 @@ from PIL import Image
 from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
 from mme_vla import UserError
-from mme_vla.commands.evaluate import choose_subgoals
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.evaluation.record_log import read_records
+from mme_vla.cli.evaluate import choose_subgoals
+from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.report import html_report
 from mme_vla.evaluation.results.scopes import Protocol
-from mme_vla.evaluation.rollout.subgoal_score import SubgoalScore, point_distances, subgoal_table, total_score
-from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
+from mme_vla.evaluation.rollout.subgoals import SubgoalScore, SubgoalTrace, point_distances, subgoal_table, total_score
+from mme_vla.evaluation.store import read_records
 from mme_vla.subgoal import BackgroundPredictor, Subgoal, SubgoalPredictor, build_predictor
-from mme_vla.subgoal.words.parsing import points_of
+from mme_vla.subgoal.text import points_of
 
 UNMASK = Job("VideoUnmask", "test", 0)
 
@@ -246,7 +245,7 @@ def test_a_folder_left_by_another_process_does_not_stop_a_trace(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "VideoUnmask_ep0").mkdir()
-    monkeypatch.setattr("mme_vla.evaluation.rollout.subgoal_trace.shutil.rmtree", lambda *_, **__: None)
+    monkeypatch.setattr("mme_vla.evaluation.rollout.subgoals.shutil.rmtree", lambda *_, **__: None)
     SubgoalTrace("simple", tmp_path, "VideoUnmask_ep0")
     assert (tmp_path / "VideoUnmask_ep0.jsonl").read_bytes() == b""
 
@@ -258,7 +257,7 @@ TINY_VLM = ["subgoal=qwenvl", "subgoal.model=tiny", "subgoal.device=cpu", "subgo
 def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str], tmp_path: Path) -> None:
     pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
     pytest.importorskip("transformers", reason="needs the extra vlm")
-    from mme_vla.envs.rendering_check import render_backend
+    from mme_vla.envs.rendering import render_backend
 
     try:
         render_backend()

@@ -12,8 +12,8 @@ from subgoal_fakes import ApiError, Client, frames, kinds, play, predictor_of, r
 from mme_vla.errors import UserError
 from mme_vla.subgoal import Gemini
 from mme_vla.subgoal.base import Usage
+from mme_vla.subgoal.gemini import VOCABULARY, gemini_system
 from mme_vla.subgoal.models.api import Api, ApiFailure, Settings
-from mme_vla.subgoal.words.gemini_prompts import VOCABULARY, gemini_system
 
 SECRET = "AIza-not-a-real-key"
 

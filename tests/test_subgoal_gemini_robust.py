@@ -9,7 +9,7 @@ from conftest import REPOSITORY
 from subgoal_fakes import frames, kinds, play, predictor_of, says, started
 
 from mme_vla.errors import UserError
-from mme_vla.subgoal.models.threads import side_by_side
+from mme_vla.subgoal.models.api import side_by_side
 
 
 def test_late_tasks_leave_out_what_came_due_before_their_step():

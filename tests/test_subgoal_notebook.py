@@ -11,9 +11,8 @@ from chat_server import Answer, ChatServer, chat_server, failure, says
 
 from mme_vla.errors import UserError
 from mme_vla.subgoal import NotebookPredictor, build_predictor
-from mme_vla.subgoal.notes import Count, Identity, Notebook, Route, read_notes
-from mme_vla.subgoal.words.notebook_prompts import MONITOR
-from mme_vla.subgoal.words.parsing import MalformedAnswer
+from mme_vla.subgoal.notebook import MONITOR, Count, Identity, Notebook, Route, read_notes
+from mme_vla.subgoal.text import MalformedAnswer
 
 QUICK = {"backoff": 0, "requests_per_minute": None, "retries": 0}
 COUNT = {"kind": "count", "name": "placed", "value": 0}

@@ -7,7 +7,7 @@ import torch
 from rollout_stand_ins import FACTS, JOBS, quick_policy
 
 from mme_vla import UserError
-from mme_vla.commands.evaluate import choose_subgoals, report_usage
+from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.evaluation import run_settings
 from mme_vla.evaluation.rollout.settings import RolloutSettings

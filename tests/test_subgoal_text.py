@@ -6,26 +6,24 @@ import re
 import pytest
 
 from mme_vla.subgoal.answers import SubgoalHistory, hold_until, merge_keyframes, recent_frames
-from mme_vla.subgoal.words.parsing import (
+from mme_vla.subgoal.text import (
     MalformedAnswer,
     mark_points,
+    memer_answer,
+    memer_system,
+    memer_user,
+    numbered,
     parse_gemini,
     parse_memer,
     parse_subgoal,
     pixels_of_pairs,
     says_done,
-    to_pixels,
-    to_thousandths,
-    write_boxes,
-)
-from mme_vla.subgoal.words.prompts import (
-    memer_answer,
-    memer_system,
-    memer_user,
-    numbered,
     split_media,
     subgoal_system,
     subgoal_user,
+    to_pixels,
+    to_thousandths,
+    write_boxes,
 )
 
 

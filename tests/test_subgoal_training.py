@@ -11,16 +11,16 @@ from mme_vla.errors import UserError
 from mme_vla.subgoal import build_predictor
 from mme_vla.subgoal.clips import read_image
 from mme_vla.subgoal.finetuning.collecting import build, open_input
-from mme_vla.subgoal.finetuning.examples import (
+from mme_vla.subgoal.finetuning.rows import (
     IGNORED,
     Collator,
     RowDataset,
+    RowOptions,
     hf_dataset,
     question_of,
     read_rows,
     texts_of,
 )
-from mme_vla.subgoal.finetuning.rows import RowOptions
 from mme_vla.subgoal.finetuning.training import accumulation, find_checkpoint, fine_tune
 from mme_vla.subgoal.models.qwen3vl import VLM
 

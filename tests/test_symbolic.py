@@ -9,7 +9,7 @@ import pytest
 from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.processing.subgoal_text import POINT, SubgoalText, perturb_point
+from mme_vla.processing.prompt import POINT, SubgoalText, perturb_point
 from mme_vla.testing.small import moving_frames, small_policy
 
 TEXTS = {

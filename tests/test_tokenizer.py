@@ -7,7 +7,7 @@ import huggingface_hub
 import pytest
 from huggingface_hub.errors import LocalEntryNotFoundError
 
-from mme_vla.commands.train_tokenizer import VOCAB_SIZE, read_corpus, train_tokenizer
+from mme_vla.cli.train_tokenizer import VOCAB_SIZE, read_corpus, train_tokenizer
 from mme_vla.errors import UserError
 from mme_vla.processing.tokenizer import Tokenizer
 

@@ -18,16 +18,13 @@ from mme_vla.config.composition import compose
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
-from mme_vla.processing.normalisers import NormStats, QuantileStats
+from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.training.checkpoint import check_disk
-from mme_vla.training.console import ProgressLine
 from mme_vla.training.data import check_frozen
-from mme_vla.training.finish import loss_change
-from mme_vla.training.logging import Loggers, check_logger, open_loggers, read_metrics
-from mme_vla.training.loop import Trainer
-from mme_vla.training.runs import Run, differing_keys, open_run
+from mme_vla.training.logging import Loggers, ProgressLine, check_logger, open_loggers, read_metrics
+from mme_vla.training.loop import Trainer, loss_change
+from mme_vla.training.runs import Run, differing_keys, open_run, start_from
 from mme_vla.training.settings import KeepRule, TrainSettings
-from mme_vla.training.start import start_from
 from mme_vla.training.validation import Validation
 from mme_vla.types import Batch, HistoryTokens
 

@@ -15,9 +15,9 @@ from safetensors.torch import load_file, save_file
 from mme_vla import MMEPolicy, UserError
 from mme_vla.evaluation.rollout.evaluation import default_output
 from mme_vla.evaluation.rollout.runner import RunFacts
-from mme_vla.files import SUMS, check_sums, inside
 from mme_vla.processing.tokenizer import PALIGEMMA
 from mme_vla.testing.small import SMALL_VISION, small_policy
+from mme_vla.utils import SUMS, check_sums, inside
 from mme_vla.weights import load_weights, open_source, read_stats
 from mme_vla.weights.orbax import read_orbax, write_orbax
 
@@ -168,7 +168,7 @@ def test_nothing_is_resolved_from_the_environment(
     policy: MMEPolicy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
-    from mme_vla.commands.weights import convert
+    from mme_vla.cli.weights import convert
 
     monkeypatch.setenv("SECRET", "hidden-word")
     write_orbax({"PaliGemma/x": torch.zeros(2)}, tmp_path / "run" / "0" / "params")

@@ -8,12 +8,12 @@ import forked
 import pytest
 
 from mme_vla.config.composition import compose
-from mme_vla.evaluation.record_log import read_folders
 from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.store import read_folders
 from mme_vla.policy.build import build_policy
-from mme_vla.policy.digest import composition_digest
+from mme_vla.policy.saving import composition_digest
 
 OWN = {
     "memory/mine.yaml": "{name: mine, budget: 64, spacing: 4}",

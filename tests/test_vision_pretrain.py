@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla import UserError
-from mme_vla.commands.vision_pretrain import run
+from mme_vla.cli.vision_pretrain import run
 from mme_vla.config.composition import compose
 from mme_vla.envs.scene.placement import SceneError
 from mme_vla.nano import pretraining, scenes

@@ -12,11 +12,11 @@ import torch
 from safetensors.torch import save_file
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.commands.weights import convert
+from mme_vla.cli.weights import convert
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
 from mme_vla.weights import detect_format, load_weights, open_source, read_stats, start_from, transfer
-from mme_vla.weights.adapter import memory_parameters
 from mme_vla.weights.released import released_table
+from mme_vla.weights.tables import memory_parameters
 
 pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
 FORMATS = ["ours", "lerobot", "openpi", "released"]
@@ -156,7 +156,7 @@ def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
-    command = ["mme_vla.weights.convert", str(bases["lerobot"]), str(tmp_path / "new")]
+    command = ["mme_vla", "weights", str(bases["lerobot"]), str(tmp_path / "new")]
     done = forked.run(*command, "backbone=tiny", "--dry-run")
     assert done.returncode == 0, done.stderr
     assert re.search(

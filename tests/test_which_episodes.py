@@ -2,11 +2,11 @@
 
 import pytest
 
-from mme_vla.commands import record
+from mme_vla.cli import record
 from mme_vla.config.composition import compose
 from mme_vla.envs.episodes import choose_episodes, choose_numbers, named_tasks
 from mme_vla.errors import UserError
-from mme_vla.evaluation.rollout import plan as rollout_plan
+from mme_vla.evaluation.rollout import evaluation as rollout_plan
 from mme_vla.play import run as play
 
 

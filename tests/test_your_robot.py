@@ -18,14 +18,14 @@ from rollout_stand_ins import InlineEnvs, roll
 from serving_fakes import Served
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.commands.cache import main as cache_main
-from mme_vla.commands.inspect import main as inspect_main
-from mme_vla.commands.train import train
+from mme_vla.cli.cache import main as cache_main
+from mme_vla.cli.inspect import main as inspect_main
+from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
-from mme_vla.data.cache.store import cache_folder, fingerprint
+from mme_vla.data.cache import cache_folder, fingerprint
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.memory.history import StorageSpec
 from mme_vla.testing.small import SMALL_VISION, random_batch, unit_stats
 

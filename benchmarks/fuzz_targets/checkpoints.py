@@ -11,13 +11,13 @@ from torch import Tensor, nn
 
 from benchmarks.fuzz_targets.base import Target, digest, every_file
 from mme_vla import MMEPolicy
-from mme_vla.commands.weights import convert
-from mme_vla.files import SUMS, write_sums
+from mme_vla.cli.weights import convert
 from mme_vla.policy.tensor_files import WEIGHTS, save_tensors
 from mme_vla.testing.small import SMALL_VISION, small_policy
 from mme_vla.training.checkpoint import read_state, restore, save_checkpoint, trainable
-from mme_vla.training.ema import EMA
+from mme_vla.training.optim import EMA
 from mme_vla.training.settings import KeepRule
+from mme_vla.utils import SUMS, write_sums
 from mme_vla.weights import load_weights, read_stats
 
 _CONFIG = {"train": {"steps": 1}, "seed": 1}

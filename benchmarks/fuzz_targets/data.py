@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 
 from benchmarks.fuzz_targets.base import Target, digest, every_file
-from mme_vla.data.cache.building import build_cache
-from mme_vla.data.cache.store import VisionCache, fingerprint
-from mme_vla.data.conversion import convert
+from mme_vla.data.cache import VisionCache, fingerprint
+from mme_vla.data.cache_building import build_cache
+from mme_vla.data.convert import convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.embodiment import ROBOMME_JOINT
-from mme_vla.files import write_sums
 from mme_vla.memory.tokendrop import TokenDrop
+from mme_vla.utils import write_sums
 
 for _name in ("av", "datasets", "lerobot.datasets.feature_utils", "PIL.Image", "pyarrow.parquet"):
     importlib.import_module(_name)  # here, or every process that reads a damaged copy takes seconds to do so

@@ -9,17 +9,16 @@ import numpy as np
 from benchmarks.fuzz_targets.base import Target, digest, every_file
 from mme_vla.envs import metadata
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
-from mme_vla.evaluation.run_file import claim_run, read_run
-from mme_vla.files import read_text, write_sums
-from mme_vla.files.media import film_bytes, png_bytes
+from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records, read_run
 from mme_vla.play.game import Option
-from mme_vla.play.questions import parse_choice
+from mme_vla.play.vlm_players import parse_choice
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.finetuning.examples import RowDataset
+from mme_vla.subgoal.finetuning.rows import RowDataset
 from mme_vla.subgoal.models.api import Api, Reply, Settings
-from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
+from mme_vla.subgoal.text import MalformedAnswer, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
+from mme_vla.utils import read_text, write_sums
+from mme_vla.utils.media import film_bytes, png_bytes
 
 
 def write_logs(folder: Path) -> None:

@@ -8,11 +8,11 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla import Backbone, Batch, register
+from mme_vla.backbone.attention import additive_mask, attend
 from mme_vla.backbone.base import Inject
-from mme_vla.backbone.layers.attention import additive_mask, attend
-from mme_vla.backbone.layers.blocks import Block, Span, attention_mask
-from mme_vla.backbone.pi05.siglip import pool_grid
-from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.backbone.blocks import Block, Span, attention_mask
+from mme_vla.backbone.config import BackboneConfig
+from mme_vla.backbone.siglip import pool_grid
 
 
 class Layer(nn.Module):

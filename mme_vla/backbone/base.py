@@ -8,11 +8,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.layers.attention import check_backend
-from mme_vla.backbone.layers.blocks import Block, Visibility
-from mme_vla.backbone.layers.recomputing import Recompute
-from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
+from mme_vla.backbone.attention import check_backend
+from mme_vla.backbone.blocks import Block, Visibility
 from mme_vla.errors import UserError
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup, stacked_layers
 from mme_vla.types import Batch
 
 Hook = Callable[[int, Tensor], Tensor]

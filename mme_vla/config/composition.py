@@ -22,13 +22,12 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config import plugins
-from mme_vla.config.endings import print_user_errors as print_user_errors
+from mme_vla.config.errors import COMPOSITION_ERRORS, ConfigTree, paths
+from mme_vla.config.errors import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
 from mme_vla.config.hydra_engine import VERSION_BASE, is_fixed, own_hydra, parse
 from mme_vla.config.hydra_engine import config_dir as config_dir
-from mme_vla.config.mistakes import COMPOSITION_ERRORS, ConfigTree, paths
-from mme_vla.config.naming import remember_name, true_name
-from mme_vla.config.words import join_memories, several_memories
+from mme_vla.config.naming import join_memories, remember_name, several_memories, true_name
 from mme_vla.errors import UserError, printable
 
 

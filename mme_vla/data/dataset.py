@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.data.cache.store import VisionCache
+from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.processing.base import PolicyProcessor, Sample
-from mme_vla.processing.collating import collate as collate
-from mme_vla.processing.past_views import past_views
-from mme_vla.processing.subgoal_text import SubgoalText
+from mme_vla.processing.base import collate as collate
+from mme_vla.processing.images import past_views
+from mme_vla.processing.prompt import SubgoalText
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         if memory is not None and (caches is None or len(caches) != len(sources)):
             raise UserError(
                 "A policy with memory trains on cached vision tokens, one cache a source: build them with "
-                "`python -m mme_vla.data.cache model=<model> data=<data>` and pass `caches`."
+                "`mme-vla cache model=<model> data=<data>` and pass `caches`."
             )
         if not 0 <= action_offset <= 1:
             raise UserError(f"action_offset={action_offset}: expected 0 (as released) or 1 (causally clean).")
@@ -243,3 +243,46 @@ def _check_subgoals(sources: Sequence[EpisodeSource], subgoal: SubgoalText) -> N
                 f"{source.name} has no {' and no '.join(lacking)}, which subgoal_text.kind={subgoal.kind} reads; its "
                 f"subgoal texts are: {', '.join(source.subgoal_names) or 'none'}."
             )
+
+
+class GroupDataset(TrainingDataset):
+    """Groups of `processor.group_size` steps, drawn from whole records, conditioning videos included.
+
+    Every episode gives as many groups as every other, whatever its length; an epoch shows about as many steps as there
+    are. A group's steps are distinct, drawn uniformly and sorted; a shorter episode gives all, the last one repeated.
+    """
+
+    def __len__(self) -> int:
+        """Number of groups in an epoch."""
+        episodes = len(self._episode)
+        return episodes * max(round(self.steps / (episodes * self.processor.group_size)), 1)
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        if not 0 <= index < len(self):
+            raise IndexError(f"group {index} of {len(self)}")
+        at = index % len(self._episode)
+        s, episode = int(self._source[at]), int(self._episode[at])
+        length, size = int(self.sources[s].lengths[episode]), self.processor.group_size
+        rng = np.random.default_rng([self.seed, self.epoch, index])
+        if length >= size:
+            frames = np.sort(rng.choice(length, size, replace=False))
+        else:
+            frames = np.minimum(np.arange(size), length - 1)
+        return self._group(s, episode, frames, rng)
+
+    def observation(self, index: int) -> dict[str, Any]:
+        """The group that ends at a step: the moments before it at which the policy would have been asked."""
+        s, episode, frame = self.locate(index)
+        stride = self.processor.embodiment.action.execute
+        frames = np.arange(frame, -1, -stride)[: self.processor.group_size][::-1]
+        return self._group(s, episode, frames, np.random.default_rng([self.seed, self.epoch, index]))
+
+    def _group(self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
+        steps = [self.step_at(s, episode, int(frame)) for frame in frames]
+        return {
+            "moments": [self.seen(step, rng) for step in steps],
+            "times": frames.astype(np.int64),
+            "goal": steps[-1].goal,
+            "subgoals": steps[-1].subgoals,
+            "place": (s, episode, int(frames[-1])),
+        }

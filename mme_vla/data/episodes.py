@@ -14,24 +14,26 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.choice_rows import find_choices
-from mme_vla.data.columns import DRAWN, find_columns, names_of, width_of
 from mme_vla.data.hdf5_episode import SUBGOALS
-from mme_vla.data.layout import (
+from mme_vla.data.lerobot_files import (
+    DRAWN,
     SAMPLE,
     content_fingerprint,
+    find_columns,
     lossy_coding,
+    names_of,
     read_exec_starts,
     read_info,
     resolve_root,
+    width_of,
 )
-from mme_vla.data.table_files import REMEDY, check_vectors, open_table, read_episode_table, video_file
+from mme_vla.data.tables import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
-from mme_vla.data.waypoints import Motions, find_motions
+from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option
-from mme_vla.embodiment.options import read_options
+from mme_vla.embodiment.action_space import read_options
 from mme_vla.errors import UserError, brief, did_you_mean
-from mme_vla.files import Sums, decoding, read_json
+from mme_vla.utils import Sums, decoding, read_json
 
 SIDE_FILE = "meta/robomme_episodes.json"
 log = logging.getLogger(__name__)

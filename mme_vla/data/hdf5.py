@@ -6,10 +6,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.hdf5_episode import CHOICES, FRAMES, POSE_ACTIONS, POSE_STATE, RawEpisode
-from mme_vla.data.hdf5_values import REMEDY, EpisodeRef
+from mme_vla.data.hdf5_episode import CHOICES, FRAMES, POSE_ACTIONS, POSE_STATE, REMEDY, EpisodeRef, RawEpisode
 from mme_vla.errors import UserError
-from mme_vla.files import decoding, require_file
+from mme_vla.utils import decoding, require_file
 
 
 def find_files(inputs: Sequence[str | Path]) -> list[Path]:
@@ -26,7 +25,7 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
             if (entry / "meta" / "info.json").is_file():
                 advice = (
                     "it is a LeRobot dataset already, named by data.sources as it is. What conversion keeps besides, "
-                    "such as keyframes, needs the HDF5 files: `python -m mme_vla.envs.record` writes them with hdf5=…"
+                    "such as keyframes, needs the HDF5 files: `mme-vla record` writes them with hdf5=…"
                 )
             raise UserError(f"No HDF5 file at {str(entry)!r}: {advice}")
         files.update(found)

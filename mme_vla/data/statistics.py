@@ -5,11 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
+from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.progress import progress
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.errors import UserError
-from mme_vla.processing.normalisers import ExactStats, NormStats, QuantileStats, RunningStats
+from mme_vla.processing.normalise import ExactStats, NormStats, QuantileStats, RunningStats
 
 BATCH = 128  # as released; the quantiles of a running histogram depend a little on it
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.files import decoding, files_to_hold
+from mme_vla.utils import decoding, files_to_hold
 
 _SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nearer one is decoded up to
 

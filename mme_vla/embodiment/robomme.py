@@ -6,9 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment.actions import ActionSpace
-from mme_vla.embodiment.base import Camera, Embodiment, State
-from mme_vla.embodiment.options import MIDDLE
+from mme_vla.embodiment.action_space import MIDDLE, ActionSpace
+from mme_vla.embodiment.robot import Camera, Embodiment, State
 from mme_vla.errors import UserError
 
 ARM_JOINTS = 7

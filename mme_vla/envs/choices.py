@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robot.stick_skills import Demonstrator
     from mme_vla.envs.scene.things import Thing
 
 

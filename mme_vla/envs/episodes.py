@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mme_vla.envs import metadata
-from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES, EpisodeSpec
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.registry import TASKS
 

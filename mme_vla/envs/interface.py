@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from mme_vla.embodiment.robomme import CAMERAS
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
-from mme_vla.envs.rewards import earned_by
+from mme_vla.envs.render_request import Drawing
 from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.saved_state import EpisodeState, play_again
+from mme_vla.envs.scores import earned_by
 from mme_vla.envs.spaces import Control, UnreachableError, action_space
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.errors import UserError
@@ -79,7 +79,7 @@ class RoboMMEEnv(gymnasium.Env):
         max_steps: control steps after which the status becomes `timeout`; the video's steps do not count.
         include: what observations and infos hold beyond the standard keys.
         render: whether there are images.
-        reward: `none`, as in the benchmark, `sparse` or `subtask` (`mme_vla.envs.rewards`).
+        reward: `none`, as in the benchmark, `sparse` or `subtask` (`mme_vla.envs.scores`).
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.

@@ -5,8 +5,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
 from mme_vla.envs import metadata
-from mme_vla.envs.task_names import TASK_NAMES
-from mme_vla.envs.variants import read_variant
+from mme_vla.envs.metadata import TASK_NAMES, read_variant
 from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.registry import TASKS
 
@@ -162,7 +161,7 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
         require_simulator()
     backend = "none"
     if render:
-        from mme_vla.envs.rendering_check import render_backend
+        from mme_vla.envs.rendering import render_backend
 
         backend = render_backend()
     return TASKS[task](obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options)

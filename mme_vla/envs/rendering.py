@@ -8,13 +8,178 @@ never released, keeps it; scenes stay separate, and pictures the same.
 It also keeps one Vulkan device from being opened per environment, of which NVIDIA's driver bears some thirty only.
 """
 
+import hashlib
 import logging
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mme_vla.envs.shaders import lean_shaders
+import numpy as np
+
+from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     import sapien
+    from mani_skill.render import ShaderConfig
+
+
+CELL = 0.001
+"""Width of a cell, metres: less than a pixel covers from 0.13 metres on."""
+_HEADER_BYTES = 80
+_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+def coarsen(corners: np.ndarray, cell: float = CELL) -> np.ndarray:
+    """Merge corners that lie in one cell of a grid into their mean.
+
+    Args:
+        corners: of each triangle, float [n, 3, 3], metres.
+        cell: width of a cell, metres.
+
+    Returns:
+        Corners [m, 3, 3] float32, m <= n, of the triangles whose corners lie in three cells, each once and with its
+        side kept, in an order that depends on nothing else.
+    """
+    points = corners.reshape(-1, 3)
+    _, cells, counts = np.unique(
+        np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
+    )
+    cells = cells.reshape(-1)
+    means = np.stack([np.bincount(cells, points[:, axis]) for axis in range(3)], 1) / counts[:, None]
+    triangles = cells.reshape(-1, 3)
+    different = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
+    triangles = triangles[different]
+    # Turned, so that a triangle begins with its lowest corner whichever it began with.
+    turns = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    triangles = np.unique(np.take_along_axis(triangles, turns, axis=1), axis=0)
+    return means[triangles].astype(np.float32)
+
+
+def read_stl(path: Path) -> np.ndarray:
+    """Corners [n, 3, 3] float32 of the triangles of a binary STL file."""
+    return np.frombuffer(path.read_bytes(), _TRIANGLE, offset=_HEADER_BYTES + 4)["corners"].copy()
+
+
+def stl_bytes(corners: np.ndarray) -> bytes:
+    """A binary STL file of triangles with corners [n, 3, 3], each with the normal of its side."""
+    triangles = np.zeros(len(corners), _TRIANGLE)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    triangles["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+    triangles["corners"] = corners
+    return bytes(_HEADER_BYTES) + len(corners).to_bytes(4, "little") + triangles.tobytes()
+
+
+PACK = "minimal"
+"""ManiSkill's shaders of cameras that observe."""
+_TABLE = "samplerBRDFLUT"
+_DECLARED = re.compile(rf"^layout\(.*\) uniform sampler2D {_TABLE};$", re.MULTILINE)
+_READ = re.compile(rf"texture\({_TABLE}, vec2\([^()]*\)\)\.xy")
+
+
+def without_table(source: str) -> str:
+    """The text of a shader that neither declares nor reads the table; what it said of it is zero."""
+    return _DECLARED.sub("", _READ.sub("vec2(0)", source))
+
+
+def lean_shaders() -> "ShaderConfig | None":
+    """Shaders for cameras in scenes without an environment map; None where the installed ones are not as expected.
+
+    Sets the formats of pictures, which ManiSkill sets by the pack's name, so ask right before the cameras are made.
+    """
+    from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
+
+    folder = _written()
+    if folder is None:
+        return None
+    stock = PREBUILT_SHADER_CONFIGS[PACK]
+    set_shader_pack(stock)
+    return replace(stock, shader_pack=str(folder))
+
+
+@cache
+def _written() -> Path | None:
+    """The folder of changed shaders, made once for an installed SAPIEN."""
+    import sapien
+
+    from mme_vla.utils import user_cache, write_atomically
+
+    stock = Path(sapien.__file__).parent / "vulkan_shader"
+    found = {
+        file.relative_to(stock): file.read_text(encoding="utf-8")
+        for part in (PACK, "common")
+        for file in sorted((stock / part).glob("*"))
+        if file.is_file()
+    }
+    lean = {name: without_table(text) for name, text in found.items()}
+    if lean == found or any(_TABLE in text for text in lean.values()):
+        logging.getLogger(__name__).debug("these shaders are not known here, and are used as they are: %s", stock)
+        return None
+    key = hashlib.sha256(repr(sorted(lean.items())).encode()).hexdigest()[:16]
+    caches = user_cache("shaders") / key
+    for name, text in lean.items():
+        if not (caches / name).is_file():
+            (caches / name).parent.mkdir(parents=True, exist_ok=True)
+            with write_atomically(caches / name) as draft:
+                draft.write_text(text, encoding="utf-8")
+    return caches / PACK
+
+
+INSTALL_HINT = (
+    "Rendering needs a Vulkan driver: an NVIDIA GPU's own, or, without one, Mesa's software driver, 24 or newer. "
+    "On Debian and Ubuntu run scripts/install_vulkan.sh (it installs libvulkan1 and mesa-vulkan-drivers >= 24; on "
+    "Debian 12 from bookworm-backports). Or pass render=False for an environment without images."
+)
+OLDEST_MESA = 24
+
+
+@cache
+def render_backend() -> str:
+    """The simulator's name for the device that renders: the GPU if there is one, else the CPU.
+
+    Raises:
+        UserError: there is no Vulkan driver, or it is too old; the message says what to install.
+    """
+    import sapien
+
+    try:
+        summary = str(sapien.render.get_device_summary())
+    except RuntimeError as error:
+        raise UserError(f"This machine cannot render ({error}). {INSTALL_HINT}") from None
+    supported = [name for name, yes in devices(summary) if yes]
+    if not supported:
+        raise UserError(f"No Vulkan driver here is new enough:\n{summary.strip()}\n{INSTALL_HINT}")
+    try:
+        if sapien.Device("cuda").can_render():
+            return "sapien_cuda"
+    except RuntimeError:
+        logging.getLogger(__name__).debug("no CUDA device to render on")
+    if all("llvmpipe" in name for name in supported):
+        version = mesa_version()
+        if version is not None and version < OLDEST_MESA:
+            raise UserError(f"mesa-vulkan-drivers {version} is too old to render with. {INSTALL_HINT}")
+    return "sapien_cpu"
+
+
+def devices(summary: str) -> list[tuple[str, bool]]:
+    """Name of each device in SAPIEN's summary, and whether SAPIEN supports it."""
+    found = re.findall(r"GPU:\s*(.+?)\s*\n\s*Supported:\s*(\d)", summary)
+    return [(name, flag == "1") for name, flag in found]
+
+
+def mesa_version() -> int | None:
+    """Major version of the installed package mesa-vulkan-drivers; None where the system is not Debian's kind."""
+    if shutil.which("dpkg-query") is None:
+        return None
+    command = ["dpkg-query", "-W", "-f=${Version}", "mesa-vulkan-drivers"]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    major = re.match(r"(?:\d+:)?(\d+)\.", answer)
+    return int(major.group(1)) if major else None
+
 
 _CHECK_SIZE = 8
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
-from mme_vla.envs.drawing import Drawing
+from mme_vla.envs.render_request import Drawing
 from mme_vla.errors import UserError
 
 

@@ -28,7 +28,7 @@ from mme_vla.envs.robot.control import GRIPPER_STEPS
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robot.stick_skills import Demonstrator
     from mme_vla.envs.task import Task
 
 

@@ -6,10 +6,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from mme_vla.envs.vector.jobs import Job
+from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.record_log import find_records, read_records
 from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.store import find_records, read_records
 
 
 def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:

@@ -8,7 +8,7 @@ from types import NoneType
 from typing import Any, NamedTuple, Self
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.files import parse_json, sealed, unsealed
+from mme_vla.utils import parse_json, sealed, unsealed
 
 _LARGEST = 2**63  # numbers from there on are damage
 OUTCOMES = ("success", "fail", "timeout", "error")
@@ -68,7 +68,7 @@ class EpisodeRecord:
     steps: control steps executed, one an action but for planned motions. seconds: where the time went.
     subgoal: name of the subgoal predictor, None for a policy without.
     memory_budget: memory tokens, where it is not the model's usual number (a sweep over budgets).
-    composition: `composition_digest` (policy/digest.py) of the policy, so that no two configurations are averaged
+    composition: `composition_digest` (policy/saving.py) of the policy, so that no two configurations are averaged
         under one name; None in records written before there was one, and of players that are no policy of this library.
     extra: whatever else a runner keeps.
     when: UTC time of the end, ISO 8601.

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.layers.blocks import Block, Visibility
-from mme_vla.backbone.pi05.sizes import BackboneConfig
+from mme_vla.backbone.blocks import Block, Visibility
+from mme_vla.backbone.config import BackboneConfig
 from mme_vla.errors import UserError
 from mme_vla.integration.base import (
     MEMORY_VISIBILITY,

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.layers.blocks import Block
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
+from mme_vla.backbone.blocks import Block
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.integration.base import Integration, checked_position, memory_visibility, own_positions, required
 from mme_vla.registry import INTEGRATIONS
 from mme_vla.types import MemoryTokens

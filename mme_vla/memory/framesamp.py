@@ -7,8 +7,8 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.memory.base import every_one, whole_frames
+from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.perceptual import PerceptualMemory
 from mme_vla.registry import MEMORIES
 
 

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.history import FrameScores, History, StorageSpec
-from mme_vla.memory.perceptual import PerceptualMemory
 from mme_vla.registry import MEMORIES
 
 FIRST_FRAME_SCORE = 1000.0  # above any change, so that the first frame always stays

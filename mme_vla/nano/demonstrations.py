@@ -13,18 +13,58 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.waypoints import Motions
-from mme_vla.embodiment.options import Option, read_options
+from mme_vla.embodiment.action_space import Option, read_options
 from mme_vla.embodiment.robomme import benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
-from mme_vla.files import parse_json, write_atomically
-from mme_vla.nano.snapshots import Snapshots
 from mme_vla.subgoal.oracle import online_subgoal
+from mme_vla.utils import parse_json, write_atomically
 
 if TYPE_CHECKING:
-    from mme_vla.embodiment.actions import ActionSpace
+    from mme_vla.embodiment.action_space import ActionSpace
     from mme_vla.envs.recording.frames import FrameChoice
     from mme_vla.envs.recording.recorder import RecordedStep
     from mme_vla.envs.task import Task
+
+
+class Snapshots:
+    """Snapshots of one task's scene, in the order they were taken; velocities are not part of them.
+
+    A snapshot is read from the simulator's own objects: that takes a tenth of what `get_state_dict` takes, and brings
+    back marks and traces, which belong to no thing of the task, as they were drawn.
+    """
+
+    def __init__(self, task: "Task") -> None:
+        from sapien.render import RenderBodyComponent
+
+        entities = [actor._objs[0] for actor in task.scene.actors.values() if actor.px_body_type != "static"]
+        self._entities = entities
+        bodies = [entity.find_component_by_type(RenderBodyComponent) for entity in entities]
+        self._bodies = [body for body in bodies if body is not None]
+        self._articulations = [each._objs[0] for each in task.scene.articulations.values()]
+        self._taken: list[tuple[list[Any], list[float], list[tuple[Any, Any]]]] = []
+
+    def __len__(self) -> int:
+        return len(self._taken)
+
+    def take(self) -> None:
+        """Keep the scene as it stands."""
+        self._taken.append((
+            [entity.pose for entity in self._entities],
+            [body.visibility for body in self._bodies],
+            [(each.root_pose, each.qpos) for each in self._articulations],
+        ))  # fmt: skip
+
+    def put_back(self, number: int) -> None:
+        """Make the scene stand as in a snapshot, counted from 0."""
+        poses, visibilities, joints = self._taken[number]
+        for entity, pose in zip(self._entities, poses, strict=True):
+            entity.pose = pose
+        for body, visibility in zip(self._bodies, visibilities, strict=True):
+            body.visibility = visibility
+        for each, (root, qpos) in zip(self._articulations, joints, strict=True):
+            each.root_pose = root
+            each.qpos = qpos
+
 
 SUBGOALS = ("simple", "grounded")
 CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
@@ -213,9 +253,9 @@ def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
 
 def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     """The motions of a demonstration, or its choices, if it succeeds."""
-    from mme_vla.envs.drawing import Drawing
     from mme_vla.envs.recording.frames import choices_of, motions_of
     from mme_vla.envs.recording.recorder import Recorder
+    from mme_vla.envs.render_request import Drawing
 
     steps: list[RecordedStep] = []
 
@@ -231,8 +271,8 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
 
 def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
     """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
-    from mme_vla.envs.drawing import Drawing
     from mme_vla.envs.interface import RoboMMEEnv
+    from mme_vla.envs.render_request import Drawing
 
     env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
     env.drawing = Drawing(now=())

@@ -11,21 +11,20 @@ from omegaconf import OmegaConf
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.plugins import plugins_of
 from mme_vla.errors import UserError
-from mme_vla.files import read_json_lines, write_json
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.nano.learning import Decisions, off_by, statistics
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.mme import MMEPolicy, mme_of
-from mme_vla.processing.normalisers import NormStats
+from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
-from mme_vla.training.console import ProgressLine
-from mme_vla.training.logging import JsonLines, Loggers
+from mme_vla.training.logging import JsonLines, Loggers, ProgressLine
 from mme_vla.training.loop import Trainer
 from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.validation import Validation
+from mme_vla.utils import read_json_lines, write_json
 
 DONE = "trained.json"
 HELD_OUT = 10

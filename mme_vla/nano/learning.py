@@ -13,14 +13,14 @@ from torch.utils.data import Dataset
 
 from mme_vla.backbone.base import stack_draws
 from mme_vla.errors import UserError
-from mme_vla.files import write_atomically
 from mme_vla.memory.base import Memory, stack_history
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.normalisers import NormStats, QuantileStats, RunningStats
-from mme_vla.processing.subgoal_text import perturb_point, subgoal_kind
+from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
+from mme_vla.processing.prompt import perturb_point, subgoal_kind
 from mme_vla.types import Batch, HistoryTokens
+from mme_vla.utils import write_atomically
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
 

@@ -7,14 +7,13 @@ from typing import Any
 import numpy as np
 
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
+from mme_vla.evaluation.results.aggregate import Method, Results, aggregate, wilson
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
-from mme_vla.evaluation.results.intervals import wilson
 from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.results.tables import comparison_table, to_markdown
-from mme_vla.files import read_json, write_atomically
+from mme_vla.nano.evaluating import NAME as PLANNER
 from mme_vla.nano.fitting import DONE, learning_curve
-from mme_vla.nano.planner import NAME as PLANNER
+from mme_vla.utils import read_json, write_atomically
 
 PAGE, CURVES = "page.md", "learning.png"
 LEVELS = ("easy", "medium", "hard")

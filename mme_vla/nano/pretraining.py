@@ -16,15 +16,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.nano.backbone import NanoBackbone
-from mme_vla.backbone.nano.sizes import NanoConfig
-from mme_vla.backbone.nano.tower import CLASSES, COARSE, FINE, WORDS, ConvTower
+from mme_vla.backbone.nano import NanoBackbone, NanoConfig
+from mme_vla.backbone.nano_vision import CLASSES, COARSE, FINE, WORDS, ConvTower
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
-from mme_vla.files import write_atomically
 from mme_vla.nano.scenes import LABEL_SIDE
-from mme_vla.processing.pictures import to_unit_range
+from mme_vla.processing.images import to_unit_range
 from mme_vla.processing.tokenizer import SAMPLE, Tokenizer
+from mme_vla.utils import write_atomically
 
 logger = logging.getLogger(__name__)
 SHIFT = 8  # pixels that a picture is moved by at most

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.backbone.nano.tower import CLASSES
+from mme_vla.backbone.nano_vision import CLASSES
 from mme_vla.envs.make import make_task
-from mme_vla.files import write_atomically
-from mme_vla.processing.pictures import resize_with_pad_uint8
+from mme_vla.processing.images import resize_with_pad_uint8
+from mme_vla.utils import write_atomically
 
 if TYPE_CHECKING:
     from mme_vla.envs.task import Task

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.embodiment.options import Option
+from mme_vla.embodiment.action_space import Option
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds

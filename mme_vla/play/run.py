@@ -7,11 +7,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from mme_vla.envs.episodes import choose_episodes as choose_specs
-from mme_vla.evaluation.record_log import RECORDS, RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, finished, merge
 from mme_vla.evaluation.results.paper import paper_table
-from mme_vla.evaluation.run_file import claim_run
-from mme_vla.evaluation.suites import PAPER_ORDER
+from mme_vla.evaluation.results.scopes import PAPER_ORDER
+from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.play.game import ChoiceSession, EpisodeId
 
 

@@ -9,9 +9,9 @@ from importlib.util import find_spec
 from typing import Any
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.files import parse_json
 from mme_vla.play.desk import Desk, StaleError
-from mme_vla.serving.listen import is_local, listen
+from mme_vla.serving.settings import is_local, listen
+from mme_vla.utils import parse_json
 
 log = logging.getLogger("mme_vla.play")
 PAGE = {"": "index.html", "play.css": "play.css", "play.js": "play.js", "film.js": "film.js", "icon.svg": "icon.svg"}

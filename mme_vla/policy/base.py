@@ -9,14 +9,14 @@ import torch
 from torch import Tensor
 
 from mme_vla.backbone.base import Draws, stack_draws
-from mme_vla.backbone.layers.recomputing import Recompute
-from mme_vla.backbone.shard_groups import ShardGroup, stacked_layers
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.memory.base import Memory
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.saving import Saved
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup, stacked_layers
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor

@@ -1,21 +1,93 @@
 """`build_policy`: from a variant's name to a policy, through the same YAML files the commands use."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from pathlib import Path
 from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.backbone.shapes_only import shapes_only
+from mme_vla.backbone.config import shapes_only
 from mme_vla.config.composition import compose, import_plugins
-from mme_vla.config.words import words
+from mme_vla.config.naming import words
 from mme_vla.errors import UserError
+from mme_vla.integration.base import Integration, doors_of
+from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.kinds import policy_class
-from mme_vla.processing.base import DEFAULT, PolicyProcessor
+from mme_vla.policy.saving import policy_class
+from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
+from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.prompt import PROMPTS
-from mme_vla.registry import PROCESSORS
+from mme_vla.registry import MEMORIES, PROCESSORS
+
+
+def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: int) -> Memory:
+    """The memory of a configuration.
+
+    Args:
+        d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
+
+    Raises:
+        UserError: an unknown memory or option, or a grid to which a view's cannot be pooled.
+    """
+    memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
+    memory.check_grid(grid)
+    return memory
+
+
+def check_integrated(
+    config: Mapping[str, Any], integration: Integration, memory: Memory | None, hosts: Set[str]
+) -> None:
+    """Make sure that memory and integration go together, and that the backbone has a place for what they bring.
+
+    Raises:
+        UserError: one of them without the other, memory tokens in time that have none, or past views for a tower that
+            sees one picture at a time.
+    """
+    speaks = memory is not None and memory.budget > 0
+    if speaks != (integration.memory_width > 0):
+        if memory is not None and not speaks:
+            raise UserError(
+                f"The memory {config['memory']['name']!r} hands over no tokens as it is set, for an integration to "
+                "bring to the backbone: choose integration=none, or let it have some (memory.states=true)."
+            )
+        given = "an integration without a memory" if memory is None else "a memory without an integration"
+        raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
+    if memory is None:
+        return
+    check_past(config, memory, hosts)
+    check_positions(config, integration, memory, hosts)
+
+
+def check_past(config: Mapping[str, Any], memory: Memory, hosts: Set[str]) -> None:
+    """Make sure that a memory that gives past views has a backbone whose vision tower looks at them.
+
+    Raises:
+        UserError: that of this backbone sees one picture at a time.
+    """
+    if memory.looks_back is not None and "past" not in hosts:
+        raise UserError(
+            f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
+            f"and the tower of the backbone {config['backbone']['name']!r} sees one picture at a time. Take another "
+            "memory, a backbone that hosts `past` (pi05), or past states alone (memory.views=false)."
+        )
+
+
+def check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, hosts: Set[str]) -> None:
+    """Make sure that a memory that shall be placed in time can be: its tokens have one, the backbone a place for it."""
+    if integration.memory_position != "time":
+        return
+    if not memory.timed:
+        raise UserError(
+            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} stand for no one "
+            "moment each. Take memory_position=slot, or a memory that says `timed`."
+        )
+    if "blocks" in doors_of(type(integration)) and "positions" not in hosts:
+        raise UserError(
+            f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
+            "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
+        )
+
 
 SECTIONS = (
     "name", "plugins", "embodiment", "backbone", "memory", "integration", "policy", "processor", "subgoal_text",
@@ -117,5 +189,5 @@ def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
             f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under `defaults` of its file "
             "write `/processor@_global_.processor: tiny`, or the name of a configs/processor file of your own."
         )
-    kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT)]
+    kind: type[PolicyProcessor] = PROCESSORS[sections["processor"].get("name", DEFAULT_PROCESSOR)]
     return kind.from_sections(sections)

@@ -1,7 +1,8 @@
 """One running episode: all streaming state lives here, never on the policy."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
@@ -11,14 +12,48 @@ from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
 from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.policy.promises import Promise, checked_promise
-from mme_vla.processing.limits import check_reach, finite_array
-from mme_vla.processing.past_views import PastPictures
+from mme_vla.processing.images import PastPictures
+from mme_vla.processing.normalise import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
 from mme_vla.types import HistoryTokens, PastViews
 
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
     from mme_vla.processing.base import PolicyProcessor
+
+
+@dataclass(frozen=True)
+class Written:
+    """One store of what was written.
+
+    entries: (time, content) in the order they are read. now: the current moment, on the clock of these times.
+    """
+
+    name: str
+    entries: tuple[tuple[int, Tensor], ...]
+    now: int
+
+
+@runtime_checkable
+class Writes(Protocol):
+    """What such an episode offers; a probe asks for no more."""
+
+    @property
+    def written_clock(self) -> str | None:
+        """What the times of entries count (`moments`); None where entries have an order alone."""
+        ...
+
+    def written(self) -> tuple[Written, ...]:
+        """All stores."""
+        ...
+
+    def as_if_written(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+        """This episode with other entries in its stores, for one chunk; it stays as it is itself."""
+        ...
+
+    def go_on_from(self, twin: "Episode") -> None:
+        """Go on from a chunk that was chosen for an episode of `as_if_written`, with one's own entries."""
+        ...
 
 
 class Host(Protocol):

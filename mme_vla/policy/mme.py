@@ -10,13 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import mme_vla.integration
-import mme_vla.memory  # noqa: F401  (importing the rooms registers what they ship)
 from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
-from mme_vla.backbone.layers.recomputing import Recompute
-from mme_vla.backbone.shape import read_backbone
-from mme_vla.backbone.shapes_only import shapes_only
-from mme_vla.backbone.shard_groups import ShardGroup
+from mme_vla.backbone.config import read_backbone, shapes_only
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
@@ -24,16 +19,18 @@ from mme_vla.integration.base import Integration, doors_of
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import MarkedHistory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.composing import build_memory, check_integrated
+from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.graphs import CapturedSampling
-from mme_vla.policy.kinds import policy_options
 from mme_vla.policy.masking import masked_mean
 from mme_vla.policy.promises import promised_overlap
-from mme_vla.policy.seeing import encode_frames, tower_fingerprint
+from mme_vla.policy.saving import policy_options
 from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.processing.past_views import full_past, stack_past
+from mme_vla.policy.vision_cache import encode_frames, tower_fingerprint
+from mme_vla.processing.images import full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
+from mme_vla.speed.graphs import CapturedSampling
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import Batch, HistoryTokens, MemoryTokens, send
 
 if TYPE_CHECKING:
@@ -227,7 +224,7 @@ class MMEPolicy(Policy):
     def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
         """The current views in [−1, 1], changed where random numbers say how (`_draw_changes`)."""
         from mme_vla.processing.augment import augment_views
-        from mme_vla.processing.pictures import to_unit_range
+        from mme_vla.processing.images import to_unit_range
 
         images = to_unit_range(batch.images)
         return images if changes is None else augment_views(images, self.embodiment.augmentations, changes)

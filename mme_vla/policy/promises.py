@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.pi05.overlap import overlap_weights
 from mme_vla.errors import UserError
 from mme_vla.processing.base import PolicyProcessor
-from mme_vla.processing.limits import finite_array
+from mme_vla.processing.normalise import finite_array
+from mme_vla.speed.rtc import overlap_weights
 from mme_vla.types import Overlap
 
 

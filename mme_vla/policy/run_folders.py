@@ -71,7 +71,7 @@ def resolve_checkpoint(path: Path) -> Path:
     if _is_released(path):
         raise UserError(
             f"{path} is a checkpoint of the released code, in another format. Convert it, then name the new folder: "
-            f"python -m mme_vla.weights.convert {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
+            f"mme-vla weights {path} {str(path).removesuffix('.zip')}_converted (with model=<model> "
             "where no history_config.txt names the variant)."
         )
     raise UserError(

@@ -1,6 +1,8 @@
 """What a policy needs to write itself to a folder or the hub, and to come back."""
 
+import inspect
 import json
+import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,18 +11,179 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.shapes_only import shapes_only
+from mme_vla.backbone.config import shapes_only
+from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
 from mme_vla.config.plugins import import_trusted
-from mme_vla.errors import UserError, brief
-from mme_vla.files import check_sums, inside, read_json, write_sums
+from mme_vla.embodiment import ROBOMME_JOINT
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
-from mme_vla.policy.hub import local_folder, push_folder
-from mme_vla.policy.kinds import policy_class_for
+from mme_vla.policy.run_folders import newest_checkpoint
 from mme_vla.policy.tensor_files import assign_tensors, dtype_of, load_tensors, save_tensors, written_weights
+from mme_vla.registry import POLICIES
+from mme_vla.utils import check_sums, inside, read_json, write_sums
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
+
+
+def composition_digest(config: Mapping[str, Any]) -> str:
+    """Twelve letters that are equal for two policies exactly if they are composed alike, sizes included.
+
+    Args:
+        config: of a policy, as it is saved with the weights. Where its tokenizer lies, what it was trained on and in
+            which precision it computes do not count; nor do keys that are not set, so that a later option with an
+            empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
+    """
+    kept = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(config.get("policy") or {})
+    kept = {key: value for key, value in kept.items() if value is not None and key != "processor.tokenizer"}
+    robot = embodiment_of(config)
+    if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
+        kept |= flat({"embodiment": robot.to_dict()})
+    return digest(kept, 12)
+
+
+DEFAULT = "mme"
+"""The policy of configurations that name none: backbone × memory × integration."""
+
+
+def policy_name(config: Mapping[str, Any]) -> str:
+    """What the section `policy` of a configuration calls its class.
+
+    Raises:
+        UserError: the section is no section.
+    """
+    section = config.get("policy") or {}
+    if not isinstance(section, Mapping):
+        raise UserError(f"policy={brief(section)} must be a section.")
+    return section.get("name", DEFAULT)  # the registry refuses what is no name
+
+
+def policy_class(config: Mapping[str, Any]) -> type[Any]:
+    """The class of the policy that a configuration describes.
+
+    Raises:
+        UserError: there is no policy of that name.
+    """
+    found: type[Any] = POLICIES[policy_name(config)]
+    return found
+
+
+def policy_class_for[P](asked: type[P], config: Mapping[str, Any], source: str) -> type[P]:
+    """The class to load a checkpoint with, where `asked.from_pretrained` was called.
+
+    Raises:
+        UserError: the checkpoint holds a policy of another class than was asked for.
+    """
+    kind = policy_class(config)
+    if issubclass(asked, kind):
+        return asked
+    if issubclass(kind, asked):
+        return kind
+    raise UserError(
+        f"{source} holds a {policy_name(config)!r} policy, which is no {asked.__name__}: load it with "
+        "Policy.from_pretrained(), which knows every kind."
+    )
+
+
+def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `policy`, whose keys beside `name` are the constructor's keyword-only arguments.
+
+    Where a constructor takes `**options`, those of its parent class count too.
+
+    Raises:
+        UserError: another key.
+    """
+    options = {key: value for key, value in config.get("policy", {}).items() if key != "name"}
+    known = _keyword_options(cls)
+    for key in options:
+        if key not in known:
+            raise UserError(f"policy has no key {brief(key)}. {did_you_mean(str(key), known)}")
+    return options
+
+
+def _keyword_options(cls: type) -> list[str]:
+    known: list[str] = []
+    for owner in cls.__mro__:
+        if "__init__" in vars(owner):
+            parameters = inspect.signature(vars(owner)["__init__"]).parameters.values()
+            known += [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters):
+                break
+    return list(dict.fromkeys(known))
+
+
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")
+_PLACE = re.compile(rf"({_REPOSITORY.pattern})((?:/[\w-][\w. -]*)*)")
+"""A repository, and a folder or file in it."""
+
+
+def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
+    """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of that name.
+
+    A folder of a training run stands for its newest checkpoint, and `latest` for the newest run beside it.
+
+    Args:
+        source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no other is fetched.
+        revision: branch, tag or commit of the repository; its main branch by default.
+        token: for private repositories; the one stored by `hf auth login` by default.
+
+    Raises:
+        UserError: neither a path nor a repository that can be reached.
+    """
+    path = newest_checkpoint(Path(source).expanduser())
+    place = _PLACE.fullmatch(str(source))
+    if path.exists() or place is None:
+        if revision is not None:
+            raise UserError(f"revision={revision!r} names a state of a hub repository, but {source} is a path.")
+        return path
+    import httpx
+    from huggingface_hub import snapshot_download
+    from huggingface_hub.errors import HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+
+    repository, within = place[1], place[2].strip("/")
+    try:
+        if not within:
+            return Path(snapshot_download(repository, revision=revision, token=token))
+        wanted = [within, f"{within}/*"]
+        root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=wanted))
+        if not (root / within).exists():
+            raise UserError(f"The hub repository {repository} has no {within!r}: nothing of that name was in it.")
+        return root / within
+    except (HfHubHTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled, httpx.HTTPError, OSError) as error:
+        at = "" if revision is None else f" at revision {revision!r}"
+        reason = str(error).strip().splitlines()
+        raise UserError(
+            f"{source} is not a path on this machine, and the hub repository of that name{at} could not be fetched "
+            f"({type(error).__name__}: {reason[0] if reason else 'no answer'}). Check the name, the network, and for a "
+            "private or gated repository your token (hf auth login)."
+        ) from error
+
+
+def push_folder(
+    folder: Path, repo_id: str, *, private: bool, token: str | None, revision: str | None, message: str
+) -> str:
+    """Create the repository if need be, upload the folder's files as one commit, and return its address.
+
+    Raises:
+        UserError: the id is not `owner/name`, or the hub refuses.
+    """
+    if not _REPOSITORY.fullmatch(repo_id):
+        raise UserError(f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul.")
+    import huggingface_hub
+    from huggingface_hub.errors import HfHubHTTPError
+
+    api: Any = huggingface_hub.HfApi(token=token)
+    try:
+        address = api.create_repo(repo_id, private=private, exist_ok=True)
+        if revision is not None:
+            api.create_branch(repo_id, branch=revision, exist_ok=True)
+        api.upload_folder(repo_id=repo_id, folder_path=folder, commit_message=message, revision=revision)
+    except HfHubHTTPError as error:
+        raise UserError(f"The hub refused to store {repo_id}: {error}. Is the token allowed to write there?") from error
+    return str(address)
+
 
 CONFIG = "config.json"
 

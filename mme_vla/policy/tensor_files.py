@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief, listed
-from mme_vla.files import check_sums, inside, read_json
+from mme_vla.utils import check_sums, inside, read_json
 
 WEIGHTS = "model.safetensors"
 INDEX = "model.safetensors.index.json"

@@ -9,12 +9,16 @@ from typing import Any, Self
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
 from mme_vla.errors import UserError
-from mme_vla.files import check_sums, inside, read_json
-from mme_vla.processing.normalisers import NormStats, normalize
+from mme_vla.memory.base import stack_history
+from mme_vla.processing.images import stack_past
+from mme_vla.processing.normalise import NormStats, normalize
 from mme_vla.registry import PROCESSORS
+from mme_vla.types import Batch
+from mme_vla.utils import check_sums, inside, read_json
 
 CONFIG_FILE = "processor.json"
 STATS_FILE = "norm_stats.json"
@@ -205,7 +209,7 @@ class PolicyProcessor:
         raise NotImplementedError
 
     def keyframe_item(self, sample: Any) -> dict[str, Any]:
-        """The same of a run of keyframes with depth (`mme_vla.data.keyframe_dataset`), where samples are such."""
+        """The same of a run of keyframes with depth (`mme_vla.data.keyframes`), where samples are such."""
         raise NotImplementedError
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
@@ -264,3 +268,29 @@ def load_processor(folder: Path | str, tokenizer: Path | str | None = None) -> P
     folder = Path(folder)
     kind: type[PolicyProcessor] = PROCESSORS[read_settings(folder).get("name", DEFAULT)]
     return kind.load(folder, tokenizer)
+
+
+def collate(items: Sequence[dict[str, Any]]) -> Batch:
+    """Stack items of one dataset into a `Batch`, without the prompt padding that none of them uses."""
+
+    def stack(name: str) -> Tensor:
+        return torch.stack([item[name] for item in items])
+
+    images = stack("images")
+    batch = Batch(
+        images=images,
+        image_mask=torch.ones(images.shape[:2], dtype=torch.bool),
+        prompt=stack("prompt"),
+        prompt_mask=stack("prompt_mask"),
+        history=stack_history([item["history"] for item in items]) if "history" in items[0] else None,
+        actions=stack("actions"),
+        action_mask=stack("action_mask") if "action_mask" in items[0] else None,
+        state=stack("state"),
+        past=stack_past([item.get("past") for item in items]),
+    )
+    return batch.without_prompt_padding()
+
+
+def pad_width(x: Tensor, width: int) -> Tensor:
+    """Append zeros to the last dimension until it is `width` long."""
+    return functional.pad(x, (0, width - x.shape[-1]))

@@ -12,7 +12,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from mme_vla.serving.counters import ServerStats
+from mme_vla.serving.engine import ServerStats
 from mme_vla.serving.settings import Limits
 
 HEAD_S = 10  # seconds from a request's first byte (or the connection) to the end of its headers

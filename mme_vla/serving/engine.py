@@ -3,18 +3,70 @@
 import asyncio
 import logging
 import time
-from collections import deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mme_vla.policy.base import Policy
-from mme_vla.policy.batching import Act, Read, Turns
 from mme_vla.policy.episode import Episode
-from mme_vla.serving.counters import ServerStats
+from mme_vla.policy.scheduler import Act, Read, Turns
+
+WINDOW = 2048  # latest durations kept of each kind
+
+
+class ServerStats:
+    """Counts since the start, and percentiles over the latest `WINDOW` durations of each kind."""
+
+    def __init__(self) -> None:
+        self._begun = time.monotonic()
+        self._seconds: dict[str, deque[float]] = defaultdict(lambda: deque(maxlen=WINDOW))
+        self.counts: Counter[str] = Counter()
+        self.connections = 0
+
+    def took(self, kind: str, seconds: float) -> None:
+        """Note one finished piece of work."""
+        self.counts[kind] += 1
+        self._seconds[kind].append(seconds)
+
+    def count(self, kind: str, by: int = 1) -> None:
+        """Count something that has no duration."""
+        self.counts[kind] += by
+
+    def percentiles(self, kind: str) -> dict[str, float] | None:
+        """p50, p95 and the longest in milliseconds, or None before the first."""
+        seconds = self._seconds.get(kind)
+        if not seconds:
+            return None
+        p50, p95 = np.percentile(np.fromiter(seconds, float), [50, 95])
+        return {"p50": round(p50 * 1e3, 2), "p95": round(p95 * 1e3, 2), "max": round(max(seconds) * 1e3, 2)}
+
+    def snapshot(self) -> dict[str, Any]:
+        """Everything as plain numbers and texts."""
+        batches = self.counts["batch"]
+        return {
+            "uptime_s": round(time.monotonic() - self._begun, 1),
+            "connections": self.connections,
+            "counts": dict(sorted(self.counts.items())),
+            "mean_batch": round(self.counts["batched"] / batches, 2) if batches else None,
+            "latency_ms": {kind: self.percentiles(kind) for kind in sorted(self._seconds)},
+        }
+
+    def line(self) -> str:
+        """One line for a log."""
+        infer = self.percentiles("infer")
+        times = f"p50 {infer['p50']:.0f} ms, p95 {infer['p95']:.0f} ms" if infer else "none yet"
+        mean = self.snapshot()["mean_batch"]
+        batch = f", {mean} to a batch" if mean else ""
+        return (
+            f"{self.connections} clients · {self.counts['infer']} inferences ({times}{batch}) · "
+            f"{self.counts['refused']} requests refused, {self.counts['failed']} failed"
+        )
+
 
 logger = logging.getLogger("mme_vla.serving")
 
@@ -34,7 +86,7 @@ class _Waiting[T]:
 class Engine:
     """Runs the policy for all clients.
 
-    The event loop never computes. All computing happens in one thread, in the order of `mme_vla.policy.batching`.
+    The event loop never computes. All computing happens in one thread, in the order of `mme_vla.policy.scheduler`.
 
     Args:
         policy: with statistics, on its device.

@@ -16,9 +16,8 @@ from mme_vla.embodiment.robomme import CAMERAS, check_benchmark
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
-from mme_vla.processing.subgoal_text import subgoal_kind
-from mme_vla.serving.listen import is_local
-from mme_vla.serving.settings import ServeSettings
+from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.serving.settings import ServeSettings, is_local
 
 try:
     from jsonargparse import ActionConfigFile, ArgumentParser

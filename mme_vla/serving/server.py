@@ -7,22 +7,45 @@ from contextlib import suppress
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
+from mme_vla.embodiment import Embodiment, Option
+from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import missing_extra
 from mme_vla.policy.base import Policy
-from mme_vla.processing.subgoal_text import subgoal_kind
+from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.serving.codec import pack
-from mme_vla.serving.counters import ServerStats
-from mme_vla.serving.engine import Engine
-from mme_vla.serving.listen import listen
-from mme_vla.serving.settings import ServeSettings
-from mme_vla.serving.warmup import warm_up
+from mme_vla.serving.engine import Engine, ServerStats
+from mme_vla.serving.settings import ServeSettings, listen
+
+
+def warm_up(policy: Policy, settings: ServeSettings) -> None:
+    """Encode a piece of video and choose chunks, alone and as a pair; nothing of it is kept."""
+    robot, count = policy.embodiment, settings.encode_chunk
+    episodes = [policy.start_episode("warm up", seed=settings.seed) for _ in range(min(2, settings.max_batch))]
+    for episode in episodes:
+        episode.subgoal, episode.options = "warm up", (Option("a", "warm up"),)
+        episode.observe(_nothing(robot, count), np.zeros((count, robot.state.width), np.float32))
+    policy.act(episodes[:1], settings.flow_steps)
+    policy.act(episodes, settings.flow_steps)
+
+
+def _nothing(robot: Embodiment, count: int) -> dict[str, np.ndarray]:
+    """Black pictures of every camera, and a wall at no distance where it reads depth."""
+    seen: dict[str, np.ndarray] = {}
+    for camera in robot.cameras:
+        seen[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
+        beside = (np.zeros((count, SIDE, SIDE, 1), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)))
+        seen |= dict(zip(camera.readings, beside, strict=False))
+    return seen
+
 
 try:
     import uvicorn
 
     from mme_vla.serving.app import make_app
     from mme_vla.serving.connections import Connections, HttpProtocol, WebSocketProtocol
-    from mme_vla.serving.http_sessions import HttpSessions
+    from mme_vla.serving.session import HttpSessions
 except ImportError as error:
     raise missing_extra("Serving", "serve") from error
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from mme_vla.subgoal.words.parsing import Parsed, Point
+from mme_vla.subgoal.text import Parsed, Point
 
 HOLD = {"ButtonUnmask": 90, "PickHighlight": 90}
 _HOLD_BY_SUBGOAL = {"ButtonUnmaskSwap": {"press the first button": 100, "press the second button": 250}}

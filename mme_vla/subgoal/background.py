@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.models.threads import start
+from mme_vla.subgoal.models.api import start
 
 GRACE = 2.0  # seconds that closing waits: better not to end the process while a local model computes
 

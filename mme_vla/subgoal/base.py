@@ -14,8 +14,7 @@ import numpy as np
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.registry import SUBGOALS
-from mme_vla.subgoal.words.parsing import MalformedAnswer, Parsed, Point
-from mme_vla.subgoal.words.prompts import KINDS
+from mme_vla.subgoal.text import KINDS, MalformedAnswer, Parsed, Point
 
 log = logging.getLogger(__name__)
 PROBLEMS = ("malformed", "empty", "refused", "failed")

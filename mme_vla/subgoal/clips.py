@@ -7,12 +7,12 @@ from typing import Any, Self
 import numpy as np
 
 from mme_vla.errors import UserError
-from mme_vla.files import decoding, require_file
-from mme_vla.files.media import FPS
+from mme_vla.utils import decoding, require_file
+from mme_vla.utils.media import FPS
 
 VIDEO_FRAMES = 10  # that a model looks at, at most
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
-"""How films that models look at are compressed (`mme_vla.files.media.Film`): finer than those for people."""
+"""How films that models look at are compressed (`mme_vla.utils.media.Film`): finer than those for people."""
 
 _REMEDY = "Build the training data again."
 

@@ -7,13 +7,185 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError
+from mme_vla.processing.prompt import POINT
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.models.api import ApiFailure, Reply, make_api
+from mme_vla.subgoal.models.api import ApiFailure, Reply, make_api, side_by_side
 from mme_vla.subgoal.models.connection import Shown
-from mme_vla.subgoal.models.threads import side_by_side
-from mme_vla.subgoal.words.gemini_prompts import LATE, first_query, gemini_system, next_query
-from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.subgoal.text import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
+
+AT = " at <y, x>"
+
+# `@` marks where a grounded subgoal has a point. [ordinal]: first, second, …; [colour]: red, blue or green.
+VOCABULARY: dict[str, tuple[str, ...]] = {
+    "BinFill": ("pick up the [ordinal] [colour] cube@", "put it into the bin@", "press the button@"),
+    "PickXtimes": (
+        "pick up the [colour] cube@ for the [ordinal] time",
+        "place the [colour] cube onto the target@",
+        "press the button to stop@",
+    ),
+    "SwingXtimes": (
+        "pick up the [colour] cube@",
+        "move to the top of the right-side target@ for the [ordinal] time",
+        "move to the top of the left-side target@ for the [ordinal] time",
+        "put the [colour] cube on the table",
+        "press the button@",
+    ),
+    "StopCube": (
+        "move to the top of the button@ to prepare",
+        "remain static",
+        "press the button to stop the cube on the target@",
+    ),
+    "ButtonUnmask": (
+        "press the button@",
+        "pick up the container@ that hides the [colour] cube",
+        "put down the container",
+    ),
+    "ButtonUnmaskSwap": (
+        "press the first button@",
+        "press the second button@",
+        "pick up the container@ that hides the [colour] cube",
+        "put down the container",
+    ),
+    "VideoUnmask": ("pick up the container@ that hides the [colour] cube", "put down the container"),
+    "VideoUnmaskSwap": ("pick up the container@ that hides the [colour] cube", "put down the container"),
+    "PickHighlight": (
+        "press the button@",
+        "pick up the [ordinal] highlighted cube@, which is [colour]",
+        "place the cube onto the table",
+    ),
+    "VideoRepick": (
+        "pick up the correct cube@ for the [ordinal] time",
+        "put it down",
+        "press the button@ to finish",
+    ),
+    "VideoPlaceButton": ("pick up the cube@", "place the cube onto the correct target@"),
+    "VideoPlaceOrder": ("pick up the cube@", "place the cube onto the correct target@"),
+    "MoveCube": (
+        "close gripper and push the cube@ to the target@",
+        "pick up the cube@",
+        "place the cube onto the target@",
+        "pick up the peg@",
+        "hook the cube@ to the target@ with the peg",
+    ),
+    "InsertPeg": (
+        "pick up the peg by grasping the near end@",
+        "pick up the peg by grasping the far end@",
+        "insert the peg from the left side of the box@",
+        "insert the peg from the right side of the box@",
+    ),
+    "PatternLock": (
+        "move forward", "move backward", "move left", "move right",
+        "move forward-left", "move forward-right", "move backward-left", "move backward-right",
+    ),
+    "RouteStick": tuple(
+        f"move to the nearest {side} target by circling around the stick {turn}"
+        for side in ("left", "right") for turn in ("clockwise", "counterclockwise")
+    ),
+}  # fmt: skip
+
+LATE = frozenset({
+    "BinFill", "PickXtimes", "SwingXtimes", "ButtonUnmask", "ButtonUnmaskSwap", "PickHighlight", "VideoRepick",
+    "VideoPlaceButton", "VideoPlaceOrder", "MoveCube", "InsertPeg",
+})  # fmt: skip
+"""Tasks whose second question waits: their first subgoal takes longer than one interval."""
+
+_NOTES = {
+    "PickHighlight": (
+        "The scene changes while the robot acts: after the button is pressed, cubes are highlighted one after another "
+        "for a short time. Remember which cubes they were, and in which order."
+    ),
+    "MoveCube": "The video shows which of three ways to use: pushing, picking and placing, or hooking with the peg.",
+    "InsertPeg": "The video shows which end of the peg is grasped and from which side it is inserted.",
+    "PatternLock": (
+        "Directions are those of the robot's base. The camera faces the robot: forward, away from the robot, is down "
+        "in the picture, and the robot's left is on the right-hand side of the picture."
+    ),
+    "RouteStick": (
+        "Directions are those of the robot's base. The camera faces the robot, so the robot's left is on the "
+        "right-hand side of the picture, and turning is judged from above."
+    ),
+}
+
+
+def gemini_system(task: str, kind: str) -> str:
+    """The system prompt.
+
+    Args:
+        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
+    """
+    example = example_of(task, kind)
+    parts = [
+        "You watch a robot arm at a table through a camera in front of it, and tell it what to do next. You are given "
+        "the task in words, then pictures or short videos of what happened. Break the task down into subgoals and name "
+        "the one the robot has to work on now.",
+        *what_there_is(task, kind),
+    ]
+    parts.append(
+        "Answer with JSON alone. To the first question: "
+        f'{{"subgoal_sequence": ["{example}", …], "subgoal": "{example}"}}, the whole plan and the first subgoal. To '
+        f'every later one: {{"description": "what happened since", "subgoal": "{example}"}}. Repeat the last subgoal '
+        "while it is not finished yet."
+    )
+    return "\n\n".join(parts)
+
+
+def what_there_is(task: str, kind: str) -> list[str]:
+    """Paragraphs on a task: the subgoals it may have, what points are, and what is special about it.
+
+    Args:
+        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
+    """
+    written = _subgoals(task, kind)
+    parts = [
+        "Subgoals of this task, to be used word for word ([ordinal] is first, second, third, …; [colour] is red, blue "
+        "or green):\n" + "\n".join(f"- {text}" for text in written),
+    ]
+    if kind == "grounded" and any(AT in text for text in written):
+        parts.append(
+            "<y, x> is a point in the latest picture: y is its row and x its column, whole numbers from 0 (top, left) "
+            "to 1000 (bottom, right). Point at the middle of the object that is meant."
+        )
+    if task in _NOTES:
+        parts.append(_NOTES[task])
+    return parts
+
+
+def example_of(task: str, kind: str) -> str:
+    """One subgoal of a task, as a model is to write it."""
+    return _example(_subgoals(task, kind)[0])
+
+
+def _subgoals(task: str, kind: str) -> list[str]:
+    templates = VOCABULARY.get(task) or tuple(dict.fromkeys(t for one in VOCABULARY.values() for t in one))
+    return [_written(template, kind) for template in templates]
+
+
+def first_query(goal: str, video: bool) -> str:
+    """The first question; its pictures come before it, the demonstration video first."""
+    shown = (
+        "The video shows what happened before the robot's turn, the picture shows the scene now."
+        if video
+        else "The picture shows the scene at the start."
+    )
+    return f"The task: {goal}\n{shown} Plan the subgoals, and name the first one."
+
+
+def next_query(clip: bool) -> str:
+    """A later question; its video, or the single picture of a very short stretch, comes before it."""
+    shown = "This video shows what the robot did since." if clip else "This picture shows the scene now."
+    return f"{shown} Describe what happened, and name the current subgoal."
+
+
+def _written(template: str, kind: str) -> str:
+    return template.replace("@", AT if kind == "grounded" else "")
+
+
+def _example(text: str) -> str:
+    filled = text.replace("[ordinal]", "first").replace("[colour]", "red").replace("<y, x>", "<512, 430>")
+    assert POINT.search(filled) or "<" not in filled
+    return filled
+
 
 CLIP = 4  # frames: fewer are not worth a video
 

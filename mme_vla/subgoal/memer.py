@@ -11,8 +11,7 @@ from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, problem_of
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import Question
 from mme_vla.subgoal.qwenvl import VLMPredictor
-from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_memer
-from mme_vla.subgoal.words.prompts import memer_system, memer_user
+from mme_vla.subgoal.text import MalformedAnswer, memer_system, memer_user, parse_memer
 
 
 class MemerEpisode(SubgoalEpisode):

@@ -2,19 +2,222 @@
 
 import threading
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from mme_vla.errors import UserError
+from mme_vla.errors import UserError, brief
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.models.api import ApiFailure, make_api
+from mme_vla.subgoal.gemini import example_of, what_there_is
+from mme_vla.subgoal.models.api import ApiFailure, make_api, side_by_side
 from mme_vla.subgoal.models.connection import Shown
-from mme_vla.subgoal.models.threads import side_by_side
-from mme_vla.subgoal.notes import Notebook, read_notes
-from mme_vla.subgoal.words.notebook_prompts import MONITOR, monitor_query, next_query, opening_query, planner_system
-from mme_vla.subgoal.words.parsing import MalformedAnswer, json_object, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.subgoal.text import MalformedAnswer, json_object, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.utils import is_text
+
+MONITOR = (
+    "You watch a robot arm at a table through a camera in front of it, and judge one thing alone: whether it has "
+    "completed the subgoal that it was given. An object is picked up once it is in the air; it is put down once the "
+    "gripper has let go of it; a button is pressed once it was pushed down; a place is reached once the tool is over "
+    "it. What only seems to be about to happen is not complete.\n\n"
+    'Answer with JSON alone: {"why": "what is to be seen", "done": true} or {"why": "…", "done": false}.'
+)
+
+
+def planner_system(task: str, kind: str) -> str:
+    """The system prompt of the planner.
+
+    Args:
+        task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
+    """
+    example = example_of(task, kind)
+    parts = [
+        "You lead a robot arm at a table, which you see through a camera in front of it. You keep a notebook, the only "
+        "thing that you remember from one question to the next: write down what later decisions depend on. Whether a "
+        "subgoal is complete is judged by somebody else; you are asked once it is, and name the next one.",
+        *what_there_is(task, kind),
+        "Notes are of three kinds. A count says how often something has been done; it may stay or grow by one. An "
+        "identity says which thing is meant, in words that tell it from the others, where it is now. A route is a list "
+        "of steps that never changes, and how many of them are done. A note with a name that is there already takes "
+        "its place.",
+        'Answer with JSON alone: {"notes": [{"kind": "count", "name": "cubes in the bin", "value": 1}, {"kind": '
+        '"identity", "name": "the container with the red cube", "words": "the left one of the two in front"}, {"kind": '
+        f'"route", "name": "the pattern", "steps": ["move left"], "done": 0}}], "subgoal": "{example}"}}. Leave '
+        '"notes" empty where there is nothing to write.',
+    ]
+    return "\n\n".join(parts)
+
+
+def opening_query(goal: str, video: bool) -> str:
+    """The planner's first question; its pictures come before it, the demonstration video first."""
+    shown = (
+        "The video shows what happened before the robot's turn, the picture shows the scene now. Note what has to be "
+        "remembered of the video."
+        if video
+        else "The picture shows the scene at the start."
+    )
+    return f"The task: {goal}\n{shown} Name the first subgoal."
+
+
+def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
+    """A later question to the planner; the video of the finished subgoal, if it has frames, comes before it."""
+    shown = "The picture shows the scene now."
+    if clip:
+        shown = "The video shows how it was done, the picture the scene now."
+    return (
+        f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete. {shown} Bring the notebook "
+        "up to date, and name the next subgoal."
+    )
+
+
+def monitor_query(goal: str, subgoal: str, clip: bool) -> str:
+    """A question to the monitor; its pictures come before it."""
+    shown = (
+        "The video shows what the robot did since it was given the subgoal, the picture the scene now."
+        if clip
+        else "The picture shows the scene now."
+    )
+    return f"The task: {goal}\nThe subgoal: {subgoal}\n{shown} Is the subgoal complete?"
+
+
+MOST_NOTES, MOST_STEPS, MOST_WORDS, MOST_COUNT = 16, 32, 200, 99
+
+
+@dataclass(frozen=True)
+class Count:
+    """How often something has been done; it never falls, and one finished subgoal adds one at most."""
+
+    value: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """As a model writes it, without the name."""
+        return {"kind": "count", "value": self.value}
+
+    def check(self, before: "Count | None", finished: bool) -> None:
+        """See `Notebook.written`."""
+        if before is not None and not before.value <= self.value <= before.value + finished:
+            raise MalformedAnswer(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Which thing is meant, in words that tell it from the others."""
+
+    words: str
+
+    def to_dict(self) -> dict[str, Any]:
+        """As a model writes it, without the name."""
+        return {"kind": "identity", "words": self.words}
+
+    def check(self, before: "Identity | None", finished: bool) -> None:
+        """See `Notebook.written`: things are moved, so that other words may tell them."""
+
+
+@dataclass(frozen=True)
+class Route:
+    """Steps in order, and how many are done; they stay what they were, and one finished subgoal does one at most."""
+
+    steps: tuple[str, ...]
+    done: int = 0
+
+    def to_dict(self) -> dict[str, Any]:
+        """As a model writes it, without the name."""
+        return {"kind": "route", "steps": list(self.steps), "done": self.done}
+
+    def check(self, before: "Route | None", finished: bool) -> None:
+        """See `Notebook.written`."""
+        if self.done > len(self.steps):
+            raise MalformedAnswer(f"{self.done} of {len(self.steps)} steps cannot be done")
+        if before is not None and before.steps != self.steps:
+            raise MalformedAnswer("the steps of a route were changed")
+        if before is not None and not before.done <= self.done <= before.done + finished:
+            raise MalformedAnswer(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
+
+
+Note = Count | Identity | Route
+
+
+@dataclass(frozen=True)
+class Notebook:
+    """What is known, by name; and the subgoals that were finished, in order."""
+
+    notes: Mapping[str, Note] = field(default_factory=dict)
+    finished: tuple[str, ...] = ()
+
+    def written(self, entries: Sequence[tuple[str, Note]], finished: str | None) -> "Notebook":
+        """The notebook with these entries.
+
+        Args:
+            finished: the subgoal that was just completed; None where notes are taken before anything was done.
+
+        Raises:
+            MalformedAnswer: an entry changes in a way that its kind does not; nothing is written then.
+        """
+        notes = dict(self.notes)
+        for name, note in entries:
+            before = self.notes.get(name)
+            if before is not None and type(before) is not type(note):
+                raise MalformedAnswer(f"{brief(name)} was another kind of note before")
+            note.check(before, finished is not None)  # type: ignore[arg-type]
+            notes[name] = note
+        if len(notes) > MOST_NOTES:
+            raise MalformedAnswer(f"the notebook has room for {MOST_NOTES} notes")
+        return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
+
+    def in_words(self) -> str:
+        """The notebook as a model reads it, a note a line."""
+        lines = []
+        for name, note in self.notes.items():
+            if isinstance(note, Count):
+                lines.append(f"- count, {name}: {note.value}")
+            elif isinstance(note, Identity):
+                lines.append(f"- identity, {name}: {note.words}")
+            else:
+                steps = "; ".join(f"{i}. {step}" for i, step in enumerate(note.steps, 1))
+                lines.append(f"- route, {name}: {steps} ({note.done} of {len(note.steps)} done)")
+        lines += [f"- finished: {text}" for text in self.finished]
+        return "\n".join(lines) or "- nothing yet"
+
+
+def read_notes(given: Any) -> list[tuple[str, Note]]:
+    """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has.
+
+    Raises:
+        MalformedAnswer: something else.
+    """
+    if not isinstance(given, list) or not all(isinstance(entry, dict) for entry in given):
+        raise MalformedAnswer("notes is not a list of objects")
+    return [(_words(entry.get("name"), "name"), _read(entry)) for entry in given[: MOST_NOTES + 1]]
+
+
+def _read(entry: dict[str, Any]) -> Note:
+    kind = entry.get("kind")
+    if kind == "count":
+        return Count(_whole(entry.get("value"), "value", MOST_COUNT))
+    if kind == "identity":
+        return Identity(_words(entry.get("words"), "words"))
+    if kind == "route":
+        steps = entry.get("steps")
+        if not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS:
+            raise MalformedAnswer(f"steps is not a list of 1 to {MOST_STEPS} texts")
+        return Route(tuple(_words(step, "steps") for step in steps), _whole(entry.get("done", 0), "done", MOST_STEPS))
+    raise MalformedAnswer(f"there are notes of the kinds count, identity and route, not {brief(kind)}")
+
+
+def _words(given: Any, what: str) -> str:
+    if not isinstance(given, str) or not is_text(given) or not (text := " ".join(given.split())):
+        raise MalformedAnswer(f"the {what} of a note is no text")
+    if len(text) > MOST_WORDS:
+        raise MalformedAnswer(f"the {what} of a note has more than {MOST_WORDS} characters")
+    return text
+
+
+def _whole(given: Any, what: str, most: int) -> int:
+    if isinstance(given, bool) or not isinstance(given, int) or not 0 <= given <= most:
+        raise MalformedAnswer(f"the {what} of a note is no whole number from 0 to {most}")
+    return given
+
 
 CLIP = 4  # frames: fewer are not worth a video
 LONGEST = 200  # frames of a subgoal that are shown: the last ones of a longer one

@@ -6,7 +6,7 @@ from typing import Any
 from mme_vla.errors import UserError
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
-from mme_vla.subgoal.words.parsing import points_of
+from mme_vla.subgoal.text import points_of
 
 
 @SUBGOALS.register("oracle")

@@ -12,8 +12,7 @@ from mme_vla.subgoal.answers import SubgoalHistory, hold_until
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor, problem_of
 from mme_vla.subgoal.clips import Clip
 from mme_vla.subgoal.models.qwen3vl import VLM, Answer, Question
-from mme_vla.subgoal.words.parsing import MalformedAnswer, parse_subgoal, write_boxes
-from mme_vla.subgoal.words.prompts import subgoal_system, subgoal_user
+from mme_vla.subgoal.text import MalformedAnswer, parse_subgoal, subgoal_system, subgoal_user, write_boxes
 
 
 class VLMPredictor(SubgoalPredictor):

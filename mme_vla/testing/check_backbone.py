@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from mme_vla.backbone.base import Backbone, Injection
-from mme_vla.backbone.layers.blocks import Block
+from mme_vla.backbone.blocks import Block
 from mme_vla.config.sections import read_section
 from mme_vla.registry import BACKBONES
 from mme_vla.types import Batch

@@ -49,8 +49,8 @@ def _scene(task: str, seed: int, difficulty: str | None, options: dict[str, Any]
 
 
 def _demonstrated(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> dict[str, Any]:
-    from mme_vla.envs.recording.demonstration import demonstrate
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.recording.recorder import demonstrate
+    from mme_vla.envs.robot.stick_skills import Demonstrator
 
     env = _make(task, seed, difficulty, options)
     try:

@@ -12,8 +12,8 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
-from mme_vla.processing.normalisers import NormStats, QuantileStats
-from mme_vla.processing.past_views import full_past
+from mme_vla.processing.images import full_past
+from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.types import Batch, HistoryTokens, PastViews
 
 PERCEPTUAL = [f"{m}_{i}" for m in ("framesamp", "tokendrop") for i in ("context", "modul", "expert")]

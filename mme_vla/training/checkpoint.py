@@ -23,7 +23,6 @@ import torch
 from torch import Tensor, distributed, nn
 
 from mme_vla.errors import UserError, listed
-from mme_vla.files import check_sums, inside, read_json, write_sums
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
 from mme_vla.policy.tensor_files import (
@@ -36,7 +35,7 @@ from mme_vla.policy.tensor_files import (
     save_tensors,
     written_weights,
 )
-from mme_vla.training.ema import EMA
+from mme_vla.training.optim import EMA
 from mme_vla.training.parallel import like, whole_state
 from mme_vla.training.settings import KeepRule
 from mme_vla.training.shards import (
@@ -48,6 +47,7 @@ from mme_vla.training.shards import (
     shard_files,
     training_tensors,
 )
+from mme_vla.utils import check_sums, inside, read_json, write_sums
 
 FORMAT = "mme_vla training checkpoint 1"
 RAW, OPTIMIZER = "raw.safetensors", "optimizer.safetensors"

@@ -5,20 +5,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mme_vla.data.cache.ensure import ensure_cache
-from mme_vla.data.cache.store import COMMAND
-from mme_vla.data.dataset import TrainingDataset
-from mme_vla.data.groups import GroupDataset
-from mme_vla.data.keyframe_dataset import KeyframeDataset
-from mme_vla.data.sources import open_sources
-from mme_vla.data.splits import default_val_episodes, split_episodes
+from mme_vla.data.cache import COMMAND
+from mme_vla.data.cache_building import ensure_cache
+from mme_vla.data.dataset import GroupDataset, TrainingDataset
+from mme_vla.data.keyframes import KeyframeDataset
+from mme_vla.data.sources import default_val_episodes, open_sources, split_episodes
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
-from mme_vla.files import check_sums, inside
 from mme_vla.policy.base import Policy
 from mme_vla.processing.base import STATS_FILE
-from mme_vla.processing.normalisers import NormStats
-from mme_vla.processing.subgoal_text import SubgoalText
+from mme_vla.processing.normalise import NormStats
+from mme_vla.processing.prompt import SubgoalText
+from mme_vla.utils import check_sums, inside
 
 
 @dataclass(frozen=True)

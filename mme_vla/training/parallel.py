@@ -18,9 +18,9 @@ from torch.distributed.device_mesh import DeviceMesh, init_device_mesh
 from torch.distributed.fsdp import FSDPModule, MixedPrecisionPolicy, fully_shard
 from torch.distributed.tensor import DTensor
 
-from mme_vla.backbone.shard_groups import float32_modules
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.base import Policy
+from mme_vla.speed.sharding import float32_modules
 
 STRATEGIES = ("auto", "ddp", "fsdp")
 WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)

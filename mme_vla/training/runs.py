@@ -9,13 +9,15 @@ from typing import Any
 
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.files import FolderLock, plain
-from mme_vla.files.locks import LOCK
-from mme_vla.policy.kinds import policy_name
-from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, resolve_checkpoint, step_of
+from mme_vla.policy.base import Policy
+from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, newest_checkpoint, resolve_checkpoint, step_of
+from mme_vla.policy.saving import policy_name
 from mme_vla.registry import INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
+from mme_vla.utils import FolderLock, plain
+from mme_vla.utils.locks import LOCK
+from mme_vla.weights import transfer
 
 PARTS = {"memory": MEMORIES, "integration": INTEGRATIONS}
 CONFIG, METRICS, SUMMARY, PLOT = "config.yaml", "metrics.jsonl", "summary.json", "open_loop.png"
@@ -199,3 +201,39 @@ def _newest_unfinished(folder: Path) -> Path | None:
         if found:
             return None if (run / SUMMARY).is_file() and run != folder else found[-1]
     return None
+
+
+ASK, NONE = "ask", "none"
+
+
+def weights_to_start_from(init_from: str | None) -> str | None:
+    """What `init_from` names; None for random weights.
+
+    Raises:
+        UserError: a recipe that is meant for trained weights (`init_from: ask`) was given none.
+    """
+    if init_from == ASK:
+        raise UserError(
+            "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
+            "To train the whole network from random weights, say so: init_from=none."
+        )
+    return None if init_from in (None, NONE) else init_from
+
+
+def start_from(policy: Policy, source: str) -> str:
+    """Copy every weight that `source` holds into a freshly built policy; only its memory's own may be new.
+
+    Args:
+        source: a checkpoint of any format (`mme_vla.weights`), or one of this library's run folders, which stands for
+            its newest checkpoint.
+
+    Returns:
+        A sentence that says what was taken, what is new and what was left behind.
+
+    Raises:
+        UserError: no checkpoint, another tokenizer, a weight of another shape, or weights missing that are not the
+            memory's.
+    """
+    found = newest_checkpoint(Path(source))
+    source = source if found == Path(source) else str(found)
+    return f"weights from {source}: {transfer(policy, source)}"

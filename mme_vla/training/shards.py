@@ -24,9 +24,9 @@ from torch.distributed.checkpoint.staging import DefaultStager, StagingOptions
 from torch.distributed.tensor import DTensor
 
 from mme_vla.errors import UserError, listed
-from mme_vla.files import Sums, decoding, inside, sum_line
 from mme_vla.policy.tensor_files import check_header, check_values
 from mme_vla.training.parallel import reshard
+from mme_vla.utils import Sums, decoding, inside, sum_line
 
 SHARDS = "shards"
 RAW, AVERAGE, STEPS = "raw", "average", "steps"

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import distributed
 
-from mme_vla.files.parents import end_with_parent
+from mme_vla.utils.processes import end_with_parent
 
 ANSWERED = (signal.SIGINT, signal.SIGTERM)
 

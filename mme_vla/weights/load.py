@@ -10,20 +10,20 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.files import inside, read_json
+from mme_vla.methods.diffusion_policy.weights import diffusion_adapter
+from mme_vla.methods.memoryvla.weights import memoryvla_adapter
+from mme_vla.methods.openvla_oft.weights import openvla_adapter
+from mme_vla.methods.sam2act.weights import sam2act_adapter
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
-from mme_vla.weights.adapter import Adapter, memory_parameters
-from mme_vla.weights.diffusion_policy import diffusion_adapter
-from mme_vla.weights.foreign_statistics import read_stats, stats_files
-from mme_vla.weights.memoryvla import memoryvla_adapter
-from mme_vla.weights.openvla import openvla_adapter
+from mme_vla.utils import inside, read_json
 from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
-from mme_vla.weights.sam2act_files import sam2act_adapter
 from mme_vla.weights.source import Source, open_source
+from mme_vla.weights.statistics import read_stats, stats_files
+from mme_vla.weights.tables import Adapter, memory_parameters
 
 ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "lerobot": port_adapter,

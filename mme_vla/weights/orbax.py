@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, missing_extra
-from mme_vla.files import decoding, inside, read_text, require_file
+from mme_vla.utils import decoding, inside, read_text, require_file
 
 MANIFEST, METADATA = "manifest.ocdbt", "_METADATA"
 ARRAY_FILES = {"/.zarray": "zarr", "/zarr.json": "zarr3"}

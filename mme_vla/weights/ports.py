@@ -12,12 +12,11 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.spacetime import SpaceTime
+from mme_vla.memory.extensions.spacetime import SpaceTime
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.weights.adapter import Adapter, pi05_of
-from mme_vla.weights.name_tables import Piece, prefixed
 from mme_vla.weights.names import torch_backbone as names
+from mme_vla.weights.tables import Adapter, Piece, pi05_of, prefixed
 
 LEROBOT_PREFIX = "model."
 _VLM = rf"^{names.ROOT}\.paligemma\."

@@ -17,8 +17,7 @@ from mme_vla.memory.base import Memory
 from mme_vla.memory.joined import JoinedMemory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.policy.tensor_files import assign_tensors
-from mme_vla.weights.adapter import Adapter, memory_parameters, pi05_of
-from mme_vla.weights.name_tables import Derived, NameTable, Unread, prefixed
+from mme_vla.weights.tables import Adapter, Derived, NameTable, Unread, memory_parameters, pi05_of, prefixed
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:

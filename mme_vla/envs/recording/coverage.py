@@ -7,7 +7,7 @@ from typing import Any
 
 from mme_vla.envs.make import make_task
 from mme_vla.envs.metadata import EpisodeSpec
-from mme_vla.files import read_json
+from mme_vla.utils import read_json
 
 
 def goal_of(spec: EpisodeSpec) -> str:
@@ -24,7 +24,7 @@ def goals_recorded(dataset: Path | None, official: Sequence[Path]) -> dict[str, 
     """The goals of a recording, by task: out of its dataset, or of its official files where there is none."""
     found: dict[str, set[str]] = {}
     if dataset is not None:
-        from mme_vla.data.conversion import SIDE_FILE
+        from mme_vla.data.convert import SIDE_FILE
 
         for episode in read_json(dataset / SIDE_FILE, "the facts of a recorded dataset")["episodes"]:
             found.setdefault(episode["task"], set()).add(episode["goals"][0])

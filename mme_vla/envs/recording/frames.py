@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mme_vla.data.choice_rows import CHOICE_NUMBERS, find_choices, row_of
-from mme_vla.data.waypoints import Motions, find_motions, known_poses
+from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_motions, known_poses, row_of
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.episodes import spans
+from mme_vla.envs.render_request import Drawing
 from mme_vla.errors import UserError
 from mme_vla.registry import MEMORIES
 

@@ -1,20 +1,19 @@
 """One demonstration as data: every stored step of an episode, with the fields of the official files."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
-from mme_vla.envs.drawing import Drawing
 from mme_vla.envs.grounding import Grounding, project
 from mme_vla.envs.observations import AngleTrack, Include, Observer
-from mme_vla.envs.recording.demonstration import demonstrate
+from mme_vla.envs.render_request import Drawing
 from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.robot.demonstrator import Demonstrator
-from mme_vla.envs.robot.grasping import DOWNWARD_Q
+from mme_vla.envs.robot.gripper_skills import DOWNWARD_Q
+from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
 if TYPE_CHECKING:
@@ -22,6 +21,49 @@ if TYPE_CHECKING:
 
     from mme_vla.envs.subtasks import SubTask
     from mme_vla.envs.task import Task
+
+
+def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
+    """Perform the sub-tasks of a task that has just been reset, evaluating before and after each one.
+
+    The demonstrator's view of where the episode stands, `env.progress.planned`, moves at these evaluations only. In a
+    recovery demonstration the drawn pick of the execution fails once first.
+
+    Args:
+        env: the task; while this runs, `env.recording` is set.
+        demonstrator: of the same task. Its steps are where frames are taken, its waypoints where they are noted.
+        subtasks: what to perform; by default all of the task's.
+
+    Returns:
+        Whether the task succeeded.
+
+    Raises:
+        PlanningError: a motion could not be planned.
+    """
+    subtasks = env.progress.subtasks if subtasks is None else subtasks
+    picks = [subtask for subtask in subtasks if subtask.pick and not subtask.video]
+    recording, env.recording = env.recording, True
+    try:
+        ended = _ended(env)
+        for subtask in subtasks:
+            if ended or _ended(env):
+                break
+            if env.recovery and env.failed_pick is not None and subtask in picks:
+                failing = picks.index(subtask) == env.failed_pick
+                demonstrator.fail_next_pick = env.recovery if failing else None
+            subtask.run(demonstrator)
+            ended = _ended(env)
+    finally:
+        env.recording = recording
+    return env.success() and not env.progress.failed
+
+
+def _ended(env: "Task") -> bool:
+    """Evaluate once, as a recorder does between sub-tasks; whether the episode is over."""
+    env.evaluate()
+    env.progress.planned = env.progress.index
+    return env.progress.succeeded or env.progress.failed
+
 
 MAX_STEPS = 2000
 """Control steps after which a recording is given up."""

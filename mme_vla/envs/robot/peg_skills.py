@@ -6,7 +6,7 @@ import numpy as np
 import sapien
 
 from mme_vla.envs.robot.control import CLOSE, OPEN, RobotControl
-from mme_vla.envs.robot.grasping import pointing_down, turned
+from mme_vla.envs.robot.gripper_skills import pointing_down, turned
 from mme_vla.envs.scene.objects import H, Peg
 from mme_vla.envs.scene.things import Thing
 

@@ -20,8 +20,8 @@ from mani_skill.agents.robots.panda.panda_stick import PandaStick
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 from mani_skill.sensors.camera import CameraConfig
 
-from mme_vla.envs.meshes import CELL, coarsen, read_stl, stl_bytes
-from mme_vla.files import user_cache
+from mme_vla.envs.rendering import CELL, coarsen, read_stl, stl_bytes
+from mme_vla.utils import user_cache
 
 WRISTCAM = "mme_vla_panda_wristcam"
 """Agent id of the Panda with gripper and wrist camera."""

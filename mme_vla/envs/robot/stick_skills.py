@@ -6,6 +6,8 @@ import numpy as np
 import sapien
 
 from mme_vla.envs.robot.control import CLOSE, PlanningError, RobotControl
+from mme_vla.envs.robot.gripper_skills import GripperPrimitives
+from mme_vla.envs.robot.peg_skills import PegPrimitives
 from mme_vla.envs.scene.things import Thing
 
 STICK_Z = 0.07
@@ -73,3 +75,18 @@ def arc(start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "cou
     t = np.linspace(0, 1, ARC_SAMPLES)[:, None]
     points = (1 - t) ** 2 * a + 2 * t * (1 - t) * control + t**2 * b
     return np.column_stack([points, np.full(ARC_SAMPLES, STICK_Z)])
+
+
+__all__ = ["Demonstrator", "PlanningError"]
+
+
+class Demonstrator(GripperPrimitives, PegPrimitives, StickPrimitives):
+    """Performs the primitives that demonstrations and multi-choice options are made of.
+
+    Motions are planned from where the arm is and carried out without looking; the same scene gives the same steps.
+    Waypoints are announced before the motion that leads there.
+
+    Example:
+        >>> demonstrator = Demonstrator(env, env.step)  # doctest: +SKIP
+        >>> demonstrator.pick(env.cubes[0])  # doctest: +SKIP
+    """

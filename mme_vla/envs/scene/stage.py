@@ -12,10 +12,9 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 
 from mme_vla.embodiment.robomme import SIDE
-from mme_vla.envs.rendering import keep_renderer
+from mme_vla.envs.rendering import keep_renderer, lean_shaders
 from mme_vla.envs.robot.robots import ROBOT_BASE, STICK, WRISTCAM
 from mme_vla.envs.scene.things import Thing, pose_of
-from mme_vla.envs.shaders import lean_shaders
 
 RESET_QPOS = np.array([0, 0, 0, -np.pi / 2, 0, np.pi / 2, np.pi / 4], np.float32)
 """Joint angles at the start of every episode, and the target of the reset action; radians."""

@@ -1,10 +1,9 @@
 """ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up the right one."""
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.anchors import shifted_anchors
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Button, build_button
-from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.placement import draw_button, shifted_anchors
 from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task

@@ -17,7 +17,7 @@ from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robot.stick_skills import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
 TOLD = {

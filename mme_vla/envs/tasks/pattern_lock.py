@@ -18,7 +18,7 @@ from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.stick import back_to_start
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robot.stick_skills import Demonstrator
 
 GRID = {"easy": 3, "medium": 4, "hard": 5}
 PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}

@@ -2,10 +2,9 @@
 
 from typing import ClassVar
 
-from mme_vla.envs.language import ordinal
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Disc
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import SubTask, ordinal
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.video_place import VideoPlace
 

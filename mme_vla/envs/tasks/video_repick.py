@@ -3,20 +3,26 @@
 from typing import TYPE_CHECKING
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.language import number, ordinal
-from mme_vla.envs.scene.anchors import ANCHOR_HALF, rotated_anchors, swaps_in_turn
 from mme_vla.envs.scene.cues import Cue, row, tally, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
 from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.placement import (
+    ANCHOR_HALF,
+    Region,
+    SceneError,
+    draw_button,
+    draw_cube,
+    rotated_anchors,
+    swaps_in_turn,
+)
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.demonstrator import Demonstrator
+    from mme_vla.envs.robot.stick_skills import Demonstrator
 
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes

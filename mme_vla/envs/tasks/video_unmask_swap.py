@@ -1,8 +1,8 @@
 """VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick up the right one."""
 
 from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.anchors import rotated_anchors
 from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.placement import rotated_anchors
 from mme_vla.envs.scene.predicates import StaticFor
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.tasks import register_task

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.envs.rendering import renderer_works
-from mme_vla.files.parents import end_with_parent
+from mme_vla.utils.processes import end_with_parent
 
 LARGE = 4096
 """Arrays of at least this many bytes go through shared memory; everything else is pickled."""

@@ -12,8 +12,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.layers.attention import sight_mask
-from mme_vla.backbone.pi05.gemma import JointBlock, KeyValue, LayerModulation, Layout, Room
+from mme_vla.backbone.attention import sight_mask
+from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, Room
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 

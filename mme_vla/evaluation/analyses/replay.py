@@ -9,7 +9,7 @@ from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.subgoal_text import SubgoalText
+from mme_vla.processing.prompt import SubgoalText
 
 STRIDE = 16
 """Steps between two chunks, as an evaluation executes them."""

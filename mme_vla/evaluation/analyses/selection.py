@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.memory_picture import memory_sheet
+from mme_vla.data.memory_image import memory_sheet
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import OnlineHistory

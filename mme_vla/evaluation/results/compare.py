@@ -7,8 +7,7 @@ import numpy as np
 
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeKey
-from mme_vla.evaluation.results.aggregate import Method
-from mme_vla.evaluation.results.intervals import Interval, bootstrap, holm, sign_test
+from mme_vla.evaluation.results.aggregate import Interval, Method, bootstrap, holm, sign_test
 from mme_vla.evaluation.results.scopes import Protocol, scopes
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results import paper
-from mme_vla.evaluation.suites import MAX_STEPS, PAPER_ORDER, PAPER_SEEDS, TASK_FACTS
+from mme_vla.evaluation.results.scopes import MAX_STEPS, PAPER_ORDER, PAPER_SEEDS, TASK_FACTS
 
 CHECKPOINTS = (60_000, 70_000, 79_999)
 _LEVELS = ("easy", "easy", "medium", "hard")

@@ -1,12 +1,13 @@
 """The paper's numbers, to put beside one's own."""
 
 import csv
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.evaluation.suites import PAPER_ORDER, TASK_FACTS
+from mme_vla.evaluation.results.scopes import PAPER_ORDER, TASK_FACTS
 
 FOLDER = Path(__file__).resolve().parents[2] / "assets" / "paper"
 
@@ -98,5 +99,52 @@ def group_mean(method: str, group: str) -> PaperResult:
 def _mean(method: str, tasks: list[str] | tuple[str, ...]) -> float:
     results = per_task(method)
     if not tasks:
-        raise UserError("No task of this name: see SUITES and GROUPS of mme_vla.evaluation.suites.")
+        raise UserError("No task of this name: see SUITES and GROUPS of mme_vla.evaluation.results.scopes.")
     return sum(results[task].mean for task in tasks) / len(tasks)
+
+
+REPLAN = 16
+"""Frames that pass between two chunks of an episode."""
+_COUNTED = Path(__file__).resolve().parents[2] / "assets" / "cost.csv"
+
+
+@dataclass(frozen=True)
+class ModelCost:
+    """One model's cost; all but `prompt` (tokens) and `parameters` in FLOPs.
+
+    forward: the loss of one training sample. chunk: memory, prefix and ten Euler steps. memory: of these, encoding the
+    memory tokens from scratch. streamed: instead, a recurrent memory's update by one frame (None for others). frames:
+    the vision tower on those of `REPLAN` passing frames that the memory stores.
+    """
+
+    model: str
+    prompt: int
+    parameters: int
+    forward: int
+    chunk: int
+    memory: int
+    streamed: int | None
+    frames: int
+
+
+@cache
+def counted() -> dict[str, ModelCost]:
+    """The shipped counts of every model at full size, made by `python -m mme_vla.analyse cost`."""
+    with _COUNTED.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    numbers = [{key: int(text) if text else None for key, text in row.items() if key != "model"} for row in rows]
+    return {row["model"]: ModelCost(row["model"], **of) for row, of in zip(rows, numbers, strict=True)}  # type: ignore
+
+
+def chunk_flops() -> dict[str, float]:
+    """FLOPs of a sampled chunk at full size, by model."""
+    return {model: float(cost.chunk) for model, cost in counted().items()}
+
+
+def write_costs(costs: list[ModelCost], path: Path) -> None:
+    """Write counts as CSV."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, [member.name for member in fields(ModelCost)], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(asdict(cost) for cost in costs)

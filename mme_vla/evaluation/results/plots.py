@@ -9,7 +9,7 @@ import numpy as np
 
 from mme_vla.evaluation.results import paper
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
-from mme_vla.evaluation.suites import OWN, SUITES, task_facts
+from mme_vla.evaluation.results.scopes import OWN, SUITES, task_facts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,10 +7,10 @@ from html import escape
 from mme_vla.evaluation.results import plots
 from mme_vla.evaluation.results.aggregate import USUAL_BUDGET, Results
 from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.results.cost_table import chunk_flops
-from mme_vla.evaluation.results.process_scores import CAPTION, process_tables
+from mme_vla.evaluation.results.curves import CAPTION, process_tables
+from mme_vla.evaluation.results.paper import chunk_flops
 from mme_vla.evaluation.results.tables import Table, comparison_table, detail, overview, runs_table
-from mme_vla.evaluation.rollout.subgoal_score import subgoal_tables
+from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 
 _CSS = """
 :root { --ink: #2b2d42; --faint: #6c7689; --line: #e3e6ec; --accent: #1f6f8b; }

@@ -6,7 +6,7 @@ from typing import Any
 
 from mme_vla.evaluation.results.aggregate import Method
 from mme_vla.evaluation.results.tables import escape_markdown
-from mme_vla.evaluation.run_file import RUN_FILE, read_run
+from mme_vla.evaluation.store import RUN_FILE, read_run
 
 UNKNOWN = "not recorded with these results: state it by hand"
 RECIPE = {

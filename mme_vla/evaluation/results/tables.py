@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from mme_vla.errors import printable
 from mme_vla.evaluation.results.aggregate import Figure, Method, Results
 from mme_vla.evaluation.results.compare import Comparison, show_p
-from mme_vla.evaluation.suites import PAPER_SEEDS
+from mme_vla.evaluation.results.scopes import PAPER_SEEDS
 
 if TYPE_CHECKING:
     from rich.table import Table as RichTable

@@ -1,33 +1,74 @@
 """A whole evaluation: claim the folder, leave out what is done, run the rest, record every episode at once."""
 
+import os
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mme_vla.embodiment.robomme import check_benchmark
+from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
-from mme_vla.envs.vector.jobs import Job
-from mme_vla.envs.vector.pool import VecEnv
+from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError
-from mme_vla.evaluation.claims import Claims
 from mme_vla.evaluation.forecast import Durations, earlier_records
-from mme_vla.evaluation.record_log import RecordLog, read_records
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.plan import Shard
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Workload
+from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.rollout.subgoal_trace import SUBGOALS
-from mme_vla.evaluation.rollout.waiting import Waiting
-from mme_vla.evaluation.run_file import INDIFFERENT, claim_run, fingerprint
-from mme_vla.files import remove_drafts, safe_name
+from mme_vla.evaluation.rollout.subgoals import SUBGOALS
+from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
-from mme_vla.processing.subgoal_text import subgoal_kind
+from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
+from mme_vla.utils import remove_drafts, safe_name
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several processes that share a run."""
+
+    index: int = 0
+    count: int = 1
+
+    @property
+    def file(self) -> str:
+        """Name of the file its records go to."""
+        return RECORDS if self.count == 1 else f"episodes-{self.index}of{self.count}.jsonl"
+
+
+def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test") -> list[Job]:
+    """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`).
+
+    Raises:
+        UserError: an unknown task, split or episode, or none at all.
+    """
+    return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split)]
+
+
+def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
+    """Read `0/4` (the first of four), or what torchrun says of this process.
+
+    Args:
+        text: wins over the environment. environment: by default the process's own.
+
+    Raises:
+        UserError: no two numbers, or the first not below the second.
+    """
+    environment = os.environ if environment is None else environment
+    if text is None:
+        if "RANK" not in environment or "WORLD_SIZE" not in environment:
+            return Shard()
+        text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
+    found = re.fullmatch(r"(\d+)/(\d+)", str(text))
+    shard = Shard(int(found[1]), int(found[2])) if found else Shard(1, 0)
+    if shard.index >= shard.count:
+        raise UserError(f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
+    return shard
+
 
 USUAL_BUDGET = 512
 VIDEOS = "videos"

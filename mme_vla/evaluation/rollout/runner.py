@@ -6,7 +6,7 @@ for a slow episode, and a long conditioning video is read in pieces between batc
 
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -14,20 +14,46 @@ from typing import Protocol
 import numpy as np
 
 from mme_vla.envs import metadata
-from mme_vla.envs.vector.jobs import Job, Reply
+from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord
-from mme_vla.evaluation.results.process_scores import EXTRA as PROCESS
-from mme_vla.evaluation.rollout.pictures import Pictures
+from mme_vla.evaluation.results.curves import EXTRA as PROCESS
+from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.running_episode import RunningEpisode
+from mme_vla.evaluation.rollout.render_plan import Pictures
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.rollout.subgoal_score import EXTRA
-from mme_vla.evaluation.rollout.subgoal_trace import SubgoalTrace
-from mme_vla.evaluation.rollout.waiting import Waiting
+from mme_vla.evaluation.rollout.subgoals import EXTRA, SubgoalTrace
+from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
-from mme_vla.policy.batching import Act, Prepare, Turns
+from mme_vla.policy.scheduler import Act, Prepare, Turns
 from mme_vla.subgoal import SubgoalPredictor
+
+
+class Waiting:
+    """Episodes in the order they begin.
+
+    Args:
+        jobs: all that are left. claims: where other processes run the same ones; each then begins what it could claim.
+    """
+
+    def __init__(self, jobs: Iterable[Job] = (), claims: Claims | None = None) -> None:
+        self._jobs, self._claims = list(jobs), claims
+        self._again: list[Job] = []
+
+    def take(self) -> Job | None:
+        """The next episode to begin, if there is one; those tried again come last."""
+        if self._claims is None:
+            job = self._jobs.pop(0) if self._jobs else None
+        else:
+            job = self._claims.take(self._jobs)
+            if job is not None:
+                self._jobs.remove(job)
+        return self._again.pop(0) if job is None and self._again else job
+
+    def put_back(self, job: Job) -> None:
+        """Have an episode run once more, by this process."""
+        self._again.append(job)
+
 
 GIVE_UP_AFTER = 8  # episodes in a row whose environments did not even begin
 

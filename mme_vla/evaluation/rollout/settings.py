@@ -9,8 +9,8 @@ from mme_vla.config.sections import read_section
 from mme_vla.envs.make import ENVS
 from mme_vla.envs.metadata import check_split
 from mme_vla.errors import UserError, did_you_mean
-from mme_vla.evaluation.rollout.film import KEPT
-from mme_vla.evaluation.suites import MAX_STEPS
+from mme_vla.evaluation.results.scopes import MAX_STEPS
+from mme_vla.evaluation.rollout.video import KEPT
 
 DRAWN = ("needed", "all")
 

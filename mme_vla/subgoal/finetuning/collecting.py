@@ -1,6 +1,6 @@
 """Training data of the subgoal predictors, from demonstrations.
 
-`python -m mme_vla.subgoal.build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
+`mme-vla subgoal-build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
 
 Writes one JSON-lines file for each set (`simple.jsonl`, `grounded.jsonl`, `memer.jsonl`) in the layout of ms-swift,
 with the pictures and videos beside it; paths in the rows are relative to the output folder. An interrupted run goes on
@@ -17,14 +17,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_values import EpisodeRef
-from mme_vla.data.layout import SAMPLE
-from mme_vla.data.progress import progress
+from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.errors import UserError, brief
-from mme_vla.files import (
+from mme_vla.subgoal.clips import ENCODING
+from mme_vla.subgoal.finetuning.labels import Labels
+from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
+from mme_vla.utils import (
     SUMS,
     FolderLock,
     claim_plan,
@@ -35,10 +38,7 @@ from mme_vla.files import (
     write_atomically,
     write_sums,
 )  # fmt: skip
-from mme_vla.files.media import png_bytes, write_film
-from mme_vla.subgoal.clips import ENCODING
-from mme_vla.subgoal.finetuning.labels import Labels
-from mme_vla.subgoal.finetuning.rows import RowOptions, episode_rows
+from mme_vla.utils.media import png_bytes, write_film
 
 if TYPE_CHECKING:
     pass

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.files.media import film_bytes, png_bytes
 from mme_vla.subgoal.clips import ENCODING
 from mme_vla.subgoal.models.connection import Connection, Heard, Settings, Shown, Turn, count
+from mme_vla.utils.media import film_bytes, png_bytes
 
 
 class GoogleConnection(Connection):

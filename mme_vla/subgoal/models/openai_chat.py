@@ -10,9 +10,9 @@ from urllib.parse import unquote, urlsplit
 import numpy as np
 
 from mme_vla.errors import UserError, missing_extra
-from mme_vla.files.media import png_bytes
 from mme_vla.subgoal.clips import sample_video
 from mme_vla.subgoal.models.connection import Connection, Heard, Settings, Shown, Turn, count
+from mme_vla.utils.media import png_bytes
 
 _ROLES = {"user": "user", "model": "assistant"}
 

@@ -10,10 +10,10 @@ import torch
 
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean, missing_extra
-from mme_vla.files.media import FPS
 from mme_vla.subgoal.clips import VIDEO_FRAMES, Clip
 from mme_vla.subgoal.models.tiny import make_tiny
-from mme_vla.subgoal.words.prompts import IMAGE, VIDEO, split_media
+from mme_vla.subgoal.text import IMAGE, VIDEO, split_media
+from mme_vla.utils.media import FPS
 
 IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: a picture; a video frame
 TOKEN_SIDE = 32  # pixels of a token: patches of 16, merged 2×2

@@ -1,9 +1,9 @@
 """The released (JAX) names of the backbone's tensors. VLM leaves have no suffix, the action expert's end in `_1`."""
 
-from mme_vla.backbone.pi05.backbone import Pi05Backbone
-from mme_vla.backbone.pi05.gemma import ExpertLayer
-from mme_vla.backbone.pi05.sizes import BackboneConfig, ExpertConfig
-from mme_vla.weights.name_tables import NameTable, Piece, Unread, linear, prefixed
+from mme_vla.backbone.config import BackboneConfig, ExpertConfig
+from mme_vla.backbone.gemma import ExpertLayer
+from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.weights.tables import NameTable, Piece, Unread, linear, prefixed
 
 LAYERS = "PaliGemma/llm/layers"
 SUFFIX = {"vlm": "", "action": "_1", "memory": "_mem"}

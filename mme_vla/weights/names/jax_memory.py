@@ -4,11 +4,11 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.memory.base import Memory
-from mme_vla.memory.perceptual import PerceptualMemory
+from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.memory.rmt import RMTLayer, angles
 from mme_vla.memory.ttt import TTTLayer
-from mme_vla.weights.name_tables import Derived, NameTable, Piece, Unread, linear, prefixed
+from mme_vla.weights.tables import Derived, NameTable, Piece, Unread, linear, prefixed
 
 ENCODER = "mem_encoder/feature_encoder"
 LAYER = "mem_encoder/recur_layer"

@@ -4,11 +4,11 @@ They follow transformers' modules as of 4.52, without LeRobot's leading `model.`
 q, k and v, and gate and up, which here are apart. An expert that integrates memory has no names in these formats.
 """
 
-from mme_vla.backbone.layers.norms import AdaRMSNorm
-from mme_vla.backbone.pi05.backbone import Pi05Backbone
-from mme_vla.backbone.pi05.gemma import ExpertLayer
-from mme_vla.backbone.pi05.sizes import BackboneConfig, VisionConfig
-from mme_vla.weights.name_tables import NameTable, Piece, Unread, prefixed
+from mme_vla.backbone.config import BackboneConfig, VisionConfig
+from mme_vla.backbone.gemma import ExpertLayer
+from mme_vla.backbone.layers import AdaRMSNorm
+from mme_vla.backbone.pi05 import Pi05Backbone
+from mme_vla.weights.tables import NameTable, Piece, Unread, prefixed
 
 ROOT = "paligemma_with_expert"
 VISION = f"{ROOT}.paligemma.model.vision_tower.vision_model"

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-from mme_vla.envs.scene.anchors import ANCHOR_HALF, Point, swaps_in_turn
 from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
 from mme_vla.envs.scene.objects import Container, H, build_container
-from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_container
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Avoid, Point, Region, SceneError, draw_container, swaps_in_turn
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.families.containers import add_hidden_cubes
 

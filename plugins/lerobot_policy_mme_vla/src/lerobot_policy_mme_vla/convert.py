@@ -14,8 +14,7 @@ from mme_vla.config.composition import print_user_errors
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError
-from mme_vla.policy.hub import local_folder
-from mme_vla.policy.saving import read_config
+from mme_vla.policy.saving import local_folder, read_config
 
 
 def for_lerobot(policy: Policy, device: str = "cpu") -> MMEVLAPolicy:

@@ -18,14 +18,13 @@ from mme_vla import Policy
 from mme_vla.config.composition import compose
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
-from mme_vla.files import write_sums
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.hub import local_folder
-from mme_vla.policy.kinds import policy_class
+from mme_vla.policy.saving import local_folder, policy_class
 from mme_vla.policy.tensor_files import WEIGHTS, assign_tensors, load_tensors
 from mme_vla.processing.base import load_processor
 from mme_vla.training.data import check_frozen
+from mme_vla.utils import write_sums
 from mme_vla.weights import start_from
 
 PREFIX = "model."

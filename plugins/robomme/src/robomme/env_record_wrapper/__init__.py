@@ -5,7 +5,7 @@ from pathlib import Path
 from mme_vla.envs import metadata
 from mme_vla.envs.interface import RoboMMEEnv
 from mme_vla.envs.make import check_names, make_env
-from mme_vla.envs.task_names import TASK_NAMES
+from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.errors import UserError
 
 __all__ = ["BenchmarkEnvBuilder"]

@@ -1,0 +1,108 @@
+"""Attention behind one function, so that the kernel is chosen in one place."""
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+from torch.nn.attention import SDPBackend, sdpa_kernel
+
+from mme_vla.backbone.blocks import Sight
+from mme_vla.backbone.sparse_attention import FlexSight, PackedSight, attend_by_blocks, attend_packed
+from mme_vla.errors import UserError, did_you_mean
+
+BACKENDS = ("auto", "sdpa", "flex", "varlen")
+"""`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the sight, skips what nobody sees.
+`varlen`: flash attention over keys packed for each run of queries. `auto`: see `look`."""
+
+Seen = Tensor | FlexSight | PackedSight | None
+"""What `attend` reads of who may see whom: a mask [b, 1, q, k], what another backend makes of a sight, or all."""
+
+BIG_NEGATIVE = -1e30
+"""Far below any logit, and still finite where kernels count in base 2 (times 1.44): no row becomes NaN."""
+
+ALIGNMENT = 8
+"""Keys a row of the mask is padded to, as fused kernels want it: otherwise they copy the mask in every layer."""
+
+KERNELS = [SDPBackend.FLASH_ATTENTION, SDPBackend.EFFICIENT_ATTENTION, SDPBackend.MATH]
+"""On a GPU. cuDNN, which PyTorch prefers on H100, gives NaN gradients for masks at some lengths (pytorch#196678)."""
+
+
+def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
+    """[b, q, k] bool → [b, 1, q, k] of 0 and `BIG_NEGATIVE`, made once per forward and shared by all layers.
+
+    Added to finite logits in float32 it absorbs them, so this equals replacing them.
+    """
+    return _padded(mask, dtype)[..., : mask.shape[-1]].unsqueeze(1)
+
+
+def sight_mask(sight: Sight, dtype: torch.dtype) -> Tensor:
+    """The same from who may see whom: [b, 1, n, k]."""
+    return sight.spread(_padded(sight.seen, dtype))[..., : sight.seen.shape[-1]].unsqueeze(1)
+
+
+def _padded(seen: Tensor, dtype: torch.dtype) -> Tensor:
+    *rows, keys = seen.shape
+    mask = torch.zeros(*rows, -(-keys // ALIGNMENT) * ALIGNMENT, dtype=dtype, device=seen.device)
+    mask[..., :keys].masked_fill_(~seen, BIG_NEGATIVE)
+    return mask
+
+
+def check_backend(name: str) -> str:
+    """The name of a backend.
+
+    Raises:
+        UserError: there is none of that name.
+    """
+    if name not in BACKENDS:
+        raise UserError(f"policy.attention={name!r}. {did_you_mean(str(name), BACKENDS)}")
+    return name
+
+
+def look(sight: Sight, dtype: torch.dtype, backend: str, compiled: bool) -> Seen:
+    """Who may see whom as one backend reads it, made once per forward and shared by all layers.
+
+    `auto` is `flex` for training on a GPU where layers are `compiled`, so that it is part of their code; else `sdpa`.
+    """
+    if backend == "auto":
+        backend = "flex" if compiled and sight.seen.is_cuda and torch.is_grad_enabled() else "sdpa"
+    if backend == "flex":
+        return FlexSight.of(sight)
+    return PackedSight.of(sight) if backend == "varlen" else sight_mask(sight, dtype)
+
+
+def part_of(seen: Seen, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
+    """What some of the queries see, for the last layer: they are few, so that it is a mask whatever the backend."""
+    if isinstance(seen, Tensor):
+        return torch.cat([seen[:, :, at] for at in rows], 2)
+    assert seen is not None
+    return sight_mask(seen.sight.part(rows), dtype)
+
+
+def our_kernels(x: Tensor) -> AbstractContextManager[object]:
+    """The context of every attention on a GPU: kernels we choose, never PyTorch by its own order."""
+    return sdpa_kernel(KERNELS) if x.is_cuda else nullcontext()
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, mask: Seen) -> Tensor:
+    """Scaled dot-product attention with grouped queries: query head n reads key head n // (N/K).
+
+    Args:
+        q: [b, q, N, h]; k, v: [b, k, K, h].
+        mask: as `look` makes it; or additive [b, 1, q, k] in q's dtype; or bool, if every row sees a key; or None.
+
+    Returns:
+        [b, q, N·h].
+    """
+    if isinstance(mask, FlexSight):
+        return attend_by_blocks(q, k, v, mask)
+    if isinstance(mask, PackedSight):
+        return attend_packed(q, k, v, mask)
+    groups = q.shape[2] // k.shape[2]
+    q, k, v = (x.transpose(1, 2) for x in (q, k, v))
+    if groups > 1:
+        # One shared key head broadcasts without a copy; several are repeated.
+        k, v = ((x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1)) for x in (k, v))
+    with our_kernels(q):
+        return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)

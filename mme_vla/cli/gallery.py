@@ -1,0 +1,136 @@
+"""`mme-vla gallery`: the 16 tasks at a glance, one demonstrated episode each, on one page."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mme_vla.envs import metadata
+from mme_vla.envs.episodes import choose_episodes, named_tasks
+from mme_vla.envs.make import make_task, require_simulator
+from mme_vla.errors import UserError
+from mme_vla.utils.media import RED, Tile, contact_sheet, spread
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+    from PIL.Image import Image
+
+    from mme_vla.envs.task import Task
+
+COLUMNS = 4  # pictures a row
+EVERY = 8
+"""Steps between two pictures that are taken; which of them are shown is decided at the end."""
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The front view at one step."""
+
+    step: int
+    picture: np.ndarray
+    subtask: str
+    video: bool
+
+
+def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
+    """Demonstrate a task and look at it every few steps; also returns whether it succeeded."""
+    from mme_vla.envs.observations import Include, Observer
+    from mme_vla.envs.recording.recorder import demonstrate
+    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.subtasks import NO_RECORD
+
+    observer = Observer(task, Include(), render=True)
+    snapshots: list[Snapshot] = []
+
+    def look(evaluated: dict[str, Any]) -> None:
+        observer.follow()
+        shown = task.progress.shown
+        if task.steps_done % every == 1 and shown.text != NO_RECORD:
+            picture = observer.frame(evaluated)["front_rgb"]
+            snapshots.append(Snapshot(task.steps_done, picture, shown.text, shown.video))
+
+    task.reset()
+    observer.start()
+    task.observe = look
+    try:
+        success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
+    finally:
+        task.observe = None
+    return snapshots, success
+
+
+def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
+    """Some of the snapshots side by side, spread evenly, each with its step; video frames have a red border."""
+    chosen = [snapshots[i] for i in spread(len(snapshots), tiles)]
+    labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in chosen]
+    pictures = [
+        Tile(shot.picture, label, RED if shot.video else None) for shot, label in zip(chosen, labels, strict=True)
+    ]
+    return contact_sheet(pictures, COLUMNS)
+
+
+def page(entries: Sequence[tuple[str, str, str]]) -> str:
+    """The page's Markdown; each entry is a task, its goal and the name of its picture."""
+    lines = [
+        "# The sixteen tasks",
+        "",
+        "One demonstrated episode each, front camera; pictures with a red border belong to the conditioning video.",
+        "Drawn by `mme-vla gallery`.",
+        "",
+    ]
+    for task, goal, picture in entries:
+        lines += [f"## {task}", "", f"*{goal}*", "", f"![{task}]({picture})", ""]
+    return "\n".join(lines)
+
+
+def run(cfg: "DictConfig") -> None:
+    """Draw the gallery as configs/show.yaml and the command line say.
+
+    Raises:
+        UserError: an unknown task, split or episode, too few tiles, or no simulator or renderer.
+    """
+    from mme_vla.data.console import progress
+
+    specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
+    if not isinstance(cfg.tiles, int) or cfg.tiles < 2:
+        raise UserError(f"tiles={cfg.tiles!r}: expected an integer of at least 2.")
+    require_simulator()
+    folder = Path(cfg.output)
+    folder.mkdir(parents=True, exist_ok=True)
+    entries = []
+    with progress("show", len(specs), unit="tasks") as advance:
+        for spec in specs:
+            env, snapshots = _demonstrated(spec)
+            several = sum(other.task == spec.task for other in specs) > 1
+            picture = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
+            strip(snapshots, cfg.tiles).save(folder / picture, quality=82)
+            entries.append((spec.task, env.goals()[0], picture))
+            env.close()
+            advance(1)
+    (folder / "README.md").write_text(page(entries))
+    print(f"{folder / 'README.md'}: {len(entries)} tasks.")
+
+
+def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
+    """The first seed from the episode's on whose demonstration succeeds, as the official episodes were found."""
+    from mme_vla.envs.scene.placement import SceneError
+
+    for seed in range(spec.seed, spec.seed + 100):
+        try:
+            env = make_task(spec.task, render=True, seed=seed, difficulty=spec.difficulty)
+        except SceneError:
+            continue
+        snapshots, success = demonstrate_with_pictures(env)
+        if success:
+            return env, snapshots
+        env.close()
+    raise UserError(f"{spec.task}: no demonstration succeeded for seeds {spec.seed} … {spec.seed + 99}.")
+
+
+def main() -> None:
+    """Run `mme-vla gallery`."""
+    from mme_vla.config.composition import cli
+
+    cli("show")(run)()

@@ -1,0 +1,12 @@
+"""`mme-vla harness --args.checkpoint=…`: a policy behind AI2's vla-evaluation-harness."""
+
+
+def main() -> None:
+    """Serve as the harness's own model servers do; `--help` lists its words.
+
+    Raises:
+        UserError: the extra `harness` is not installed, or a checkpoint that cannot be served.
+    """
+    from mme_vla.serving.harness import run_server
+
+    run_server()

@@ -1,0 +1,287 @@
+"""Building a vision cache: episode by episode, each written whole or not at all."""
+
+import logging
+import os
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import groupby
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.data.ahead import ahead
+from mme_vla.data.cache import (
+    COMMAND,
+    DTYPES,
+    FINGERPRINT,
+    CacheMissingError,
+    VisionCache,
+    cache_folder,
+    check_fingerprint,
+    default_cache_root,
+    fingerprint,
+    kept_frames,
+    score_file,
+    sum_file,
+    token_file,
+)
+from mme_vla.data.console import progress
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.errors import UserError
+from mme_vla.memory.base import Memory
+from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
+
+PAGE = 4096  # bytes
+CHUNKS_AHEAD = 2
+
+Encode = Callable[[np.ndarray], Tensor]  # frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What building would take: frames to encode, bytes on disk, seconds (one process), as measured on a few frames."""
+
+    frames: int
+    bytes: int
+    seconds: float
+
+
+def process_rank() -> tuple[int, int]:
+    """(rank, world size) as torchrun gives them, (0, 1) without it."""
+    return int(os.environ.get("RANK", "0")), int(os.environ.get("WORLD_SIZE", "1"))
+
+
+def clear_cache(folder: Path) -> None:
+    """Remove the files of a cache, and nothing else.
+
+    Raises:
+        UserError: the folder is not a vision cache.
+    """
+    if not folder.exists():
+        return
+    if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
+        raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache, so nothing is removed.")
+    for pattern in ("episode_*.np[yz]", "episode_*.sha256", "*.partial", FINGERPRINT):
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
+
+
+def build_cache(
+    source: EpisodeSource,
+    memory: Memory,
+    encode: Encode,
+    folder: Path,
+    expected: dict[str, Any],
+    *,
+    batch_size: int = 32,
+    shard: tuple[int, int] | None = None,
+) -> int:
+    """Encode the episodes that are still missing; return how many were written.
+
+    Stopped at any moment, it continues with the next call. Processes share the work: of the episodes, each takes those
+    whose number is its rank modulo the world size.
+
+    Raises:
+        UserError: the folder holds something else (`check_fingerprint`).
+    """
+    rank, world = process_rank() if shard is None else shard
+    folder.mkdir(parents=True, exist_ok=True)
+    if not (folder / FINGERPRINT).is_file():
+        if any(not path.name.endswith(".partial") for path in folder.iterdir()):
+            check_fingerprint(folder, expected)
+        write_json(folder / FINGERPRINT, expected, indent=1)
+    check_fingerprint(folder, expected)
+    remove_drafts(folder)
+    mine = range(rank, len(source), world)
+    missing = [episode for episode in mine if not token_file(folder, episode).is_file()]
+    total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
+    with (
+        progress(f"vision cache {source.name}", total, total - left, "frames") as advance,
+        # Pictures are decoded in a thread while the ones before them are encoded.
+        closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
+    ):
+        for episode, of_episode in groupby(chunks, lambda found: found[0]):
+            some = (chunk for _, chunk in of_episode)
+            _build_episode(source, episode, some, memory, encode, folder, expected["dtype"], advance)
+    return len(missing)
+
+
+def _of_all(
+    source: EpisodeSource, episodes: Sequence[int], memory: Memory, batch_size: int
+) -> Iterator[tuple[int, "_Chunk"]]:
+    """The chunks of all episodes, one after the other; an episode of which nothing was drawn has an empty one."""
+    for episode in episodes:
+        yield episode, _Chunk(0, np.zeros((0, 1, 1, 3), np.uint8), [], [])
+        for chunk in _chunks(source, episode, memory, batch_size):
+            yield episode, chunk
+
+
+def estimate(
+    source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
+) -> Estimate:
+    """Measure a few batches of the first episode and extrapolate to the dataset."""
+    kept = sum(len(kept_frames(source, episode, memory.storage)) for episode in range(len(source)))
+    chunk = next(_chunks(source, 0, memory, batch_size))
+    encode(chunk.kept_pictures[:1])  # the first call pays for warming up
+    started = time.perf_counter()
+    seen, bytes_per_frame = 0, 0
+    for chunk in _chunks(source, 0, memory, batch_size):
+        tokens = encode(chunk.kept_pictures)
+        bytes_per_frame = tokens[0].numel() * np.dtype(DTYPES[dtype]).itemsize
+        seen += chunk.length
+        if time.perf_counter() - started > 5:
+            break
+    seconds = (time.perf_counter() - started) / seen * int(source.lengths.sum())
+    return Estimate(kept, kept * bytes_per_frame, seconds)
+
+
+@dataclass(frozen=True)
+class _Chunk:
+    """A stretch of an episode: how many frames it spans, the pictures to encode, and the scores that came up."""
+
+    length: int
+    kept_pictures: np.ndarray
+    score_frames: list[int]
+    score_values: list[np.ndarray]
+
+
+def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
+    spec, length, scorer = memory.storage, int(source.lengths[episode]), memory.make_scorer()
+    kept, scored = kept_frames(source, episode, memory.storage), memory.frames_scored(length)
+    span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
+    for start in range(0, length, span):
+        stop = min(start + span, length)
+        here = kept[(kept >= start) & (kept < stop)]
+        wanted = np.union1d(here, scored[(scored >= start) & (scored < stop)])
+        if not len(wanted):
+            continue
+        pictures = source.frames(episode, wanted)
+        frames, values = [], []
+        if scorer is not None:
+            for frame, picture in zip(wanted.tolist(), pictures, strict=True):
+                row = scorer(frame, picture)
+                if row is not None:
+                    frames.append(frame)
+                    values.append(np.asarray(row, np.float32))
+        yield _Chunk(stop - start, pictures[np.isin(wanted, here)], frames, values)
+
+
+def _build_episode(
+    source: EpisodeSource,
+    episode: int,
+    chunks: Iterable[_Chunk],
+    memory: Memory,
+    encode: Encode,
+    folder: Path,
+    dtype: str,
+    advance: Callable[[int], None],
+) -> None:
+    patches = memory.storage.grid**2
+    rows: list[np.ndarray] = []
+    frames: list[int] = []
+    values: list[np.ndarray] = []
+    for chunk in chunks:
+        frames += chunk.score_frames
+        values += chunk.score_values
+        if len(chunk.kept_pictures):
+            tokens = encode(chunk.kept_pictures)
+            if tokens.shape[:2] != (len(chunk.kept_pictures), patches):
+                raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.kept_pictures)} frames")
+            rows.append(_to_numpy(tokens, dtype))
+        advance(chunk.length)
+    if not rows:
+        raise UserError(f"{source.name}, episode {episode}: none of the frames that the memory stores was drawn.")
+    drafts: dict[Path, Path] = {}
+    if memory.storage.scorer:
+        stacked = np.stack(values) if values else np.zeros((0, patches), np.float32)
+        path = score_file(folder, episode)
+        drafts[path] = _draft(path, np.savez, frames=np.asarray(frames, np.int64), values=stacked)
+    path = token_file(folder, episode)
+    drafts[path] = _draft(path, save_aligned, np.concatenate(rows))
+    sums = "".join(sum_line(draft, path.name) for path, draft in drafts.items())
+    with write_atomically(sum_file(folder, episode)) as draft:
+        draft.write_text(sums)
+    for path, draft in drafts.items():  # tokens last: where they are, all else is
+        draft.replace(path)
+
+
+def save_aligned(file: IO[bytes], array: np.ndarray) -> None:
+    """Write an array as .npy whose numbers begin at a page: a row of one page is then read as one, not as two."""
+    buffer = BytesIO()
+    np.lib.format.write_array_header_1_0(buffer, np.lib.format.header_data_from_array_1_0(array))
+    magic, described = buffer.getvalue()[:8], buffer.getvalue()[10:].rstrip()
+    described += b" " * (PAGE - 11 - len(described)) + b"\n"
+    file.write(magic + len(described).to_bytes(2, "little") + described)
+    file.write(np.ascontiguousarray(array).data)
+
+
+def _to_numpy(tokens: Tensor, dtype: str) -> np.ndarray:
+    if dtype == "bfloat16":
+        return tokens.detach().to(torch.bfloat16).view(torch.uint16).cpu().numpy()
+    return tokens.detach().float().cpu().numpy()
+
+
+def _draft(path: Path, writer: Callable[..., None], *arrays: np.ndarray, **named: np.ndarray) -> Path:
+    """What will become `path`, on disk already."""
+    draft = draft_of(path)
+    with draft.open("wb") as handle:
+        writer(handle, *arrays, **named)
+        handle.flush()
+        os.fsync(handle.fileno())
+    return draft
+
+
+log = logging.getLogger(__name__)
+
+
+def ensure_cache(
+    source: EpisodeSource,
+    memory: Memory,
+    encode: Encode,
+    encoder: str,
+    *,
+    root: Path | str | None = None,
+    dtype: str = "bfloat16",
+    max_build_frames: int = 5000,
+    batch_size: int = 32,
+    command: str = COMMAND,
+) -> VisionCache:
+    """Open the cache of a dataset for this memory; build it first, or finish it, where the dataset is small.
+
+    Args:
+        source, memory: whose tokens. encode: `policy.encode_frames`. encoder: `policy.vision_fingerprint()`.
+        root: folder of all caches; None for `default_cache_root()`.
+        dtype: of the stored tokens. batch_size: frames encoded at once.
+        max_build_frames: datasets of more frames are not built here: that is worth a command of its own.
+        command: that command, for messages.
+
+    Raises:
+        UserError: the dataset is larger than that and its cache is not there, or the cache is stale or damaged.
+    """
+    coded = source.lossy.get(source.robot.memory_camera)
+    if coded is not None and memory.make_scorer() is not None:
+        log.warning(
+            "%s: its films are coded as %s, and this memory scores patches by how little they change: what compression "
+            "moves passes for motion. Convert the recordings with lossless films, or choose another memory.",
+            source.name, coded,
+        )  # fmt: skip
+    expected = fingerprint(source, memory.storage, encoder, dtype)
+    folder = cache_folder(default_cache_root() if root is None else Path(root), source, expected)
+    try:
+        return VisionCache(folder, source, expected, command)
+    except CacheMissingError as error:
+        frames = int(source.lengths.sum())
+        if frames > max_build_frames:
+            raise UserError(
+                f"{error} (It is not built here because {source.name} has {frames} frames, more than "
+                f"data.cache.max_build_frames={max_build_frames}; add dry_run=true to see size and time first.)"
+            ) from None
+    # All of it here, also under torchrun, where training has its first process prepare the data for the others.
+    build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
+    return VisionCache(folder, source, expected, command)

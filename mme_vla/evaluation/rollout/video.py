@@ -1,0 +1,89 @@
+"""An episode as a video: all cameras side by side, the conditioning part in a red border, the subgoal below."""
+
+import re
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+
+from mme_vla.utils import draft_of
+from mme_vla.utils.media import Film, film_frame
+
+KEPT = ("none", "all", "success", "failure")
+BEHIND = 64
+"""Frames that may wait to be compressed."""
+_LONGEST_GOAL = 100  # characters of a file name
+
+
+class EpisodeVideo:
+    """Draws and compresses frame by frame, so that no episode is held in memory.
+
+    A thread compresses beside the simulation, which waits only when it is `BEHIND` frames ahead.
+    The file gets its name, which tells the outcome, when the episode is over; until then it is a hidden file beside it.
+
+    Args:
+        path: of the video, from outcome and goal.
+        kept: which outcomes are kept: `all`, `success` or `failure`.
+    """
+
+    def __init__(self, path: Callable[[str, str], Path], kept: str = "all") -> None:
+        self._path, self._kept = path, kept
+        self._film: Film | None = None
+        self._draft = Path()
+        self._thread: ThreadPoolExecutor | None = None
+        self._waiting: deque[Future[None]] = deque()
+
+    def add(self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False) -> None:
+        """Append the pictures [H, W, 3] uint8 that all cameras took at one moment."""
+        if self._film is None:
+            self._film, self._thread = self._open(), ThreadPoolExecutor(1, "film")
+        assert self._thread is not None
+        self._waiting.append(self._thread.submit(self._film.add, film_frame(views, caption, demo)))
+        while len(self._waiting) > BEHIND:
+            self._waiting.popleft().result()
+
+    def finish(self, outcome: str, goal: str) -> Path | None:
+        """Close the video under its name; None if this outcome is not kept."""
+        if self._film is None or self._kept not in ("all", "success" if outcome == "success" else "failure"):
+            self.discard()
+            return None
+        self._compressed()
+        self._film.close()
+        target = self._path(outcome, goal)
+        self._draft.replace(target)
+        self._film = None
+        return target
+
+    def discard(self) -> None:
+        """Drop what was drawn."""
+        if self._film is not None:
+            for frame in self._waiting:
+                frame.cancel()
+            self._compressed(whole=False)
+            self._film.close(whole=False)
+            self._draft.unlink(missing_ok=True)
+            self._film = None
+
+    def _compressed(self, whole: bool = True) -> None:
+        """Wait for the thread; with `whole`, what went wrong in it is raised."""
+        if self._thread is not None:
+            self._thread.shutdown()
+        waiting, self._waiting, self._thread = self._waiting, deque(), None
+        for frame in waiting if whole else ():
+            frame.result()
+
+    def _open(self) -> Film:
+        folder = self._path("", "").parent
+        folder.mkdir(parents=True, exist_ok=True)
+        self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
+        return Film(self._draft)
+
+
+def video_name(task: str, episode: int, outcome: str, goal: str) -> str:
+    """`PickXtimes_ep3_success_pick_up_the_red_cube.mp4`."""
+    words = re.sub(r"[^a-z0-9]+", "_", goal.lower()).strip("_")
+    if len(words) > _LONGEST_GOAL:
+        words = words[:_LONGEST_GOAL].rpartition("_")[0]
+    return "_".join(part for part in (task, f"ep{episode}", outcome, words) if part) + ".mp4"

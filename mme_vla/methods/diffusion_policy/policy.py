@@ -1,0 +1,327 @@
+"""`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or with a memory."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.base import Draws, map_draws, stack_draws
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError, brief
+from mme_vla.integration.film import PooledIntegration
+from mme_vla.memory.base import Memory
+from mme_vla.methods.diffusion_policy import model
+from mme_vla.methods.diffusion_policy.config import DiffusionSizes
+from mme_vla.methods.diffusion_policy.model import DiffusionNetwork
+from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
+from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_memory, check_past
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.masking import masked_mean
+from mme_vla.policy.saving import policy_options
+from mme_vla.policy.tensor_files import dtype_of
+from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
+from mme_vla.registry import INTEGRATIONS, POLICIES
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+if TYPE_CHECKING:
+    from mme_vla.processing.base import PolicyProcessor
+
+
+@POLICIES.register("diffusion_policy")
+class DiffusionPolicy(Policy):
+    """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks under what is seen, felt and asked for.
+
+    Any memory may stand beside it, through an integration that makes one vector of its tokens (`film`).
+    """
+
+    processor: DiffusionProcessor | None
+    adapted = ("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3")
+    heads = ("final_conv",)
+    PARTS: ClassVar[Mapping[str, str]] = {
+        "vision": r"backbone\.vision\.",
+        "memory": r"memory\.|integration\.",
+        "encoder": r"backbone\.(image_encoder|image_pool)\.",
+        "text": r"backbone\.text_proj\.",
+        "action": "",
+    }
+
+    def __init__(
+        self,
+        backbone: DiffusionNetwork,
+        memory: Memory | None = None,
+        integration: PooledIntegration | None = None,
+        processor: DiffusionProcessor | None = None,
+        config: Mapping[str, Any] | None = None,
+        *,
+        compute_dtype: str = "float32",
+        history_dtype: str = "bfloat16",
+        augment: bool = True,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            processor: needed for episodes and data; the network alone runs on ready batches without it.
+            config: what `from_config` was given; saved with the weights.
+            compute_dtype, history_dtype: as for `MMEPolicy`.
+            augment: crop at random while training, one place for the whole batch; else the centre, as when acting.
+        """
+        super().__init__()
+        self.backbone, self.memory, self.integration = backbone, memory, integration
+        self.processor = processor
+        self.config = dict(config or {})
+        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
+        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
+        self.augment = augment
+        self.sizes = sizes = backbone.sizes
+        self.horizon, self.action_dim = sizes.horizon, sizes.action_dim
+        self.skipped, self.sample_steps = sizes.window - 1, sizes.diffusion_steps
+
+    @classmethod
+    def from_config(
+        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
+    ) -> Self:
+        """Build from plain sections `backbone`, `embodiment`, `memory`, `integration`, `policy`.
+
+        Raises:
+            UserError: an unknown name or option, sizes that do not fit together, or a package that is missing.
+        """
+        model.require_diffusers()
+        sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
+        integration = _pooled(config.get("integration"), sizes)
+        if (integration is None) != (not config.get("memory")):
+            given = "a memory without an integration" if integration is None else "an integration without a memory"
+            raise UserError(f"This configuration names {given}; name both, or neither.")
+        if robot.action.width != sizes.action_dim:
+            raise UserError(
+                f"backbone.action_dim={sizes.action_dim}: Diffusion Policy answers with the robot's own "
+                f"{robot.action.width} numbers an action; leave it to the embodiment."
+            )
+        feature = 0 if integration is None else integration.feature_width
+        network = DiffusionNetwork(sizes, len(robot.cameras), robot.state.width, feature, integration is not None)
+        memory: Memory | None = None
+        if integration is not None:
+            grid = sizes.memory_tower.image_size // sizes.memory_tower.patch_size
+            memory = build_memory(config["memory"], sizes.memory_width, grid, integration.memory_width)
+            check_past(config, memory, frozenset())
+        if processor is not None and not isinstance(processor, DiffusionProcessor):
+            raise UserError("Diffusion Policy needs its own processor: set processor=dp, or dp_tiny to try things out.")
+        return cls(network, memory, integration, processor, config, **policy_options(cls, config))
+
+    def autocast(self) -> torch.autocast:
+        """The context all network code runs in."""
+        kind = self.device.type if self.device.type != "meta" else "cpu"
+        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+    # Training
+
+    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """The `noise` [n, h, a] that is added and the `step` [n] that says how much."""
+        step = torch.randint(self.sizes.diffusion_steps, (count,), generator=generator)
+        return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
+
+    def forward(
+        self,
+        batch: DiffusionBatch,
+        draws: Mapping[str, Tensor] | None = None,
+        corner: tuple[int, int] | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The mean squared error of the predicted noise, and metrics to log (detached).
+
+        Args:
+            batch: with `actions`. draws: as `loss_draws` makes them.
+            corner: (top, left) of the crop; by default drawn while training and the centre's else.
+        """
+        if batch.actions is None:
+            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
+        given = draws or self.loss_draws(len(batch.actions), torch.default_generator)
+        drawn = map_draws(given, lambda value: value.to(self.device))
+        memory = self.encode_memory(batch.history)
+        with self.autocast():
+            condition = self.condition(batch, memory, corner)
+            noisy = model.add_noise(self._schedule(), batch.actions, drawn["noise"], drawn["step"])
+            predicted = self.backbone.unet(noisy, drawn["step"], condition)
+        losses = (predicted.float() - drawn["noise"]).square().mean(-1)  # b h
+        loss = masked_mean(losses, batch.action_mask)
+        reported = {} if memory is None else memory.metrics
+        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
+
+    def condition(
+        self, batch: DiffusionBatch, memory: MemoryTokens | None = None, corner: tuple[int, int] | None = None
+    ) -> Tensor:
+        """What the U-Net denoises under, [b, c]: the window's steps, oldest first, then the memory's vector."""
+        feature = None if self.integration is None else self.integration.feature(memory)
+        return self.backbone.condition(self._pictures(batch.images, corner), batch.state, batch.text, feature)
+
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """Memory tokens of a selection, or None for a policy without memory."""
+        if self.memory is None or history is None:
+            return None
+        with self.autocast():
+            return self.memory(history)
+
+    def recompute(self, wanted: Recompute) -> None:
+        """Compute the pictures' features again in the backward pass instead of keeping them, or keep them."""
+        self.backbone.recomputed = wanted
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """The memory's tower, the picture encoder, and the U-Net."""
+        tower = [] if self.memory is None else [ShardGroup(self.backbone.vision, full=True)]
+        return [*tower, ShardGroup(self.backbone.image_encoder), ShardGroup(self.backbone.unet)]
+
+    def _schedule(self) -> Any:
+        return model.noise_schedule(self.sizes.diffusion_steps)
+
+    def _pictures(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
+        """Pictures [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
+        room = [side - kept for side, kept in zip(images.shape[-2:], self.sizes.cropped, strict=True)]
+        if corner is None and self.training and self.augment:
+            top, left = (int(torch.randint(most + 1, ())) for most in room)
+        else:
+            top, left = (round(most / 2) for most in room) if corner is None else corner
+        height, width = self.sizes.cropped
+        cropped = images[..., top : top + height, left : left + width]
+        return (cropped.float() / 255 - 0.5) / 0.5
+
+    # Sampling
+
+    def sample_draws(self, generator: torch.Generator) -> Draws:
+        """The starting `noise` [h, a], and what is `added` [99, h, a] after each step but the last."""
+        shape, steps = (self.horizon, self.action_dim), self.sizes.diffusion_steps
+        noise = torch.randn(shape, generator=generator)
+        return {"noise": noise, "added": torch.randn(steps - 1, *shape, generator=generator)}
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        batch: DiffusionBatch,
+        draws: Mapping[str, Tensor] | None = None,
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
+        """A normalised chunk [b, h, a], from the first step of the current frame on.
+
+        Args:
+            draws: as `sample_draws` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
+            memory: memory tokens encoded beforehand.
+        """
+        if draws is None:
+            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.state))])
+        drawn = map_draws(draws, lambda value: value.to(self.device))
+        memory = self.encode_memory(batch.history) if memory is None else memory
+        with self.autocast():
+            condition = self.condition(batch, memory)
+
+            def predict(x: Tensor, step: Tensor) -> Tensor:
+                with self.autocast():
+                    return self.backbone.unet(x, step, condition).float()
+
+            return model.sample(self._schedule(), predict, drawn["noise"], drawn["added"], steps)
+
+    # Episodes
+
+    def observation(self, episodes: Sequence[Episode]) -> DiffusionBatch:
+        """The windows and goals of running episodes."""
+        processor = self.require_processor()
+        images, states = zip(*(e.window for e in episodes), strict=True)
+        text = torch.stack([e.prompt for e in episodes])
+        return DiffusionBatch(torch.stack(images), processor.states(torch.stack(states)), text).to(self.device)
+
+    def answer(
+        self, batch: DiffusionBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """A chunk for what `observation` saw, through the episodes' memories."""
+        memory = None
+        if self.memory is not None:
+            with torch.no_grad(), self.autocast():
+                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+        return self.sample_actions(batch, draws, steps, memory)
+
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        return prepare(self, episode)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
+        processor = self.require_processor()
+        if processor.window > 1 and processor.consecutive:
+            return None
+        return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
+
+    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
+        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
+        return encode_frames(self, frames, self.backbone.pooled_tokens, self.sizes.memory_width, batch_size)
+
+    def vision_fingerprint(self) -> str:
+        """A hash of the memory's vision tower and the dtype it runs in: what a cache of its tokens depends on."""
+        self.require_memory()
+        return tower_fingerprint(self.backbone.vision, self.compute_dtype)
+
+    def require_processor(self) -> DiffusionProcessor:
+        """Return the processor, or say what it takes to have one."""
+        processor = super().require_processor()
+        assert isinstance(processor, DiffusionProcessor)
+        return processor
+
+    def check_processor(self, source: str) -> None:
+        """See `Saved`."""
+        super().check_processor(source)
+        processor, sizes = self.require_processor(), self.sizes
+        pairs = {
+            "picture": (processor.picture, sizes.picture),
+            "window": (processor.window, sizes.window),
+            "text_dim": (processor.text.width, sizes.text_dim),
+            "horizon": (processor.horizon, sizes.horizon),
+            "memory_size": (processor.memory_size, sizes.memory_tower.image_size),
+        }
+        for name, (found, expected) in pairs.items():
+            if found != expected:
+                raise UserError(
+                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
+                    "two checkpoints, or one was changed."
+                )
+
+    # Costs and parts
+
+    def full_batch(self, device: torch.device | str = "cpu") -> DiffusionBatch:
+        """A batch of one without content, with a memory that is full."""
+        sizes, robot = self.sizes, self.embodiment
+        shape = (1, sizes.window, len(robot.cameras), 3, *sizes.picture)
+        return DiffusionBatch(
+            images=torch.zeros(shape, dtype=torch.uint8, device=device),
+            state=torch.zeros(1, sizes.window, robot.state.width, device=device),
+            text=torch.zeros(1, sizes.text_dim, device=device),
+            actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
+            history=None if self.memory is None else self.memory.full_history(sizes.memory_width, device),
+        )
+
+    def see_empty_frame(self) -> None:
+        """Run the memory's vision tower on one black frame."""
+        side = self.sizes.memory_tower.image_size
+        self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))
+
+    def parts(self) -> Mapping[str, str]:
+        """`vision` is the memory's tower alone, which stays as it is; the cameras' own encoder learns."""
+        return self.PARTS
+
+
+def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledIntegration | None:
+    """The integration of a configuration, which must hand memory over as one vector.
+
+    Raises:
+        UserError: it is of another kind.
+    """
+    if not section:
+        return None
+    kind = INTEGRATIONS[section.get("name", "")]
+    if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
+        raise UserError(
+            f"Diffusion Policy has no place for what the integration {section['name']!r} brings: memory reaches it as "
+            "one vector. Choose integration=film."
+        )
+    built: PooledIntegration = INTEGRATIONS.build(section, sizes)
+    return built

@@ -1,0 +1,102 @@
+"""An episode of MemoryVLA: what its banks hold, and which moments of the conditioning video enter them."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.memory.extensions.bank import BankState
+from mme_vla.methods.memoryvla.model import BankStates, MemoryVlaCore
+from mme_vla.policy.episode import Episode, Host, Written
+
+VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
+
+
+class Writer(Host, Protocol):
+    """What such an episode asks of its policy besides."""
+
+    @property
+    def banked(self) -> MemoryVlaCore: ...
+
+    def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates: ...
+
+
+class MemoryVlaEpisode(Episode):
+    """Banks beside the current view.
+
+    Of the video every `VIDEO_STRIDE`-th frame is written; of the execution, each frame at which a chunk was chosen. The
+    latter is written when the next frames arrive, so that choosing twice at one frame gives the same chunk.
+    """
+
+    def __init__(self, policy: Writer, goal: str, seed: int = 0) -> None:
+        super().__init__(policy, goal, seed)
+        self._writer = policy
+        self.banks: BankStates = policy.banked.init_state()
+        self.asked: tuple[Tensor, Tensor] | None = None
+        """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
+        self._due: np.ndarray | None = None
+
+    def _take(
+        self,
+        frames: np.ndarray,
+        demo: np.ndarray,
+        executed: np.ndarray,
+        drawn: np.ndarray | None = None,
+        states: np.ndarray | None = None,
+    ) -> None:
+        if self.asked is not None:
+            self.banks = self._writer.banked.store(self.banks, *self.asked)
+            self.asked = None
+        moments = []
+        pictures = dict(zip(range(len(demo)) if drawn is None else drawn.tolist(), frames, strict=True))
+        for i in range(len(demo)):
+            if self._due is not None and demo[i]:  # a later frame of the video shows that it was not the last one
+                moments.append(self._due)
+            if self._due is not None and (demo[i] or not self._video_over):
+                self._due = None
+            if demo[i] and (self.frames_seen + i) % VIDEO_STRIDE == 0:
+                self._due = pictures[i].copy()
+        super()._take(frames, demo, executed, drawn, states)
+        if moments:
+            self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
+
+    # What was written, for those who look at it (`policy/episode.py`)
+
+    written_clock = "moments"
+
+    def written(self) -> tuple[Written, ...]:
+        """The entries of both banks, each with its times."""
+        named = (("cognition", self.banks.cognition), ("perceptual", self.banks.perceptual))
+        return tuple(
+            Written(name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count)
+            for name, bank in named
+        )
+
+    def as_if_written(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+        """See `Writes`."""
+        twin, banks = copy.copy(self), self.banks
+        cognition, perceptual = stores
+        twin.banks = replace(
+            banks, cognition=_bank(cognition, banks.cognition), perceptual=_bank(perceptual, banks.perceptual)
+        )
+        return twin
+
+    def go_on_from(self, twin: Episode) -> None:
+        """See `Writes`."""
+        assert isinstance(twin, MemoryVlaEpisode)
+        self.asked = twin.asked
+
+
+def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:
+    contents = torch.stack([content for _, content in entries]) if entries else like.entries[:0]
+    return BankState(contents, like.times.new_tensor([time for time, _ in entries]))
+
+
+def words(prompts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Prompts as a batch: ids [b, l] and mask [b, l]."""
+    ids, masks = zip(*prompts, strict=True)
+    return torch.stack(ids), torch.stack(masks)

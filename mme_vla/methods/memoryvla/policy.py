@@ -1,0 +1,379 @@
+"""`MemoryVlaPolicy`: a VLM's cognition token and vision features, two banks or any memory, a diffusion head."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.base import Draws, map_draws, stack_draws
+from mme_vla.backbone.config import shapes_only
+from mme_vla.config.sections import read_section
+from mme_vla.embodiment.robomme import embodiment_of
+from mme_vla.errors import UserError, brief
+from mme_vla.memory.base import Memory
+from mme_vla.methods.memoryvla.episode import MemoryVlaEpisode, words
+from mme_vla.methods.memoryvla.model import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core, read_moments
+from mme_vla.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
+from mme_vla.methods.openvla_oft.processor import augment, centre_cut, draw_changes
+from mme_vla.methods.prismatic import IMAGENET, Prismatic
+from mme_vla.policy.base import Policy
+from mme_vla.policy.build import build_memory, check_past
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.masking import masked_mean
+from mme_vla.policy.saving import policy_options
+from mme_vla.policy.tensor_files import dtype_of
+from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
+from mme_vla.processing.base import PolicyProcessor
+from mme_vla.processing.images import to_unit_range
+from mme_vla.registry import POLICIES
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup
+from mme_vla.types import HistoryTokens, MemoryTokens
+
+
+@POLICIES.register("memoryvla")
+class MemoryVlaPolicy(Policy):
+    """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two towers), each with a
+    bank of past moments that is read, fused and written; a diffusion transformer answers.
+
+    Training sees groups of moments of one episode, each group in banks of its own; acting writes moment by moment.
+    A memory of the library may stand in the banks' place: each moment then reads its own history's tokens.
+    """
+
+    heads = ("core",)
+    adapted = ("attn.qkv", "attn.proj", "q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj")
+    unadaptable = r"^core\."
+    PARTS: ClassVar[Mapping[str, str]] = {
+        "vision": r"vlm\.vision\.",
+        "vlm": r"vlm\.",
+        "memory": r"memory\.|core\.((cognition|perceptual)_(bank|retrieval)|compression)\.",
+        "action": "",
+    }
+
+    acts_in_bfloat16 = True
+
+    def __init__(
+        self,
+        vlm: Prismatic,
+        core: Core,
+        memory: Memory | None = None,
+        processor: MemoryVlaProcessor | None = None,
+        config: Mapping[str, Any] | None = None,
+        *,
+        compute_dtype: str = "float32",
+        history_dtype: str = "bfloat16",
+        augment: bool = True,
+    ) -> None:
+        """Put the parts together.
+
+        Args:
+            core: with banks, or for a memory (`build_core`).
+            processor: needed for episodes and data; the network alone runs on ready batches without it.
+            config: what `from_config` was given; saved with the weights.
+            compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
+            history_dtype: dtype of stored vision tokens; banks hold what the network computes.
+            augment: crop and colour pictures while training.
+        """
+        super().__init__()
+        self.vlm, self.core, self.memory, self.processor = vlm, core, memory, processor
+        self.config, self.sizes = dict(config or {}), core.config
+        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
+        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
+        self.augment = augment
+        self.horizon, self.action_dim = core.config.horizon, core.config.action_dim
+        self.sample_steps = core.config.ddim_steps
+
+    @classmethod
+    def from_config(
+        cls, config: Mapping[str, Any], processor: PolicyProcessor | None = None, *, fresh_backbone: bool = True
+    ) -> Self:
+        """Build from plain sections `backbone`, `embodiment`, `memory`, `policy`.
+
+        Raises:
+            UserError: an unknown option, sizes that do not fit together, an integration, or a memory that gives past
+                views.
+        """
+        section = {key: value for key, value in config["backbone"].items() if key != "name"}
+        sizes = read_section(MemoryVlaConfig, section, "backbone")
+        embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
+        if config.get("integration"):
+            raise UserError(
+                f"MemoryVLA has no place for the integration {config['integration'].get('name')!r}: its own retrieval "
+                "reads a memory, in place of its banks. Set integration=none."
+            )
+        if processor is not None and not isinstance(processor, MemoryVlaProcessor):
+            raise UserError("MemoryVLA needs its own processor: set processor=memoryvla, or memoryvla_tiny to try it.")
+        if processor is not None and processor.group_size == 1 and not config.get("memory"):
+            raise UserError(
+                "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
+                "or more, or a memory in place of the banks (memory=framesamp)."
+            )
+        with nullcontext() if fresh_backbone else shapes_only():
+            vlm = Prismatic(sizes.vision, sizes.vlm, sizes.vocab_size, IMAGENET)
+        if not fresh_backbone:
+            vlm.to_empty(device=torch.get_default_device())
+        # Drawn in any case: OpenVLA, to start from, has none.
+        core = build_core(sizes, recalls=bool(config.get("memory")))
+        memory: Memory | None = None
+        if config.get("memory"):
+            memory = build_memory(config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width)
+            check_past(config, memory, frozenset())
+        return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
+
+    def autocast(self) -> torch.autocast:
+        """The context all network code runs in."""
+        kind = self.device.type if self.device.type != "meta" else "cpu"
+        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
+
+    # Moments
+
+    def _of_batch(self, batch: GroupBatch, changes: Tensor | None = None) -> tuple[Tensor, Tensor, list[Tensor]]:
+        """Moments of a batch without its padding, and the places of each group among them.
+
+        Args:
+            changes: [g, m', 6] of the pictures, m' ≥ m; by default the middle is cut out.
+        """
+        pictures = batch.images[batch.valid]
+        if changes is None:
+            shown = centre_cut(pictures)
+        else:
+            shown = augment(pictures, changes[:, : batch.valid.shape[1]][batch.valid])
+        with self.autocast():
+            told = (batch.prompt[batch.valid], batch.prompt_mask[batch.valid])
+            cognition, features = read_moments(self.vlm, to_unit_range(shown), *told)
+        counts = batch.valid.sum(1).tolist()
+        return cognition, features, list(torch.arange(sum(counts)).split(counts))
+
+    @property
+    def banked(self) -> MemoryVlaCore:
+        """The core, where it has banks of its own."""
+        assert isinstance(self.core, MemoryVlaCore)
+        return self.core
+
+    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
+        """Memory tokens of selections, or None for a policy that has its banks."""
+        if self.memory is None or history is None:
+            return None
+        with self.autocast():
+            return self.memory(history)
+
+    # Training
+
+    @property
+    def group_size(self) -> int:
+        """Moments of a training sample: its processor's, else its configuration's."""
+        return self.config["processor"]["group_size"] if self.processor is None else self.processor.group_size
+
+    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of m moments."""
+        shape = (count, self.sizes.repeats, self.group_size)
+        return {
+            "noise": torch.randn(*shape, self.horizon, self.action_dim, generator=generator),
+            "steps": torch.randint(len(self.core.schedule), shape, generator=generator),
+            "drop": torch.rand(shape, generator=generator),
+        }
+
+    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+        """While training with augmentation `changes` [n, m, 6]: what happens to the pictures of `count` groups."""
+        if not (self.training and self.augment):
+            return {}
+        size = self.group_size
+        return {"changes": draw_changes(count * size, generator).unflatten(0, (count, size))}
+
+    def forward(self, batch: GroupBatch, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+        """The mean squared error of the predicted noise over all moments, copies and numbers.
+
+        Args:
+            batch: with `actions`. draws: as `loss_draws` and `picture_draws` make them; fresh ones by default.
+        """
+        if batch.actions is None:
+            raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
+        given = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
+        if "changes" not in given:
+            given |= self.picture_draws(len(batch.images), torch.default_generator)
+        changes = given.pop("changes", None)
+        copies = batch.valid.shape[1]
+
+        def whole_batch_over(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
+            return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
+
+        drawn = map_draws(given, lambda value: whole_batch_over(value.to(self.device)))
+        memory = self.encode_memory(batch.histories())
+        cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
+        with self.autocast():
+            read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
+            losses = self.core.copies_error(batch.actions[batch.valid], read, seen, drawn)  # r·m h
+        counted = None
+        if batch.action_mask is not None:
+            of_moments = batch.action_mask[batch.valid]
+            counted = of_moments.repeat(len(losses) // len(of_moments), 1)
+        loss = masked_mean(losses, counted)
+        reported = {} if memory is None else memory.metrics
+        return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
+
+    def recompute(self, wanted: Recompute) -> None:
+        """Recompute the language model's layers in the backward pass."""
+        self.vlm.recompute(wanted)
+
+    def shard_groups(self) -> Sequence[ShardGroup]:
+        """Towers, word embedding, every layer of the language model, and every block of the head."""
+        whole = (self.vlm.vision, self.vlm.language.model.embed_tokens)
+        layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
+        return [*(ShardGroup(module, full=True) for module in whole), *map(ShardGroup, layers)]
+
+    def compile(self, **options: Any) -> None:
+        """Compile the towers, the language model's layers and the head's blocks, each by itself."""
+        towers, layers = (self.vlm.vision.dino, self.vlm.vision.siglip), self.vlm.language.model.layers
+        for module in (*towers, *layers, *self.core.head.blocks):
+            module.compile(**options)
+        if self.memory is not None:
+            self.memory.compile(**options)
+
+    # Sampling
+
+    def sample_draws(self, generator: torch.Generator) -> Draws:
+        """The starting `noise` [h, a]."""
+        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+
+    @torch.no_grad()
+    def sample_actions(
+        self,
+        batch: GroupBatch,
+        draws: Mapping[str, Tensor] | None = None,
+        steps: int | None = None,
+        memory: MemoryTokens | None = None,
+    ) -> Tensor:
+        """A normalised chunk [g, h, a] for the last moment of every group: through those before it, or its own memory.
+
+        Args:
+            memory: memory tokens of the last moments, encoded beforehand.
+        """
+        if draws is None:
+            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.images))])
+        if self.memory is not None:
+            batch = batch.last()
+            memory = self.encode_memory(batch.history) if memory is None else memory
+        cognition, features, groups = self._of_batch(batch)
+        with self.autocast():
+            read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
+            last = [int(group[-1]) for group in groups]
+            return self.core.sample(draws["noise"].to(self.device), read[last], seen[last], steps)
+
+    # Episodes
+
+    def start_episode(self, goal: str, seed: int = 0) -> Episode:
+        """Begin an episode with empty banks, or an empty memory."""
+        return MemoryVlaEpisode(self, goal, seed) if self.memory is None else super().start_episode(goal, seed)
+
+    def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
+        """The current moments of running episodes, each a group of one; only banks know what number theirs has."""
+        pictures = self.require_processor().seen(torch.stack([episode.images for episode in episodes]))
+        ids, masks = words([episode.prompt for episode in episodes])
+        times = torch.tensor([0 if self.memory is not None else _own(episode).banks.count for episode in episodes])
+        valid = torch.ones(len(episodes), 1, dtype=torch.bool)
+        return GroupBatch(pictures[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
+
+    def answer(
+        self, batch: GroupBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+    ) -> Tensor:
+        """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""
+        if self.memory is not None:
+            with torch.no_grad(), self.autocast():
+                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+            return self.sample_actions(batch, draws, steps, memory)
+        with torch.no_grad():
+            cognition, features, _ = self._of_batch(batch)
+            with self.autocast():
+                read, seen = self.banked.look([_own(episode).banks for episode in episodes], cognition, features)
+                chunk = self.core.sample(draws["noise"].to(self.device), read, seen, steps)
+        for i, episode in enumerate(episodes):
+            _own(episode).asked = (cognition[i], features[i])
+        return chunk
+
+    @torch.no_grad()
+    def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates:
+        """Banks after further frames [n, H, W, 3] uint8 of the camera that the policy looks through."""
+        processor = self.require_processor()
+        pictures = processor.resized(frames).to(self.device)
+        ids, mask = (part.to(self.device).expand(len(frames), -1) for part in prompt)
+        with self.autocast():
+            cognition, features = read_moments(self.vlm, to_unit_range(centre_cut(pictures)), ids, mask)
+            for i in range(len(frames)):
+                banks = self.banked.store(banks, cognition[i], features[i])
+        return banks
+
+    @torch.no_grad()
+    def prepare(self, episode: Episode) -> bool:
+        return prepare(self, episode)
+
+    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
+        """What the memory reads; banks may be shown any frame."""
+        return None if self.memory is None else self.memory.frames_read(steps, exec_start)
+
+    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
+        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
+        return encode_frames(self, frames, self.vlm.pooled_tokens, self.sizes.vision.width, batch_size)
+
+    def vision_fingerprint(self) -> str:
+        """A hash of the towers, the dtype they run in, and what a memory's pictures go through before them."""
+        pictures = "" if self.processor is None else self.processor.memory_pictures
+        return tower_fingerprint(self.vlm.vision, self.compute_dtype, pictures, str(self.vlm.vision.dino_standard))
+
+    def require_processor(self) -> MemoryVlaProcessor:
+        """Return the processor, or say what it takes to have one."""
+        processor = super().require_processor()
+        assert isinstance(processor, MemoryVlaProcessor)
+        return processor
+
+    def check_processor(self, source: str) -> None:
+        """See `Saved`."""
+        super().check_processor(source)
+        processor, sizes = self.require_processor(), self.sizes
+        pairs = {
+            "image_size": (processor.image_size, sizes.vision.image_size),
+            "action_dim": (processor.action_dim, sizes.action_dim),
+            "horizon": (processor.horizon, sizes.horizon),
+        }
+        for name, (found, expected) in pairs.items():
+            if found != expected:
+                raise UserError(
+                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
+                    "two checkpoints, or one was changed."
+                )
+
+    # Costs and parts
+
+    def full_batch(self, device: torch.device | str = "cpu") -> GroupBatch:
+        """A group of one moment without content, with the longest prompt and a full memory.
+
+        Where the moment is, is known on meta too.
+        """
+        size, length = self.sizes.vision.image_size, int(self.config["processor"]["prompt_length"])
+        length += self.embodiment.action.options_length
+        known = "cpu" if torch.device(device).type == "meta" else device
+        return GroupBatch(
+            images=torch.zeros(1, 1, 3, size, size, dtype=torch.uint8, device=device),
+            prompt=torch.full((1, 1, length), 5, device=device),
+            prompt_mask=torch.ones(1, 1, length, dtype=torch.bool, device=device),
+            times=torch.zeros(1, 1, dtype=torch.int64, device=known),
+            valid=torch.ones(1, 1, dtype=torch.bool, device=known),
+            actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
+            history=None if self.memory is None else self.memory.full_history(self.sizes.vision.width, device),
+        )
+
+    def see_empty_frame(self) -> None:
+        """Run the vision towers on one black frame."""
+        size = self.sizes.vision.image_size
+        self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
+
+    def parts(self) -> Mapping[str, str]:
+        """Towers; projector and language model; memory or banks, retrieval and compression; the head."""
+        return self.PARTS
+
+
+def _own(episode: Episode) -> MemoryVlaEpisode:
+    assert isinstance(episode, MemoryVlaEpisode)
+    return episode

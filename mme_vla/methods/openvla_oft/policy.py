@@ -1,0 +1,43 @@
+"""`OpenVlaPolicy`: OpenVLA-OFT with any memory as context. What it reads beside π0.5's inputs is the state."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mme_vla.methods.openvla_oft.processor import OpenVlaProcessor, augment, centre_crop, draw_changes
+from mme_vla.policy.episode import Episode
+from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.images import to_unit_range
+from mme_vla.registry import POLICIES
+from mme_vla.types import Batch
+
+
+@POLICIES.register("openvla")
+class OpenVlaPolicy(MMEPolicy):
+    """Backbone × memory × integration, with OpenVLA's pictures and a normalised state.
+
+    In training every picture is cropped and coloured by its own draws; else each is cropped in the middle, so that the
+    network sees the same share of a scene.
+    """
+
+    def observation(self, episodes: Sequence[Episode]) -> Batch:
+        """The current views, prompts and states of running episodes."""
+        processor = self.require_processor()
+        assert isinstance(processor, OpenVlaProcessor)
+        states = processor.proprio(torch.stack([episode.state for episode in episodes]))
+        return replace(super().observation(episodes), proprio=states.to(self.device))
+
+    def full_batch(self, device: torch.device | str = "cpu") -> Batch:
+        """As `MMEPolicy.full_batch`, with a state."""
+        return replace(super().full_batch(device), proprio=torch.zeros(1, self.embodiment.state.width, device=device))
+
+    def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
+        views = len(self.embodiment.cameras)
+        return draw_changes(count * views, generator).unflatten(0, (count, views))
+
+    def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
+        pictures = batch.images.flatten(0, 1)
+        shown = centre_crop(pictures) if changes is None else augment(pictures, changes.flatten(0, 1))
+        return to_unit_range(shown).view(batch.images.shape)

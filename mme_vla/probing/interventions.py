@@ -1,0 +1,360 @@
+"""What a probe changes: each a small class with a dial, of what a policy is shown, remembers or is told.
+
+One of your own is a class registered with `register("intervention", name)` in a module that `plugins` names.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.probing.channels import Remembered, same_progress
+from mme_vla.registry import INTERVENTIONS
+
+
+@dataclass(frozen=True)
+class Feed:
+    """Frames of an episode on their way to a policy. The default shows what happened.
+
+    sessions: unrelated episodes that come first, as if they were part of the video. video: whether the conditioning
+    video is shown. stills: how often one frame is repeated; at: which, counted from the first execution frame.
+    """
+
+    sessions: int = 0
+    video: bool = True
+    stills: int = 0
+    at: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("sessions", "stills", "at"):
+            if getattr(self, name) < 0:
+                raise UserError(f"A probe cannot show {getattr(self, name)} {name}: the number must not be negative.")
+
+    def shown(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
+        """Where frames [n] of the episode stand among the shown ones, int64 [n]; −1 where one is left out.
+
+        Args:
+            exec_start: the episode's first execution frame. before: frames of the sessions.
+        """
+        frames = np.asarray(frames, np.int64)
+        video = exec_start if self.video else 0
+        later = np.where(frames >= exec_start + self.at, self.stills, 0)  # the frame that stands still: its last repeat
+        executed = before + video + frames - exec_start + later
+        return np.where(frames >= exec_start, executed, before + frames if self.video else -1)
+
+    def first_executed(self, exec_start: int, before: int = 0) -> int:
+        """The first execution frame among the shown ones."""
+        return before + (exec_start if self.video else 0)
+
+    def own(self, shown: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
+        """The episode's own frames behind shown ones [m], ascending, each once; those of sessions are left out."""
+        shown = np.asarray(shown, np.int64) - before
+        shown = shown[shown >= 0]
+        video = exec_start if self.video else 0
+        past = shown - video
+        executed = np.where(past > self.at, np.maximum(past - self.stills, self.at), past)
+        return np.unique(np.where(shown < video, shown, exec_start + executed))
+
+
+NEEDS = {
+    "entries": "something remembered that the probe can reach",
+    "choice": "a memory that chooses among stored frames",
+    "clock": "entries that have a time",
+    "pauses": "a memory that sees frames at which nothing is decided",
+    "subgoal": "a policy that reads subgoals",
+    "recordings": "recorded episodes to take from: name them with recordings=…",
+    "boundaries": "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by env=mme_vla",
+}
+"""What an intervention can ask for, in words."""
+
+
+def _nothing(name: str) -> Remembered:
+    raise UserError(f"No other episode has a {name} to take from.")
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What an intervention may know of the moment at which it is asked.
+
+    rng: of this episode, this moment and this intervention alone. now: the current frame, as it is shown. kept: frames
+    up to now that are stored, ascending. boundaries: frames at which a sub-task began. said: earlier subgoals, the
+    current one last. donor: the store of that name of another episode that is as far along, and what was said there.
+    weigh: for each slot of a store, by how much the chunk changes without it.
+    """
+
+    rng: np.random.Generator
+    now: int = 0
+    kept: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    boundaries: Sequence[int] = ()
+    said: Sequence[str | None] = ()
+    donor: Callable[[str], Remembered] = _nothing
+    donor_said: str | None = None
+    weigh: Callable[[Remembered], np.ndarray] | None = None
+
+
+class Intervention:
+    """Changes nothing. A subclass overrides what it changes; a dataclass, so that its options are its fields.
+
+    dial: the option that `name:value` sets. needs: of `NEEDS`, without which it is refused.
+    """
+
+    dial: ClassVar[str | None] = None
+    needs: ClassVar[frozenset[str]] = frozenset()
+
+    def feed(self, feed: Feed) -> Feed:
+        """What the episode is shown."""
+        return feed
+
+    def only(self, moment: Moment) -> np.ndarray | None:
+        """The stored frames that may be remembered, ascending, at least one; None for all."""
+        return None
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        """What is remembered instead."""
+        return store
+
+    def say(self, subgoal: str | None, moment: Moment) -> str | None:
+        """What the policy is told instead."""
+        return subgoal
+
+
+def whole(name: str, value: Any, least: int) -> None:
+    """Make sure that a dial is a whole number.
+
+    Raises:
+        UserError: it is not, or too small.
+    """
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise UserError(f"{name}={value!r} must be a whole number, at least {least}.")
+
+
+WHICH = ("oldest", "newest", "random", "used")
+
+
+@INTERVENTIONS.register("shuffle")
+@dataclass(frozen=True)
+class Shuffle(Intervention):
+    """The contents of all entries change places; their times and slots stay where they are."""
+
+    needs: ClassVar = frozenset({"entries"})
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        held = store.held
+        order = moment.rng.permutation(held)
+        return store.rearranged(held, [_content(store, int(slot)) for slot in order])
+
+
+@INTERVENTIONS.register("drop")
+@dataclass(frozen=True)
+class Drop(Intervention):
+    """Some entries are taken away; the others keep slot and time.
+
+    count: how many; None takes all. which: the `oldest`, the `newest`, at `random`, or the most `used`, those whose
+    absence changes the chunk most (an attention that any integration has).
+    """
+
+    count: int | None = 1
+    which: str = "random"
+    dial: ClassVar = "count"
+    needs: ClassVar = frozenset({"entries"})
+
+    def __post_init__(self) -> None:
+        if self.count is not None:
+            whole("drop.count", self.count, 1)
+        if self.which not in WHICH:
+            raise UserError(f"drop.which={self.which!r}. {did_you_mean(str(self.which), WHICH)}")
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        held = store.held
+        most = len(held) if self.count is None else min(self.count, len(held))
+        return store.without(_ranked(store, self.which, moment)[:most])
+
+
+@INTERVENTIONS.register("swap")
+@dataclass(frozen=True)
+class Swap(Intervention):
+    """Entries hold what an entry of another recorded episode holds that is as far along; times stay.
+
+    count: how many, at random; None swaps all.
+    """
+
+    count: int | None = None
+    dial: ClassVar = "count"
+    needs: ClassVar = frozenset({"entries", "recordings"})
+
+    def __post_init__(self) -> None:
+        if self.count is not None:
+            whole("swap.count", self.count, 1)
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        held, donor = store.held, moment.donor(store.name)
+        if not donor.held or not held:
+            return store
+        # Paired over all entries, so that a part of them is swapped as it would be among all.
+        their = dict(zip(held, np.array(donor.held)[same_progress(held, len(donor.held))].tolist(), strict=True))
+        count = len(held) if self.count is None else min(self.count, len(held))
+        slots = sorted(moment.rng.permutation(held)[:count].tolist())
+        return store.rearranged(slots, [_content(donor, their[slot]) for slot in slots])
+
+
+@INTERVENTIONS.register("delay")
+@dataclass(frozen=True)
+class Delay(Intervention):
+    """All entries seem to be from `frames` later, the current one too: a clock that runs ahead. Negative: behind.
+
+    Of banks that count moments, so many moments.
+    """
+
+    frames: int = 64
+    dial: ClassVar = "frames"
+    needs: ClassVar = frozenset({"entries", "clock"})
+
+    def edit(self, store: Remembered, moment: Moment) -> Remembered:
+        shifted = [None if e is None else replace(e, time=e.time + self.frames) for e in store.entries]
+        return replace(store, entries=tuple(shifted))
+
+
+@INTERVENTIONS.register("recent")
+@dataclass(frozen=True)
+class Recent(Intervention):
+    """The memory chooses among the last `frames` frames alone, at the times at which they were."""
+
+    frames: int = 64
+    dial: ClassVar = "frames"
+    needs: ClassVar = frozenset({"entries", "choice"})
+
+    def __post_init__(self) -> None:
+        whole("recent.frames", self.frames, 1)
+
+    def only(self, moment: Moment) -> np.ndarray | None:
+        inside = moment.kept[moment.kept > moment.now - self.frames]
+        return inside if len(inside) else moment.kept[-1:]
+
+
+@INTERVENTIONS.register("oracle")
+@dataclass(frozen=True)
+class Oracle(Intervention):
+    """The memory chooses among the frames at which a sub-task began, the last of the video and the newest."""
+
+    needs: ClassVar = frozenset({"entries", "choice", "boundaries"})
+
+    def only(self, moment: Moment) -> np.ndarray | None:
+        past = [frame for frame in moment.boundaries if frame <= moment.now]
+        at = np.searchsorted(moment.kept, past, side="right") - 1
+        return moment.kept[np.unique(np.append(np.maximum(at, 0), len(moment.kept) - 1))]
+
+
+@INTERVENTIONS.register("pause")
+@dataclass(frozen=True)
+class Pause(Intervention):
+    """One frame is seen `frames` times more: the scene stands still. `at`: which, from the first execution frame on."""
+
+    frames: int = 64
+    at: int = 0
+    dial: ClassVar = "frames"
+    needs: ClassVar = frozenset({"pauses"})
+
+    def feed(self, feed: Feed) -> Feed:
+        return replace(feed, stills=feed.stills + self.frames, at=self.at)
+
+
+@INTERVENTIONS.register("distract")
+@dataclass(frozen=True)
+class Distract(Intervention):
+    """So many unrelated recorded episodes are seen first, as if they were part of the video."""
+
+    sessions: int = 1
+    dial: ClassVar = "sessions"
+    needs: ClassVar = frozenset({"recordings"})
+
+    def feed(self, feed: Feed) -> Feed:
+        return replace(feed, sessions=feed.sessions + self.sessions)
+
+
+@INTERVENTIONS.register("nodemo")
+@dataclass(frozen=True)
+class NoDemo(Intervention):
+    """The conditioning video is not shown."""
+
+    def feed(self, feed: Feed) -> Feed:
+        return replace(feed, video=False)
+
+
+def _content(store: Remembered, slot: int) -> Any:
+    entry = store.entries[slot]
+    assert entry is not None
+    return entry.content
+
+
+def _ranked(store: Remembered, which: str, moment: Moment) -> list[int]:
+    """Slots that hold something, those to be taken first at the beginning."""
+    held = store.held
+
+    def used() -> list[int]:
+        if moment.weigh is None:
+            raise UserError("drop.which=used needs a policy to ask, and here is none.")
+        weights = moment.weigh(store)
+        return sorted(held, key=lambda slot: -weights[slot])
+
+    orders: Mapping[str, Callable[[], list[int]]] = {
+        "oldest": lambda: sorted(held, key=lambda slot: -store.age(slot)),
+        "newest": lambda: sorted(held, key=store.age),
+        "random": lambda: moment.rng.permutation(held).tolist(),
+        "used": used,
+    }
+    return orders[which]()
+
+
+_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
+_NUMBERS = ("one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+_COUNT = re.compile(rf"<[^>]*>|\b(?:{'|'.join((*_ORDINALS, *_NUMBERS))}|\d+)\b")  # points are read, and left alone
+
+
+@INTERVENTIONS.register("subgoal_swap")
+@dataclass(frozen=True)
+class SubgoalSwap(Intervention):
+    """The subgoal of another recorded episode that is as far along."""
+
+    needs: ClassVar = frozenset({"subgoal", "recordings"})
+
+    def say(self, subgoal: str | None, moment: Moment) -> str | None:
+        return subgoal if moment.donor_said is None else moment.donor_said
+
+
+@INTERVENTIONS.register("subgoal_delay")
+@dataclass(frozen=True)
+class SubgoalDelay(Intervention):
+    """The subgoal that was said `decisions` chunks ago; the first one until then."""
+
+    decisions: int = 2
+    dial: ClassVar = "decisions"
+    needs: ClassVar = frozenset({"subgoal"})
+
+    def __post_init__(self) -> None:
+        whole("subgoal_delay.decisions", self.decisions, 1)
+
+    def say(self, subgoal: str | None, moment: Moment) -> str | None:
+        return moment.said[max(len(moment.said) - 1 - self.decisions, 0)] if moment.said else subgoal
+
+
+@INTERVENTIONS.register("subgoal_count")
+@dataclass(frozen=True)
+class SubgoalCount(Intervention):
+    """Every count in the subgoal is wrong by `by`: `for the first time` becomes `for the second time`."""
+
+    by: int = 1
+    dial: ClassVar = "by"
+    needs: ClassVar = frozenset({"subgoal"})
+
+    def say(self, subgoal: str | None, moment: Moment) -> str | None:
+        return None if subgoal is None else _COUNT.sub(self._wrong, subgoal)
+
+    def _wrong(self, found: re.Match[str]) -> str:
+        word = found[0]
+        for words in (_ORDINALS, _NUMBERS):
+            if word in words:
+                return words[(words.index(word) + self.by) % len(words)]
+        return str(max(int(word) + self.by, 0)) if word.isdigit() else word

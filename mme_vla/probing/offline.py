@@ -1,0 +1,217 @@
+"""A probe on recorded episodes: how the chunk that a policy would choose changes with what it remembers."""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mme_vla.backbone.base import Draws
+from mme_vla.config.sections import read_section
+from mme_vla.evaluation.rollout.episode import episode_seed
+from mme_vla.policy.base import Policy
+from mme_vla.probing import lines
+from mme_vla.probing.arms import UNPROBED, Arm
+from mme_vla.probing.channels import Recollection
+from mme_vla.probing.interventions import Feed, whole
+from mme_vla.probing.lines import EntryLine, Line, MomentLine
+from mme_vla.probing.probed import Lenders, ProbedEpisode, ProbedPolicy
+from mme_vla.probing.recordings import Recording, others
+from mme_vla.processing.prompt import subgoal_kind
+
+
+@dataclass(frozen=True)
+class Change:
+    """What became of a chunk, in normalised actions (1: half of what the training data span), root mean square.
+
+    change: mean distance of two chunks of the same noise. spread: mean distance of two chunks that differ in noise
+    alone, unprobed. distance: energy distance of the two distributions, 0 where they are one.
+    """
+
+    change: float
+    spread: float
+    distance: float
+
+
+def compare_chunks(before: Tensor, after: Tensor) -> Change:
+    """Compare chunks [n, h, w] before and after an intervention, row by row of the same noise."""
+    first, second = (x.double().flatten(1).numpy() for x in (before, after))
+    across, within, inside = _distances(first, second), _distances(first, first), _distances(second, second)
+    energy = 2 * across.mean() - within.mean() - inside.mean()
+    return Change(float(np.diagonal(across).mean()), spread_of(within), float(max(energy, 0.0)))
+
+
+def spread_of(distances: np.ndarray) -> float:
+    """Mean of the distances [n, n] between different rows; 0 for one row."""
+    n = len(distances)
+    return float(distances.sum() / (n * (n - 1))) if n > 1 else 0.0
+
+
+def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.square(first[:, None] - second[None]).mean(-1))
+
+
+@dataclass(frozen=True)
+class OfflineSettings:
+    """How a probe on recorded episodes looks.
+
+    draws: chunks sampled at each moment, of the same noise in every arm. moments: most moments of an episode.
+    scan: whether each entry is left out by itself. flow_steps: of the sampler; None for the policy's own.
+    """
+
+    seed: int = 42
+    draws: int = 8
+    moments: int | None = 8
+    scan: bool = True
+    flow_steps: int | None = None
+
+    def __post_init__(self) -> None:
+        least = {"seed": 0, "draws": 1, **({} if self.moments is None else {"moments": 1})}
+        for name, smallest in least.items():
+            whole(name, getattr(self, name), smallest)
+
+    @classmethod
+    def from_config(cls, config: Mapping[str, Any]) -> Self:
+        """Read the keys of a configuration that are settings; others are ignored.
+
+        Raises:
+            UserError: a value that cannot be.
+        """
+        return read_section(cls, config, others=True)
+
+
+def probe_offline(
+    policy: Policy,
+    arms: Sequence[Arm],
+    recordings: Sequence[Recording],
+    lend: Sequence[Recording],
+    path: Path,
+    settings: OfflineSettings,
+    after: Callable[[int], None] = lambda count: None,
+) -> list[Line]:
+    """Probe every recorded episode that the file holds no lines of yet; all its lines, old and new.
+
+    Args:
+        recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines.
+        after: told of each episode that is done.
+
+    Raises:
+        UserError: the policy reads depth, and the data keep none.
+    """
+    _, done = lines.read(path)
+    lenders = Lenders(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
+    for recording in recordings:
+        if recording.name not in done:
+            found = _Moments(policy, arms, recording, lend, lenders, settings).lines()
+            lines.append(path, found, recording.name)
+        after(1)
+    return lines.read(path)[0]
+
+
+class _Moments:
+    """One recorded episode under all arms."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        arms: Sequence[Arm],
+        recording: Recording,
+        lend: Sequence[Recording],
+        lenders: Lenders | None,
+        settings: OfflineSettings,
+    ) -> None:
+        self._policy, self._recording, self._settings = policy, recording, settings
+        self._seed = episode_seed(settings.seed, recording.task, recording.episode)
+        self._steps = recording.decisions(policy.embodiment.action.execute, settings.moments)
+        self._said = subgoal_kind(policy)
+        self._boundaries = recording.boundaries()
+        sessions = others(lend, recording, recording.goal)
+        self._by_feed: dict[Feed, list[ProbedPolicy]] = defaultdict(list)
+        for arm in [UNPROBED, *arms]:
+            self._by_feed[arm.feed].append(ProbedPolicy(policy, arm, sessions, lenders).eval())
+        self._draws = self._shared_noise()
+        self._plain: dict[int, Tensor] = {}
+        """Unprobed chunks [draws, h, w] of each step."""
+
+    def lines(self) -> list[Line]:
+        """Everything that is found."""
+        return [line for probed in self._by_feed.values() for line in self._watch(probed)]
+
+    def _shared_noise(self) -> dict[int, list[Draws]]:
+        generator = torch.Generator().manual_seed(self._seed)
+        count = self._settings.draws
+        return {step: [self._policy.sample_draws(generator) for _ in range(count)] for step in self._steps}
+
+    def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
+        """Show the episode once to arms that are shown the same."""
+        found: list[Line] = []
+        recording, first = self._recording, arms[0]
+        episode = first.start_episode(recording.goal, self._seed)
+        episode.recording = recording
+        wanted = self._wanted(arms)
+        seen = 0
+        for step in self._steps:
+            recording.show(episode, seen, step + 1, wanted)
+            seen = step + 1
+            episode.boundaries = self._shown(first)
+            episode.subgoal = None if self._said is None else recording.subgoal(step, self._said)
+            episode.said.append(episode.subgoal)
+            for probed in arms:
+                found += self._probe(probed, episode, step)
+            episode.told(episode.subgoal)
+            self._policy.act([episode.inner], self._settings.flow_steps)  # banks are written where chunks are chosen
+        return found
+
+    def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:
+        """What an arm does at a moment; of the unprobed one, what it is compared with."""
+        arm, draws, steps = probed.arm, self._draws[step], self._settings.flow_steps
+        episode.told(arm.say(episode.subgoal, probed.moment(episode)))
+        recollection, edited = probed.recall(episode, draws[0])
+        if arm is UNPROBED:
+            self._plain[step] = probed.ask(episode, recollection, [edited], draws, steps)[0]
+            return self._scan(probed, episode, recollection, step) if self._settings.scan else []
+        change = compare_chunks(self._plain[step], probed.ask(episode, recollection, [edited], draws, steps)[0])
+        stores = recollection.stores
+        touched = [age for old, new in zip(stores, edited, strict=True) for age in old.changed(new)]
+        return [MomentLine(
+            self._recording.name, self._recording.task, step, self._phase(step), self._recording.subgoal(step) or "",
+            arm.name, arm.dial(), sum(map(len, stores)), touched, **asdict(change),
+        )]  # fmt: skip
+
+    def _scan(self, probed: ProbedPolicy, episode: ProbedEpisode, recollection: Recollection, step: int) -> list[Line]:
+        """The change that each entry's absence makes, one at a time."""
+        stores, places = recollection.stores, []
+        for i, store in enumerate(stores):
+            places += [(i, slot) for slot in store.held]
+        if not places:
+            return []
+        variants = [[*stores[:i], stores[i].without([slot]), *stores[i + 1 :]] for i, slot in places]
+        chunks = probed.ask(episode, recollection, variants, self._draws[step], self._settings.flow_steps)
+        found: list[Line] = []
+        for (i, slot), chunk in zip(places, chunks, strict=True):
+            change, entry = compare_chunks(self._plain[step], chunk), stores[i].entries[slot]
+            assert entry is not None
+            found.append(EntryLine(
+                self._recording.name, self._recording.task, step, self._phase(step), stores[i].name, slot, entry.time,
+                stores[i].age(slot), entry.time < self._recording.exec_start, change.change, change.spread,
+            ))  # fmt: skip
+        return found
+
+    def _phase(self, step: int) -> int:
+        """Sub-tasks of the execution that began before this step's."""
+        return sum(self._recording.exec_start < frame <= step for frame in self._boundaries)
+
+    def _shown(self, probed: ProbedPolicy) -> list[int]:
+        """Where sub-tasks began, among the frames as they are shown."""
+        shown = probed.arm.feed.shown(np.array(self._boundaries), self._recording.exec_start, probed.before)
+        return sorted({int(frame) for frame in shown if frame >= 0})
+
+    def _wanted(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
+        """Frames that any of these arms looks at; None for all."""
+        parts = [probed.frames_read(np.array(self._steps), self._recording.exec_start) for probed in arms]
+        known = [part for part in parts if part is not None]
+        return np.unique(np.concatenate(known)) if len(known) == len(parts) else None

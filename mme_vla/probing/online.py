@@ -1,0 +1,116 @@
+"""A probe in closed loop: every arm on the same episodes with the same noise as the unprobed run."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mme_vla.envs.make import make_env
+from mme_vla.envs.metadata import SESSIONS, read_variant
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.evaluation import Shard, evaluate
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.policy.base import Policy
+from mme_vla.probing.arms import UNPROBED, Arm, lacking, read_arm, slug
+from mme_vla.probing.channels import channel_of
+from mme_vla.probing.probed import Lenders, ProbedPolicy
+from mme_vla.probing.recordings import Recording
+from mme_vla.subgoal import SubgoalPredictor
+
+FOLDER = "online"
+
+
+def probe_online(
+    policy: Policy,
+    arms: Sequence[Arm],
+    jobs: Sequence[Job],
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    lend: Sequence[Recording] = (),
+    subgoals: SubgoalPredictor | None = None,
+    shard: Shard | None = None,
+    source: str | None = None,
+    base: Callable[..., Any] = make_env,
+    shown: bool = True,
+) -> list[EpisodeRecord]:
+    """Run what `folder` has no record of yet, first without and then under each arm; all records.
+
+    Args:
+        lend: recorded episodes: the sessions shown before, and where contents are taken from.
+
+    Raises:
+        UserError: as `evaluate`.
+    """
+    records: list[EpisodeRecord] = []
+    for arm in [UNPROBED, *arms]:
+        lenders = Lenders(policy, ProbedPolicy(policy).channel, lend) if lend else None
+        probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, lend, lenders).eval()
+        done = evaluate(
+            probed, jobs, folder / FOLDER / slug(arm.name), replace(facts, model=named(facts.model, arm)), settings,
+            subgoals=subgoals, shard=shard, source=source, base=base, notes={"arm": arm.name}, shown=shown,
+        )  # fmt: skip
+        records += done.records
+    return records
+
+
+def named(model: str, arm: Arm) -> str:
+    """What records call a model under an arm; unprobed it keeps its name."""
+    return model if arm is UNPROBED else f"{model} · {arm.name}"
+
+
+def online_records(folder: Path) -> list[EpisodeRecord]:
+    """What a folder holds of the closed loop, nothing where that was not run."""
+    return read_folders(find_records([folder / FOLDER])) if (folder / FOLDER).is_dir() else []
+
+
+def paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
+    """Each arm against the unprobed run, over the episodes that both have, corrected for their number.
+
+    Args:
+        model: the unprobed one's name.
+    """
+    tasks = tuple(dict.fromkeys(record.task for record in records))
+    if not tasks:
+        return []
+    protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
+    methods = aggregate(records, protocol, split).methods
+    plain = next((method for method in methods if method.model == model), None)
+    if plain is None:
+        return []
+    return compare_all([(m, plain) for m in methods if m is not plain and common_episodes(m, plain)], protocol)
+
+
+def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -> Policy:
+    """The policy as a split evaluates it: where that asks for sessions before each episode, it sees them first.
+
+    They are the first of the recordings, the same before every episode, and seem to be part of its video.
+
+    Args:
+        recordings: episodes to show.
+
+    Raises:
+        UserError: the split asks for more than there are, or the policy cannot be shown recorded episodes; or there are
+            recordings and the split asks for none.
+    """
+    variant = read_variant(split)
+    if variant is None or variant.dial != SESSIONS:
+        if recordings:
+            raise UserError(f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
+        return policy
+    if not variant.sessions:
+        return policy
+    arm = read_arm(f"distract:{variant.sessions}")
+    if why := lacking(arm, policy, channel_of(policy), len(recordings), boundaries=False):
+        raise UserError(f"split={split} needs {why}.")
+    shown = ProbedPolicy(policy, arm, recordings, of_split=True).eval()
+    shown.config["sessions"] = [recording.name for recording in shown.sessions]
+    return shown

@@ -1,0 +1,314 @@
+"""From a probe's lines to the figures of its page."""
+
+import base64
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mme_vla.evaluation.results.compare import Comparison
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, legend, picture, svg
+from mme_vla.evaluation.results.report import document, html_table, pair, section
+from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
+from mme_vla.probing.lines import EntryLine, Line, MomentLine
+from mme_vla.probing.recordings import Recording
+from mme_vla.utils import write_atomically
+from mme_vla.utils.media import Tile, contact_sheet
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+MEASURES = {
+    "evidence": ("drop:all", "nothing is remembered"),
+    "order": ("shuffle", "contents change places"),
+    "clock": ("delay:64", "everything seems 64 frames later"),
+    "pause": ("pause", "64 still frames"),
+    "interference": ("distract:1", "one unrelated episode first"),
+}
+"""What a probe's table has one column for: the arm that measures it, and what that does."""
+AGES = (0, 16, 32, 64, 128, 256, 512)
+"""Where the bins of an entry's age begin, in frames."""
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What an arm, or an entry, did over some moments.
+
+    change, spread, distance: means, as in `Change`. beyond: share of moments at which the change exceeds the spread.
+    """
+
+    moments: int
+    change: float
+    spread: float
+    distance: float
+    beyond: float
+
+    @property
+    def times(self) -> float | None:
+        """How often the policy's own spread; None for a policy that has none."""
+        return self.change / self.spread if self.spread > 0 else None
+
+
+def effect(lines: Sequence[MomentLine] | Sequence[EntryLine]) -> Effect:
+    """The effect over some lines, at least one."""
+    changes, spreads = np.array([x.change for x in lines]), np.array([x.spread for x in lines])
+    distances = [x.distance for x in lines if isinstance(x, MomentLine)]
+    return Effect(
+        len(lines), float(changes.mean()), float(spreads.mean()), float(np.mean(distances)) if distances else 0.0,
+        float((changes > spreads).mean()),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Findings:
+    """Everything a probe on recorded episodes found of one checkpoint."""
+
+    moments: list[MomentLine]
+    entries: list[EntryLine]
+
+    @classmethod
+    def of(cls, lines: Iterable[Line]) -> "Findings":
+        """Sort the lines."""
+        every = list(lines)
+        return cls([x for x in every if isinstance(x, MomentLine)], [x for x in every if isinstance(x, EntryLine)])
+
+    def arms(self) -> dict[str, Effect]:
+        """The effect of every arm, in the order in which they came."""
+        return {name: effect(lines) for name, lines in _grouped(self.moments, lambda line: line.arm).items()}
+
+    def families(self) -> dict[str, list[tuple[float, Effect]]]:
+        """Interventions of which several places of the dial were probed: dial and effect, ascending."""
+        dials: dict[str, dict[float, list[MomentLine]]] = {}
+        for line in self.moments:
+            if line.dial is not None:
+                dials.setdefault(line.arm.partition(":")[0], {}).setdefault(line.dial, []).append(line)
+        return {
+            name: [(dial, effect(lines)) for dial, lines in sorted(found.items())]
+            for name, found in dials.items()
+            if len(found) > 1
+        }
+
+    def decay(self, video: bool) -> list[tuple[float, Effect]]:
+        """Mean age and effect of the entries of each bin of age, those of the video or of the execution."""
+        mine = [entry for entry in self.entries if entry.video == video]
+        bins = _grouped(mine, lambda entry: int(np.searchsorted(AGES, entry.age, "right")))
+        return [(float(np.mean([e.age for e in lines])), effect(lines)) for _, lines in sorted(bins.items())]
+
+    def reach(self) -> float | None:
+        """How far back what matters lies: mean age of the entries, weighted by their change; None without entries."""
+        weights = np.array([entry.change for entry in self.entries])
+        return float(np.average([e.age for e in self.entries], weights=weights)) if weights.sum() > 0 else None
+
+    def from_video(self) -> float | None:
+        """The share of all entries' changes that those of the conditioning video make; None without entries."""
+        total = sum(entry.change for entry in self.entries)
+        return sum(entry.change for entry in self.entries if entry.video) / total if total > 0 else None
+
+    def matters_most(self) -> dict[str, list[EntryLine]]:
+        """For each task the moment at which a single entry mattered most: all entries of that moment."""
+        found: dict[str, list[EntryLine]] = {}
+        moments = _grouped(self.entries, lambda e: (e.task, e.recording, e.step))
+        for (task, *_), lines in moments.items():
+            if task not in found or max(e.change for e in lines) > max(e.change for e in found[task]):
+                found[task] = lines
+        return found
+
+
+def _grouped[K, L](lines: Iterable[L], key: Callable[[L], K]) -> dict[K, list[L]]:
+    groups: dict[K, list[L]] = {}
+    for line in lines:
+        groups.setdefault(key(line), []).append(line)
+    return groups
+
+
+def show(found: Effect | None) -> str:
+    """A change as a table has it: the change, and how many of the policy's own spread that is."""
+    if found is None:
+        return "–"
+    return f"{found.change:.3f}" + ("" if found.times is None else f" ({found.times:.1f}×)")
+
+
+def arms_table(findings: Findings) -> Table:
+    """Every arm over all moments."""
+    rows = []
+    for name, found in findings.arms().items():
+        lines = [line for line in findings.moments if line.arm == name]
+        ages = [age for line in lines for age in line.touched]
+        touched = f"{np.mean(ages):.0f}" if ages else "–"
+        times = "–" if found.times is None else f"{found.times:.1f}×"
+        rows.append([name, str(found.moments), touched, f"{found.change:.3f}", f"{found.spread:.3f}", times,
+                     f"{100 * found.beyond:.0f} %", f"{found.distance:.3f}"])  # fmt: skip
+    columns = ("arm", "moments", "age touched", "change", "own spread", "times that", "beyond it", "energy distance")
+    return Table("What each intervention does to the chunk", columns, rows)
+
+
+def phases_table(findings: Findings) -> Table:
+    """Every arm by task and sub-task."""
+    places = sorted({(line.task, line.phase) for line in findings.moments})
+    named = [f"{task or 'task'} · {phase + 1}" for task, phase in places]
+    rows = []
+    for name in findings.arms():
+        cells = []
+        for place in places:
+            lines = [line for line in findings.moments if line.arm == name and (line.task, line.phase) == place]
+            cells.append(show(effect(lines) if lines else None))
+        rows.append([name, *cells])
+    return Table("By task and sub-task", ("arm", *named), rows)
+
+
+def checkpoints_table(findings: dict[str, Findings]) -> Table:
+    """One row a checkpoint: what it takes from its memory."""
+    rows = []
+    for name, found in findings.items():
+        arms, reach, video = found.arms(), found.reach(), found.from_video()
+        cells = [show(arms.get(arm)) for arm, _ in MEASURES.values()]
+        rows.append([name, *cells, "–" if reach is None else f"{reach:.0f}",
+                     "–" if video is None else f"{100 * video:.0f} %"])  # fmt: skip
+    return Table("What is taken from memory", ("checkpoint", *MEASURES, "reach (frames)", "from the video"), rows)
+
+
+_ON = {"distract": "episodes before one's own", "delay": "frames that the clock runs ahead",
+       "pause": "still frames", "recent": "frames that may be remembered", "drop": "entries taken away"}  # fmt: skip
+
+
+def effects(findings: Findings) -> str:
+    """A bar an arm: the mean change of the chunk; the line is the policy's own spread."""
+    arms = findings.arms()
+    with picture((10.4, 3.4)) as (canvas, (axes,)):
+        axes.bar(range(len(arms)), [found.change for found in arms.values()], 0.7, color=COLOURS[0])
+        ends = [(i - 0.42, i + 0.42) for i in range(len(arms))]
+        axes.hlines([found.spread for found in arms.values()], *zip(*ends, strict=True), color=COLOURS[1], lw=2,
+                    label="the policy's own spread")  # fmt: skip
+        axes.set_xticks(range(len(arms)), list(arms), rotation=25, ha="right", rotation_mode="anchor")
+        axes.set_ylabel("change of the chunk")
+        legend(canvas, axes, 3)
+        return svg(canvas)
+
+
+def decay(findings: Findings) -> str:
+    """What an entry matters by its age, those of the video and of the execution."""
+    with picture((5.6, 3.4)) as (canvas, (axes,)):
+        for name, video, colour in (("video", True, COLOURS[0]), ("execution", False, COLOURS[1])):
+            points = findings.decay(video)
+            mine = [e for e in findings.entries if e.video == video]
+            if mine:
+                axes.scatter([e.age for e in mine], [e.change for e in mine], s=8, color=colour, alpha=0.25, lw=0)
+                means = [found.change for _, found in points]
+                axes.plot([age for age, _ in points], means, "-o", color=colour, ms=5, label=name)
+        spread = [entry.spread for entry in findings.entries]
+        if spread:
+            axes.axhline(sum(spread) / len(spread), color=FAINT, lw=1, ls="--", label="own spread")
+        axes.set_xlabel("age of the entry (frames)")
+        axes.set_ylabel("change without it")
+        legend(canvas, axes, 3)
+        return svg(canvas)
+
+
+def dials(findings: Findings) -> dict[str, str]:
+    """A curve for each intervention of which several places of the dial were probed."""
+    drawn = {}
+    for name, points in findings.families().items():
+        with picture((5.6, 3.0)) as (canvas, (axes,)):
+            axes.plot([0, *(x for x, _ in points)], [0, *(f.change for _, f in points)], "-o", color=COLOURS[0], ms=5)
+            axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
+            axes.set_xlabel(_ON.get(name, name))
+            axes.set_ylabel("change of the chunk")
+            axes.tick_params(colors=INK)
+            drawn[name] = svg(canvas)
+    return drawn
+
+
+PAGE, TABLE, PICTURES = "page.html", "table.md", "remembered"
+VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
+UNITS = (
+    "Change: root mean square distance of two chunks of the same noise, in normalised actions (1 is half of what the "
+    "training data span). In brackets: how many times what chunks differ by that differ in noise alone."
+)
+
+
+def remembered_picture(lines: Sequence[EntryLine], recording: Recording) -> "Image":
+    """The frames remembered at a moment, each with its age and how the chunk changes without it; the current one last.
+
+    Args:
+        lines: of one moment. recording: of which they are.
+    """
+    step, tiles = lines[0].step, []
+    for line in sorted(lines, key=lambda line: line.time):
+        label = f"{line.age} ago: {line.change:.2f}"
+        tiles.append(Tile(recording.frame(line.time), label, VIDEO if line.video else EXECUTION))
+    tiles.append(Tile(recording.frame(step), f"now: frame {step}", NOW))
+    title = f"{lines[0].task or recording.name}: change of the chunk without each entry"
+    return contact_sheet(tiles, min(len(tiles), 8), title, None)
+
+
+def write_pictures(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
+    """Draw the moment of each task at which an entry mattered most; entries that are frames alone."""
+    by_name = {recording.name: recording for recording in recordings}
+    written = []
+    for task, lines in findings.matters_most().items():
+        recording = by_name.get(lines[0].recording)
+        if recording is None or lines[0].store != "memory":
+            continue
+        needed = np.unique([*(line.time for line in lines), lines[0].step])
+        if not recording.source.drawn(recording.episode)[needed].all():
+            continue
+        (folder / PICTURES).mkdir(parents=True, exist_ok=True)
+        path = folder / PICTURES / f"{task or 'task'}.png"
+        remembered_picture(lines, recording).save(path)
+        written.append(path)
+    return written
+
+
+def write_page(
+    folder: Path, name: str, findings: Findings, comparisons: Sequence[Comparison] = (), notes: Sequence[str] = ()
+) -> Path:
+    """Write `page.html` and `table.md` into the probe's folder."""
+    parts = [f"<h1>What {escape(name)} takes from its memory</h1>"]
+    texts = [f"# What {name} takes from its memory", ""]
+    if notes:
+        parts.append("<div class=note>" + "".join(f"<p>{escape(note)}</p>" for note in notes) + "</div>")
+    if findings.moments:
+        tables = [checkpoints_table({name: findings}), arms_table(findings), phases_table(findings)]
+        parts.append(section("In short", html_table(tables[0]), UNITS))
+        parts.append(section("Interventions", effects(findings)))
+        curves = [(f"Over the dial: {dial}", drawn, "Dashed: the policy's own spread.")
+                  for dial, drawn in dials(findings).items()]  # fmt: skip
+        if findings.entries:
+            curves.insert(0, ("Decay with distance", decay(findings), "Each entry left out by itself."))
+        parts += [pair(*curves[i : i + 2]) if i + 1 < len(curves) else section(*curves[i])
+                  for i in range(0, len(curves), 2)]  # fmt: skip
+        parts += [section(table.title, html_table(table)) for table in tables[1:]]
+        texts += [to_markdown(table) for table in tables]
+    drawn = sorted((folder / PICTURES).glob("*.png"))
+    if drawn:
+        parts.append(section("What was remembered", "".join(map(_embedded, drawn)),
+                             "The moment of each task at which a single entry mattered most."))  # fmt: skip
+    if comparisons:
+        table = comparison_table(comparisons)
+        parts.append(section("In closed loop", html_table(table), "; ".join(c.verdict for c in comparisons) + "."))
+        texts += [to_markdown(table), *(f"- {comparison.verdict}" for comparison in comparisons)]
+    texts += [f"- {note}" for note in notes]
+    for file, text in ((PAGE, document(f"Probe of {name}", parts)), (TABLE, "\n".join(texts) + "\n")):
+        with write_atomically(folder / file) as draft:
+            draft.write_text(text, encoding="utf-8")
+    return folder / PAGE
+
+
+def table_of(findings: Mapping[str, Findings]) -> str:
+    """Several checkpoints beside each other, in Markdown."""
+    return to_markdown(checkpoints_table(dict(findings)))
+
+
+def _embedded(path: Path) -> str:
+    from PIL import Image
+
+    out = BytesIO()
+    with Image.open(path) as image:
+        image.save(out, format="WEBP", quality=80)
+    data = base64.b64encode(out.getvalue()).decode()
+    return f'<img style="max-width:100%" alt="{escape(path.stem)}" src="data:image/webp;base64,{data}">'

@@ -1,0 +1,204 @@
+"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it goes on where it was."""
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+from mme_vla.data.console import progress
+from mme_vla.data.sources import open_sources
+from mme_vla.envs.make import make_env, require_simulator
+from mme_vla.envs.vector.pool import Job
+from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.api import load
+from mme_vla.evaluation.results.compare import Comparison
+from mme_vla.evaluation.rollout.evaluation import Shard, checkpoint_label, choose_episodes, memory_budget
+from mme_vla.evaluation.rollout.runner import RunFacts
+from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.evaluation.store import claim_run, fingerprint
+from mme_vla.policy.base import Policy
+from mme_vla.probing import lines
+from mme_vla.probing.arms import Arm, choose_arms, options_of
+from mme_vla.probing.channels import channel_of
+from mme_vla.probing.offline import OfflineSettings, probe_offline
+from mme_vla.probing.online import online_records, paired, probe_online
+from mme_vla.probing.recordings import Recording, all_recordings
+from mme_vla.probing.report import Findings, write_page, write_pictures
+from mme_vla.subgoal import SubgoalPredictor, build_predictor
+
+OFFLINE = "offline"
+NO_DATA = (
+    "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made by "
+    "`mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false online=true "
+    "probes in closed loop alone."
+)
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is probed.
+
+    given: arms, as `with` says them; None for the usual ones. recordings: episodes to probe; lend: to take from.
+    jobs: episodes of the closed loop, none for none. source: where the weights are from.
+    """
+
+    given: Any = None
+    recordings: Sequence[Recording] = ()
+    lend: Sequence[Recording] = ()
+    jobs: Sequence[Job] = ()
+    offline: OfflineSettings = field(default_factory=OfflineSettings)
+    shard: Shard = field(default_factory=Shard)
+    source: str | None = None
+
+
+@dataclass(frozen=True)
+class Probe:
+    """What a probe found. notes: what a reader has to know, such as arms that were left out."""
+
+    findings: Findings
+    comparisons: list[Comparison]
+    notes: list[str]
+    page: Path
+
+
+def run_probe(
+    policy: Policy,
+    wanted: Wanted,
+    folder: Path,
+    facts: RunFacts,
+    settings: RolloutSettings,
+    *,
+    subgoals: SubgoalPredictor | None = None,
+    base: Callable[..., Any] = make_env,
+    shown: bool = True,
+) -> Probe:
+    """Do what is asked for and is not there, and write the page.
+
+    Raises:
+        UserError: an arm that this policy or these data do not allow, or a folder that holds another probe.
+    """
+    notes: list[str] = []
+    if wanted.recordings:
+        notes += _on_recordings(policy, wanted, folder / OFFLINE, facts, shown)
+    if wanted.jobs:
+        told = base is make_env and settings.env == "mme_vla"
+        arms, left_out = choose_arms(wanted.given, policy, channel_of(policy), len(wanted.lend), boundaries=told)
+        notes += [f"In closed loop {note}" for note in left_out if note not in notes]
+        probe_online(
+            policy, arms, wanted.jobs, folder, facts, settings, lend=wanted.lend, subgoals=subgoals,
+            shard=wanted.shard, source=wanted.source, base=base, shown=shown,
+        )  # fmt: skip
+    findings = Findings.of(lines.read_all(folder / OFFLINE))
+    comparisons = paired(online_records(folder), facts.split, facts.model)
+    write_pictures(findings, wanted.recordings, folder)
+    return Probe(findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes))
+
+
+def _on_recordings(policy: Policy, wanted: Wanted, folder: Path, facts: RunFacts, shown: bool) -> list[str]:
+    policy.require_processor().require_stats()
+    told = all(recording.tells_subtasks for recording in wanted.recordings)
+    arms, notes = choose_arms(wanted.given, policy, channel_of(policy), _to_take_from(wanted), boundaries=told)
+    claim_run(folder, _settings(policy, wanted, facts, arms))
+    shard = wanted.shard
+    mine = list(wanted.recordings)[shard.index :: shard.count]
+    name = "offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl"
+    with progress("probe", len(mine), unit="episodes") if shown else nullcontext(_silent) as advance:
+        probe_offline(policy, arms, mine, wanted.lend, folder / name, wanted.offline, advance)
+    return notes
+
+
+def _silent(steps: int) -> None:
+    """Nobody is told."""
+
+
+def _to_take_from(wanted: Wanted) -> int:
+    """Recorded episodes that are there for every one that is probed: not itself."""
+    names = {recording.name for recording in wanted.lend}
+    return len(names) - any(recording.name in names for recording in wanted.recordings)
+
+
+def _settings(policy: Policy, wanted: Wanted, facts: RunFacts, arms: Sequence[Arm]) -> dict[str, Any]:
+    """What decides the lines, as `run.json` keeps it."""
+    sources = {id(r.source): r.source for r in [*wanted.recordings, *wanted.lend]}
+    return {
+        "model": facts.model,
+        "checkpoint": facts.checkpoint,
+        "policy": fingerprint(dict(policy.config)),
+        "arms": {arm.name: options_of(arm) for arm in arms},
+        "data": {source.name: source.fingerprint for source in sources.values()},
+        "recordings": [recording.name for recording in wanted.recordings],
+        **asdict(wanted.offline),
+    }
+
+
+def probed_folder(folder: Path) -> Findings:
+    """What a finished probe's folder holds.
+
+    Raises:
+        UserError: it holds none.
+    """
+    found = Findings.of(lines.read_all(folder / OFFLINE))
+    if not found.moments:
+        raise UserError(f"{folder} holds no probe on recorded episodes: no {OFFLINE}/offline.jsonl with lines in it.")
+    return found
+
+
+def probe(
+    policy: Policy | str | Path,
+    recordings: Any = None,
+    arms: Sequence[Any] | None = None,
+    *,
+    output: str | Path,
+    tasks: str | Sequence[str] | None = None,
+    episodes: int | Sequence[int] | None = None,
+    seed: int = 42,
+    draws: int = 8,
+    moments: int | None = 8,
+    subgoal: str | SubgoalPredictor | None = None,
+    name: str | None = None,
+    base: Callable[..., Any] = make_env,
+    shown: bool = True,
+    **settings: Any,
+) -> Probe:
+    """Ask what a policy takes from its memory; what `output` holds already is not asked again.
+
+    Args:
+        policy: one with statistics; or a folder or hub repository to load one from.
+        recordings: recorded episodes: folders of datasets, as for the command. Without them the closed loop is probed.
+        arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that are possible.
+        output: the probe's folder, for its lines and its page.
+        tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
+        seed: of noise and of what is drawn at random.
+        draws: chunks sampled at each moment. moments: most of an episode.
+        subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
+        name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
+        shown: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
+
+    Returns:
+        Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
+
+    Raises:
+        UserError: nothing to probe on, an intervention that does not exist or does not fit, or a setting likewise.
+
+    >>> probe("outputs/mine/latest", "outputs/val", output="outputs/probe").page  # doctest: +SKIP
+    """
+    known = [option.name for option in fields(RolloutSettings) if option.name != "seed"]
+    if unknown := [key for key in settings if key not in known]:
+        raise UserError(f"probe() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
+    if recordings is None and tasks is None:
+        raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
+    chosen = RolloutSettings(seed=seed, **settings)
+    loaded, source = load(policy)
+    recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    jobs = [] if tasks is None else choose_episodes(tasks, episodes, chosen.split)
+    if jobs and base is make_env and chosen.env == "mme_vla":
+        require_simulator()
+    predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
+    facts = RunFacts(
+        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, chosen.split,
+        chosen.max_steps, subgoal if isinstance(subgoal, str) else None, memory_budget(loaded),
+    )  # fmt: skip
+    wanted = Wanted(arms, recorded, recorded, jobs, OfflineSettings(seed, draws, moments), source=source)
+    folder = Path(output).expanduser()
+    return run_probe(loaded.eval(), wanted, folder, facts, chosen, subgoals=predictor, base=base, shown=shown)
