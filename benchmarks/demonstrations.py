@@ -28,16 +28,16 @@ def demonstrate(task: str, difficulty: str, seed: int) -> tuple[bool, int, str]:
 
 def seeds_with_scenes(task: str, difficulty: str, first: int, count: int) -> list[int]:
     """The first seeds from `first` on whose layout finds a place for every object."""
-    found: list[int] = []
+    seeds: list[int] = []
     seed = first
-    while len(found) < count:
+    while len(seeds) < count:
         try:
             make_task(task, render=False, seed=seed, difficulty=difficulty).close()
-            found.append(seed)
+            seeds.append(seed)
         except SceneError:
             pass
         seed += 1
-    return found
+    return seeds
 
 
 def main() -> None:

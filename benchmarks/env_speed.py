@@ -39,7 +39,7 @@ def pick_cube() -> Callable[[], object]:
     return lambda: env.step(HOLD)
 
 
-def own(task: str) -> tuple[Any, Callable[[], object]]:
+def library_env(task: str) -> tuple[Any, Callable[[], object]]:
     """A task's environment, and one step of it; no conditioning video is run first."""
     env = make_env(task, seed=1, difficulty="hard", max_steps=100_000)
     env.reset(options={"video": False})
@@ -90,12 +90,12 @@ def main() -> None:
     rate(reference, 5)
     print("| task | steps/s | PickCube-v1, same run | ratio |\n|---|---:|---:|---:|")
     for task in args.tasks:
-        env, step = own(task)
+        env, step = library_env(task)
         rate(step, 3)
         pairs = [(rate(step, args.steps), rate(reference, args.steps)) for _ in range(args.rounds)]
-        ours, theirs = (float(np.median(values)) for values in zip(*pairs, strict=True))
+        target, source = (float(np.median(values)) for values in zip(*pairs, strict=True))
         env.close()
-        print(f"| {task} | {ours:.2f} | {theirs:.2f} | {np.median([a / b for a, b in pairs]):.2f} |", flush=True)
+        print(f"| {task} | {target:.2f} | {source:.2f} | {np.median([a / b for a, b in pairs]):.2f} |", flush=True)
     where(args.tasks[0], args.steps)
     for workers in args.workers:
         print(f"{workers} workers: {workers_rate(workers, args.steps):.2f} steps/s together", flush=True)
@@ -103,7 +103,7 @@ def main() -> None:
 
 def where(task: str, steps: int) -> None:
     """Print where the time of a step goes."""
-    env, step = own(task)
+    env, step = library_env(task)
     rate(step, 3)
     parts = Parts(env)
     total = 1000 / rate(step, steps)

@@ -58,10 +58,10 @@ def targets() -> dict[str, Target]:
     """All kinds by name; those of checkpoints lie in a module of their own."""
     from benchmarks.fuzz_targets import data, texts
 
-    found = [*data.TARGETS, *texts.TARGETS]
+    entries = [*data.TARGETS, *texts.TARGETS]
     if importlib.util.find_spec("benchmarks.fuzz_targets.checkpoints"):
-        found = [*importlib.import_module("benchmarks.fuzz_targets.checkpoints").TARGETS, *found]
-    return {target.name: target for target in found}
+        entries = [*importlib.import_module("benchmarks.fuzz_targets.checkpoints").TARGETS, *entries]
+    return {target.name: target for target in entries}
 
 
 def fuzz(target: Target, mutations: int, seed: int, seconds: float = 60, gib: float = 2) -> list[Case]:
@@ -77,9 +77,9 @@ def fuzz(target: Target, mutations: int, seed: int, seconds: float = 60, gib: fl
         maker.start()
         maker.join()
         files = [path.relative_to(root / "valid") for path in target.files(root / "valid")]
-        (kind, valid, said), again = (_apart(target, root / "valid", seconds, gib) for _ in range(2))
+        (kind, valid, message), again = (_apart(target, root / "valid", seconds, gib) for _ in range(2))
         if kind != "read" or again[1] != valid:
-            raise RuntimeError(f"The undamaged {target.name} cannot be read: {said or 'it reads differently twice'}")
+            raise RuntimeError(f"The undamaged {target.name} cannot be read: {message or 'it reads differently twice'}")
         return [_case(target, root, files, valid, number, seed, seconds, gib) for number in range(mutations)]
 
 
@@ -94,16 +94,16 @@ def _case(
     mutation = mutate(rng, work / path)
     if (work / path).is_file() and not (work / path).is_symlink() and (work / path).read_bytes() == before[path]:
         mutation += " (nothing changed)"
-    kind, found, said = _apart(target, work, seconds, gib)
+    kind, result, message = _apart(target, work, seconds, gib)
     outcome = kind
-    if kind == "read" and found == valid:
+    if kind == "read" and result == valid:
         outcome = "harmless"
     elif kind == "read":
-        outcome = "warned" if said else "untellable" if target.untellable(valid, found) else "silent"
-    elif kind == "refused" and len(said) > LONGEST:
+        outcome = "warned" if message else "untellable" if target.untellable(valid, result) else "silent"
+    elif kind == "refused" and len(message) > LONGEST:
         outcome = "long"
     _remove(work)
-    return Case(target.name, number, path.as_posix(), mutation, outcome, said.replace(str(work), "<folder>"))
+    return Case(target.name, number, path.as_posix(), mutation, outcome, message.replace(str(work), "<folder>"))
 
 
 def _apart(target: Target, folder: Path, seconds: float, gib: float) -> tuple[str, object, str]:
@@ -116,8 +116,8 @@ def _apart(target: Target, folder: Path, seconds: float, gib: float) -> tuple[st
     try:
         if not here.poll(seconds):
             return "hang", None, f"no end after {seconds:g} s"
-        answer: tuple[str, object, str] = here.recv()
-        return answer
+        reply: tuple[str, object, str] = here.recv()
+        return reply
     except EOFError:
         child.join(5)
         return "traceback", None, f"the process ended with {child.exitcode}"
@@ -154,8 +154,8 @@ def _read(target: Target, folder: Path, gib: float, answers: Connection) -> None
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)
             result = target.read(folder)
-        told = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
-        answers.send(("read", result, "\n".join([*told, log.getvalue()]).strip()))
+        warning_texts = [str(warning.message) for warning in caught if issubclass(warning.category, UserWarning)]
+        answers.send(("read", result, "\n".join([*warning_texts, log.getvalue()]).strip()))
     except UserError as error:
         answers.send(("refused", None, str(error)))
     except BaseException:

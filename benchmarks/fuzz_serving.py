@@ -52,10 +52,10 @@ class Mutations:
     def __init__(self, seed: int) -> None:
         self._rng = random.Random(seed)
         first, later, *_ = honest(0, size=8)
-        picture = np.zeros((8, 8, 3), np.uint8)
+        image = np.zeros((8, 8, 3), np.uint8)
         state = np.zeros(8, np.float32)
-        view = {"observation/image": picture, "observation/wrist_image": picture, "observation/state": state}
-        buffer = {"add_buffer": True, "images": picture[None, None], "state": state[None], "exec_start_idx": 0}
+        view = {"observation/image": image, "observation/wrist_image": image, "observation/state": state}
+        buffer = {"add_buffer": True, "images": image[None, None], "state": state[None], "exec_start_idx": 0}
         self._messages: list[dict[str, Any]] = [first, later, {**view, "prompt": "go"}, buffer, {"reset": True}]
         self._packed = [pack(message) for message in self._messages]
 
@@ -126,11 +126,11 @@ class Fuzz:
         if error != 0:
             self.wrong.append(f"episode {which}, request {step}: off by {error:.1e}")
 
-    def _heard(self, transport: str, answer: bytes | str) -> None:
-        refused = isinstance(answer, str)
+    def _check_reply(self, transport: str, reply: bytes | str) -> None:
+        refused = isinstance(reply, str)
         self.counts[f"{transport} {'refused' if refused else 'happened to be well-formed'}"] += 1
-        if refused and (not answer.strip() or "Traceback" in answer or "server failed" in answer):
-            self.wrong.append(f"{transport}: answered {answer[:200]!r}")
+        if refused and (not reply.strip() or "Traceback" in reply or "server failed" in reply):
+            self.wrong.append(f"{transport}: answered {reply[:200]!r}")
 
     def websocket(self, number: int) -> None:
         """Malformed messages; each connection is used until the server ends it."""
@@ -143,13 +143,13 @@ class Fuzz:
             try:
                 with suppress(ConnectionClosed):
                     socket.send(mutations.next())
-                answer = socket.recv(120)
+                reply = socket.recv(120)
             except ConnectionClosed as closed:
                 self.wrong.append(f"websocket: closed without an answer: {closed}")
                 socket = None
                 continue
-            self._heard("websocket", answer)
-            if isinstance(answer, str):
+            self._check_reply("websocket", reply)
+            if isinstance(reply, str):
                 ends.close()
                 socket = None
 
@@ -162,7 +162,7 @@ class Fuzz:
             body = reply.read()
             if reply.status >= 500 or (reply.status >= 400 and not body):
                 self.wrong.append(f"HTTP {reply.status}: {body[:200]!r}")
-            self._heard("HTTP", body if reply.status == 200 else body.decode())
+            self._check_reply("HTTP", body if reply.status == 200 else body.decode())
 
     def honest_websocket(self) -> None:
         """Episodes that must not notice any of it."""
@@ -181,10 +181,10 @@ class Fuzz:
                     connection.request("POST", "/infer", pack(message), {"X-Session": "honest"})
                     self._compare(which, step, unpack(connection.getresponse().read())["actions"])
 
-    def guarded(self, work: Any, *given: Any) -> None:
+    def guarded(self, work: Any, *args: Any) -> None:
         """Run in a thread; what goes wrong is a finding."""
         try:
-            work(*given)
+            work(*args)
         except Exception as error:
             self.wrong.append(f"{work.__name__}: {type(error).__name__}: {error}")
 

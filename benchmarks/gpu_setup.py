@@ -67,7 +67,7 @@ def peak_gib(device: torch.device) -> float | None:
 
 def milliseconds(work: Callable[[], object], rounds: int, warmup: int, device: torch.device) -> list[float]:
     """How long each round takes, the device's work included; ascending. A CPU is warmed up once at most."""
-    found = []
+    times = []
     warmup = warmup if device.type == "cuda" else min(warmup, 1)
     for index in range(warmup + rounds):
         wait(device)
@@ -75,8 +75,8 @@ def milliseconds(work: Callable[[], object], rounds: int, warmup: int, device: t
         work()
         wait(device)
         if index >= warmup:
-            found.append(1e3 * (time.perf_counter() - begun))
-    return sorted(found)
+            times.append(1e3 * (time.perf_counter() - begun))
+    return sorted(times)
 
 
 def wait(device: torch.device) -> None:
@@ -126,5 +126,5 @@ def batch_of(policy: MMEPolicy, size: int, device: torch.device) -> Batch:
 
 def draws_of(policy: MMEPolicy, size: int, device: torch.device) -> dict[str, Tensor]:
     """Random numbers of its loss."""
-    drawn = policy.loss_draws(size, torch.Generator().manual_seed(0))
-    return {name: value.to(device) for name, value in drawn.items()}
+    sampled = policy.loss_draws(size, torch.Generator().manual_seed(0))
+    return {name: value.to(device) for name, value in sampled.items()}

@@ -87,9 +87,9 @@ def feeding(model: str, setup: Setup, workers: int) -> dict[str, float]:
         wait(device)
         waited, begun = 0.0, time.perf_counter()
         for _ in range(setup.rounds):
-            asked = time.perf_counter()
+            request_time = time.perf_counter()
             batch = next(batches)
-            waited += time.perf_counter() - asked
+            waited += time.perf_counter() - request_time
             update(batch.to(device, non_blocking=True), draws)
         wait(device)
         took = time.perf_counter() - begun

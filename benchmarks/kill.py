@@ -72,15 +72,15 @@ def attack(
         thin: of successive writes to one file take the first, the middle and the last one alone.
         skip: leave out so many, which an earlier attack had time for.
     """
-    command, begun, found = COMMANDS[name], time.monotonic(), Outcome(name)
+    command, begun, outcome = COMMANDS[name], time.monotonic(), Outcome(name)
     inputs, log = base / f"{name}-inputs", base / f"{name}.log"
     inputs.mkdir()
     folder = base / name  # the same for all runs: some results say where they lie
     _import_what_it_uses(command, inputs, folder, log)
     expected, changes = _run(command.run, inputs, folder, log)
-    found.changes = len(changes)
-    chosen = _ends_and_middles(changes) if thin else range(1, len(changes) + 1)
-    numbers = [n for n in chosen if n >= first and (not only or changes[n - 1].split()[0] in only)]
+    outcome.changes = len(changes)
+    selected = _ends_and_middles(changes) if thin else range(1, len(changes) + 1)
+    numbers = [n for n in selected if n >= first and (not only or changes[n - 1].split()[0] in only)]
     numbers = numbers[::every]
     random.Random(0).shuffle(numbers)  # so that what there is time for is spread over the run
     for number in numbers[skip:]:
@@ -91,19 +91,19 @@ def attack(
         killed = trace(work, folder, kill_at=number)
         again = trace(work, folder)
         there = results(folder)
-        found.kills += killed.code == -9
-        found.outlived += killed.outlived > 0
-        found.refused += again.code != 0
-        found.wrong += again.code == 0 and any(there.get(path) != value for path, value in expected.items())
-        found.left += bool(there.keys() - expected.keys())
+        outcome.kills += killed.code == -9
+        outcome.outlived += killed.outlived > 0
+        outcome.refused += again.code != 0
+        outcome.wrong += again.code == 0 and any(there.get(path) != value for path, value in expected.items())
+        outcome.left += bool(there.keys() - expected.keys())
         if again.code or any(there.get(path) != value for path, value in expected.items()) or killed.outlived:
             wrong = sorted(path for path, value in expected.items() if there.get(path) != value)
-            found.places.append(f"{number} {killed.changes[-1]}: exit {again.code}, {wrong[:4]}")
+            outcome.places.append(f"{number} {killed.changes[-1]}: exit {again.code}, {wrong[:4]}")
         elif extra := sorted(there.keys() - expected.keys()):
-            found.places.append(f"{number} {killed.changes[-1]}: left {extra[:4]}")
+            outcome.places.append(f"{number} {killed.changes[-1]}: left {extra[:4]}")
         shutil.rmtree(folder)
-    found.seconds = round(time.monotonic() - begun, 1)
-    return found
+    outcome.seconds = round(time.monotonic() - begun, 1)
+    return outcome
 
 
 def _ends_and_middles(changes: Sequence[str]) -> list[int]:
@@ -143,9 +143,9 @@ def _run(
 ) -> tuple[dict[str, str], Sequence[str]]:
     folder.mkdir()
     changes = _finish(partial(_quiet, partial(run, inputs, folder), log), folder, log)
-    found = results(folder)
+    outputs = results(folder)
     shutil.rmtree(folder)
-    return found, changes
+    return outputs, changes
 
 
 def _finish(work: Callable[[], object], folder: Path, log: Path) -> Sequence[str]:
@@ -173,23 +173,23 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=60, help="stop killing after so long (default: 60)")
     parser.add_argument("--skip", type=int, default=0, help="go on after so many kills of an earlier attack")
     parser.add_argument("--json", type=Path, help="write the outcomes here")
-    given = parser.parse_args()
-    if unknown := set(given.commands) - set(COMMANDS):
+    args = parser.parse_args()
+    if unknown := set(args.commands) - set(COMMANDS):
         parser.error(f"unknown: {', '.join(sorted(unknown))}; known: {', '.join(COMMANDS)}")
-    until, outcomes = time.monotonic() + 60 * given.minutes, []
+    until, outcomes = time.monotonic() + 60 * args.minutes, []
     print("| command | file operations | kills | refused | wrong | left behind | outlived | seconds |")
     print("|---|" + "---:|" * 7)
     with tempfile.TemporaryDirectory() as base:
-        for name in given.commands:
-            o = attack(name, given.every, Path(base).resolve(), until, given.first, given.only, given.thin, given.skip)
+        for name in args.commands:
+            o = attack(name, args.every, Path(base).resolve(), until, args.first, args.only, args.thin, args.skip)
             outcomes.append(o)
             numbers = (o.changes, o.kills, o.refused, o.wrong, o.left, o.outlived, o.seconds)
             print(f"| {name} | " + " | ".join(map(str, numbers)) + " |", flush=True)
     for o in outcomes:
         for place in o.places:
             print(f"{o.command}: {place}")
-    if given.json:
-        given.json.write_text(json.dumps([asdict(o) for o in outcomes], indent=2) + "\n")
+    if args.json:
+        args.json.write_text(json.dumps([asdict(o) for o in outcomes], indent=2) + "\n")
     raise SystemExit(any(o.failures for o in outcomes))
 
 

@@ -36,7 +36,7 @@ class Command:
 
 def results(folder: Path) -> dict[str, str]:
     """A hash of every file below a folder, without what only tells the time."""
-    found = {}
+    sums = {}
     for path in sorted(folder.rglob("*")):
         if path.is_dir():
             continue
@@ -45,8 +45,8 @@ def results(folder: Path) -> dict[str, str]:
             data = _TIMES.sub("", data.decode()).replace(str(folder), "").encode()
         elif path.suffix == ".yaml":
             data = data.decode().replace(str(folder), "").encode()
-        found[path.relative_to(folder).as_posix()] = hashlib.sha256(data).hexdigest()
-    return found
+        sums[path.relative_to(folder).as_posix()] = hashlib.sha256(data).hexdigest()
+    return sums
 
 
 def _train(inputs: Path, folder: Path) -> None:
@@ -101,13 +101,13 @@ def _evaluate(inputs: Path, folder: Path) -> None:
     torch.manual_seed(0)
     settings = RolloutSettings(max_steps=24, flow_steps=2, max_batch=1, video="all", workers=1)
     policy = quick_policy("pi05")
-    module.evaluate(policy, JOBS[1:4], folder / "run", FACTS, settings, base=make_scripted_env, shown=False)
+    module.evaluate(policy, JOBS[1:4], folder / "run", FACTS, settings, base=make_scripted_env, show_progress=False)
 
 
 class _Recorder:
     """Stands in for the simulator: the steps of a demonstration, made up."""
 
-    def __init__(self, task: Any, on_step: Callable[[Any], None], drawing: Any) -> None:
+    def __init__(self, task: Any, on_step: Callable[[Any], None], render_request: Any) -> None:
         self._seed, self._on_step = task.seed, on_step
 
     def record(self) -> Any:
@@ -116,10 +116,10 @@ class _Recorder:
 
         rng = np.random.default_rng(self._seed)
         for step in range(4):
-            pictures = {f"{view}_rgb": rng.integers(0, 255, (64, 64, 3), np.uint8) for view in ("front", "wrist")}
+            images = {f"{view}_rgb": rng.integers(0, 255, (64, 64, 3), np.uint8) for view in ("front", "wrist")}
             state = {"joint_state": rng.normal(size=7).astype(np.float32), "gripper_state": np.zeros(2, np.float32)}
-            told = {**dict.fromkeys(SUBGOALS, "move"), "is_video_demo": step < 1, "is_completed": False}
-            self._on_step(RecordedStep({**pictures, **state}, {"joint_action": rng.normal(size=8)}, told))
+            info = {**dict.fromkeys(SUBGOALS, "move"), "is_video_demo": step < 1, "is_completed": False}
+            self._on_step(RecordedStep({**images, **state}, {"joint_action": rng.normal(size=8)}, info))
         return Recording(success=True, steps=4, stored=4, video=1)
 
 

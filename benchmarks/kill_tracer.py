@@ -53,23 +53,23 @@ def trace(work: Callable[[], object], folder: Path, kill_at: int | None = None, 
     main = os.fork()
     if main == 0:
         _be_traced(work)
-    found, below, alive = Traced(), str(folder.resolve()), {main}
+    traced, below, alive = Traced(), str(folder.resolve()), {main}
     signal.signal(signal.SIGALRM, _over)
     signal.setitimer(signal.ITIMER_REAL, limit_s)
     try:
         os.waitpid(main, 0)
         _ptrace(_SETOPTIONS, main, 0, _FOLLOW)
         _ptrace(_CONT, main, 0, 0)
-        _follow(main, alive, found, below, kill_at)
+        _follow(main, alive, traced, below, kill_at)
     except _TimeIsOverError:
-        found.outlived = len({_group(task) for task in alive} - {main, 0})
+        traced.outlived = len({_group(task) for task in alive} - {main, 0})
         for task in alive:
             _kill(task)
-        if found.code is None:
+        if traced.code is None:
             raise TimeoutError(f"still running after {limit_s:g} s") from None
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
-    return found
+    return traced
 
 
 class _TimeIsOverError(Exception):
@@ -80,7 +80,7 @@ def _over(*_: object) -> None:
     raise _TimeIsOverError
 
 
-def _follow(main: int, alive: set[int], found: Traced, below: str, kill_at: int | None) -> None:
+def _follow(main: int, alive: set[int], traced: Traced, below: str, kill_at: int | None) -> None:
     """Answer every stop of these tasks until all have ended; what outlives the main process has `_GRACE` seconds."""
     while alive:
         try:
@@ -90,7 +90,7 @@ def _follow(main: int, alive: set[int], found: Traced, below: str, kill_at: int 
         if os.WIFEXITED(status) or os.WIFSIGNALED(status):
             alive.discard(task)
             if task == main:
-                found.code = os.waitstatus_to_exitcode(status)
+                traced.code = os.waitstatus_to_exitcode(status)
                 signal.setitimer(signal.ITIMER_REAL, _GRACE)
             continue
         alive.add(task)
@@ -98,8 +98,8 @@ def _follow(main: int, alive: set[int], found: Traced, below: str, kill_at: int 
         if status >> 8 == signal.SIGTRAP | 7 << 8:  # a call of the filter
             change = _change(task, below)
             if change is not None and _group(task) == main:
-                found.changes.append(change)
-                if len(found.changes) == kill_at:
+                traced.changes.append(change)
+                if len(traced.changes) == kill_at:
                     os.kill(main, signal.SIGKILL)
                     continue
             passed_on = 0

@@ -94,8 +94,8 @@ class Soak:
                                                              strict=True)], np.float32)  # fmt: skip
                 client.add_buffer(front, state, exec_start=len(front) - 1 if step == 0 else 0)
                 view = {"observation/image": front[-1], "observation/wrist_image": front[-1]}
-                answer = client.infer({**view, "observation/state": state[-1], "prompt": message["task_goal"][0]})
-                self.compare(which, step, answer["actions"][:16])
+                reply = client.infer({**view, "observation/state": state[-1], "prompt": message["task_goal"][0]})
+                self.compare(which, step, reply["actions"][:16])
 
     def http_episode(self, rng: random.Random) -> None:
         which, name = rng.randrange(EPISODES), str(rng.randrange(6) + 10 * threading.get_ident())
@@ -108,10 +108,10 @@ class Soak:
     def post(self, body: bytes, name: str) -> tuple[int, bytes]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
         connection.request("POST", "/infer", body, {"X-Session": name})
-        answer = connection.getresponse()
-        found = answer.status, answer.read()
+        response = connection.getresponse()
+        result = response.status, response.read()
         connection.close()
-        return found
+        return result
 
     def long_first_message(self, rng: random.Random) -> None:
         with self.connect() as client:
@@ -138,21 +138,21 @@ class Soak:
                pack(first)[:-7], pack(later), pack([1, 2, 3])]  # fmt: skip
         client = self.connect()
         client._socket.send(rng.choice(bad))
-        answer = client._socket.recv(60)
+        reply = client._socket.recv(60)
         client.close()
-        if not isinstance(answer, str) or "Traceback" in answer:
-            raise AssertionError(f"garbage was answered with {answer[:100]!r}")
+        if not isinstance(reply, str) or "Traceback" in reply:
+            raise AssertionError(f"garbage was answered with {reply[:100]!r}")
 
     def garbage_on_the_wire(self, rng: random.Random) -> None:
         noise = rng.randbytes(2000)
         sent = rng.choice([noise, b"GET / HTTP/9\r\n\r\n", b"POST /infer HTTP/1.1\r\n\r\n"])
         with socket.create_connection(("127.0.0.1", self.port), timeout=60) as raw:
             raw.sendall(sent)
-            answer = raw.recv(100)
-        if not answer and sent is noise:  # what is no HTTP need not get an answer in HTTP
+            reply = raw.recv(100)
+        if not reply and sent is noise:  # what is no HTTP need not get an answer in HTTP
             self.counts["closed without an answer"] += 1
-        elif not answer.startswith(b"HTTP/1.1 4"):
-            raise AssertionError(f"garbage on the wire was answered with {answer!r}")
+        elif not reply.startswith(b"HTTP/1.1 4"):
+            raise AssertionError(f"garbage on the wire was answered with {reply!r}")
 
     def oversized(self, rng: random.Random) -> None:
         client = self.connect()
@@ -189,8 +189,8 @@ class Soak:
     def stats(self) -> dict[str, Any]:
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=60)
         connection.request("GET", "/stats")
-        found: dict[str, Any] = json.loads(connection.getresponse().read())
-        return found
+        result: dict[str, Any] = json.loads(connection.getresponse().read())
+        return result
 
 
 def challenge(frames: np.ndarray, states: np.ndarray, first: bool) -> dict[str, Any]:
@@ -206,8 +206,8 @@ def challenge(frames: np.ndarray, states: np.ndarray, first: bool) -> dict[str, 
 
 def resident_mib(process: int) -> float:
     status = Path(f"/proc/{process}/status").read_text()
-    found = re.search(r"VmRSS:\s+(\d+)", status)
-    return int(found[1]) / 1024 if found else float("nan")
+    match = re.search(r"VmRSS:\s+(\d+)", status)
+    return int(match[1]) / 1024 if match else float("nan")
 
 
 def main(seconds: float) -> int:

@@ -50,7 +50,7 @@ def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
     """The oracle planner's choices in the environment that policies meet, without pictures."""
     spec = metadata.episode(task, f"stress:{dial}={value}", episode)
     which = EpisodeId(*astuple(spec))
-    session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, pictures=False)
+    session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, images=False)
     try:
         play(session, OraclePlayer())
         video = len(session.reveals[0].frames) - 1
@@ -82,7 +82,7 @@ def main() -> None:
     if there:
         with args.output.open() as file:
             done = {tuple(row[name] for name in KEY) for row in csv.DictReader(file)}
-    wanted = [
+    keys = [
         (actor, dial, task, value, episode)
         for actor in args.actors
         for dial in args.dials
@@ -94,7 +94,7 @@ def main() -> None:
         writer = csv.writer(file)
         if not there:
             writer.writerow(COLUMNS)
-        for key in wanted:
+        for key in keys:
             if tuple(map(str, key)) not in done:
                 writer.writerow(measure(*key))
                 file.flush()

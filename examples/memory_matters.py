@@ -111,16 +111,16 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
 def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generator, size: int) -> Batch:
     """Random execution steps of random episodes, with the action their colour asks for."""
     processor, config = policy.require_processor(), policy.backbone.config
-    chosen = [streams[i] for i in rng.integers(len(streams), size=size)]
+    selected = [streams[i] for i in rng.integers(len(streams), size=size)]
     steps = rng.integers(VIDEO, LENGTH, size=size)
-    views = np.stack([stream.frames[t] for stream, t in zip(chosen, steps, strict=True)])
+    views = np.stack([stream.frames[t] for stream, t in zip(selected, steps, strict=True)])
     prompt, prompt_mask = processor.prompt("do what the video showed")
     actions = torch.zeros(size, config.horizon, config.action_dim)
-    actions[..., :8] = torch.from_numpy(ANSWERS[[stream.colour for stream in chosen]])[:, None]
+    actions[..., :8] = torch.from_numpy(ANSWERS[[stream.colour for stream in selected]])[:, None]
     history = None
     if policy.memory is not None:
         memory = policy.memory
-        recalled = [memory.recall(s.history, int(t)) for s, t in zip(chosen, steps, strict=True) if s.history]
+        recalled = [memory.recall(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history]
         history = stack_history(recalled)
     return Batch(
         images=processor.images([views, views])[:, :1],  # one camera says it all
@@ -129,19 +129,19 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
         prompt_mask=prompt_mask.expand(size, -1),
         history=history,
         actions=actions,
-        past=past_of(policy, chosen, steps),
+        past=past_of(policy, selected, steps),
     ).without_prompt_padding()
 
 
-def past_of(policy: MMEPolicy, chosen: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
+def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
     """Past views of the one camera, where the memory gives the vision tower any."""
-    look = None if policy.memory is None else policy.memory.looks_back
-    if look is None:
+    past_spec = None if policy.memory is None else policy.memory.past_view_spec
+    if past_spec is None:
         return None
     prepare = policy.require_processor().images
     past = stack_past([
-        past_views(look, int(t), lambda at, stream=stream: [stream.frames[at]] * 2, prepare)
-        for stream, t in zip(chosen, steps, strict=True)
+        past_views(past_spec, int(t), lambda at, stream=stream: [stream.frames[at]] * 2, prepare)
+        for stream, t in zip(selected, steps, strict=True)
     ])  # fmt: skip
     assert past is not None
     return replace(past, images=past.images[:, :, :1])
@@ -184,7 +184,7 @@ def learn(
         model, seed=seed, config_dir=config_dir, policy={"augment": False}, backbone=backbone or {}, **options
     )
     policy.backbone.vision.requires_grad_(False)
-    seen, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
+    train_streams, unseen = make_streams(policy, episodes, seed), make_streams(policy, 32, seed + 1)
     trained = [p for p in policy.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, lr=lr, betas=(0.9, 0.95), fused=True)
     rng, done = np.random.default_rng(seed), 0
@@ -192,14 +192,14 @@ def learn(
         policy.train()
         for group in optimizer.param_groups:
             group["lr"] = lr * min(1.0, (done + 1) / 30)
-        loss, _ = policy(make_batch(policy, seen, rng, batch_size))
+        loss, _ = policy(make_batch(policy, train_streams, rng, batch_size))
         loss.backward()
         torch.nn.utils.clip_grad_norm_(trained, 1.0)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         done += 1
         if done % every == 0 and policy.memory is not None:
-            error = open_loop_error(policy, seen, 24)
+            error = open_loop_error(policy, train_streams, 24)
             print(f"  {model}: {error:.2f} on the episodes it learns from after {done} steps", flush=True)
             if error < enough:
                 break
@@ -267,9 +267,9 @@ def compare(args: argparse.Namespace) -> None:
                 with args.results.open("a") as file:
                     file.write(json.dumps(result) + "\n")
     line = "{model:20} error {error:.3f} after {steps} steps, {cpu:.0f} s of CPU time, {wall:.0f} s of wall time"
-    shown = [results[model] for model in models]
-    print("\n".join(line.format(**result) for result in shown))
-    plot(shown, args.plot)
+    displayed = [results[model] for model in models]
+    print("\n".join(line.format(**result) for result in displayed))
+    plot(displayed, args.plot)
     print(f"plot: {args.plot}")
 
 

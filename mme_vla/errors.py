@@ -62,5 +62,5 @@ def listed(names: Iterable[object], most: int = 12) -> str:
     'a, b and 1 more'
     """
     every = [brief(str(name), 120, quote=False) for name in names]
-    rest = len(every) - most
-    return ", ".join(every[:most]) + (f" and {rest:,} more" if rest > 0 else "")
+    remaining = len(every) - most
+    return ", ".join(every[:most]) + (f" and {remaining:,} more" if remaining > 0 else "")

@@ -77,12 +77,12 @@ class Registry[T]:
             signature.bind(*args, **fixed, **options)
         except TypeError as error:
             kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
-            own = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
-            takes = own[len(args) :]
+            accepted = [name for name, p in signature.parameters.items() if p.kind in kinds and name not in fixed]
+            takes = accepted[len(args) :]
             unknown = [name for name in options if name not in takes]
             hint = did_you_mean(unknown[0], takes) if unknown else f"Known: {', '.join(takes) or 'none'}."
-            given = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
-            raise UserError(f"{what} does not take these options: {given} ({error}). {hint}") from None
+            options_text = ", ".join(f"{name}={brief(value)}" for name, value in options.items()) or "no options"
+            raise UserError(f"{what} does not take these options: {options_text} ({error}). {hint}") from None
         return entry(*args, **fixed, **options)
 
     def __contains__(self, name: object) -> bool:

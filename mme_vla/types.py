@@ -22,16 +22,16 @@ class TensorStruct:
     """A dataclass of tensors (or nested structs, or None) that moves between devices as one."""
 
     def _map(self, fn: Any) -> Self:
-        moved = {}
+        values = {}
         for member in fields(self):  # type: ignore[arg-type]
             value = getattr(self, member.name)
             if isinstance(value, Tensor):
-                moved[member.name] = fn(value)
+                values[member.name] = fn(value)
             elif isinstance(value, TensorStruct):
-                moved[member.name] = value._map(fn)
+                values[member.name] = value._map(fn)
             else:
-                moved[member.name] = value
-        return type(self)(**moved)
+                values[member.name] = value
+        return type(self)(**values)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """Return a copy whose tensors went through `Tensor.to` with these arguments."""
@@ -41,9 +41,9 @@ class TensorStruct:
         """Return a copy on a device that nobody waits for: see `send`."""
         return self._map(lambda x: send(x, device))
 
-    def rows(self, chosen: Tensor | slice) -> Self:
-        """Return the rows of every tensor that `chosen` names: numbers [n], a mask, or a slice."""
-        return self._map(lambda x: x[chosen])
+    def rows(self, index: Tensor | slice) -> Self:
+        """Return the rows of every tensor that `index` names: numbers [n], a mask, or a slice."""
+        return self._map(lambda x: x[index])
 
     def pin_memory(self) -> Self:
         """Return a copy in page-locked memory (what `DataLoader(pin_memory=True)` calls)."""

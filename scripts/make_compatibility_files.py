@@ -3,7 +3,7 @@ r"""Write `tests/data/compatibility`: files of every published format, and what 
     python scripts/make_compatibility_files.py tests/data/compatibility
 
 Run it at the version whose files later versions have to read, from the root of a clone with the extras `dev`, `sim`,
-`vlm`, `baselines` and `orbax`, on a CPU. `tests/test_compatibility.py` opens the files and compares what it gets with
+`vlm`, `baselines` and `orbax`, on a CPU. `tests/end_to_end/test_compatibility.py` opens the files and compares what it gets with
 `expected.json`. Floating-point figures agree to 1e-5 between CPUs, not bitwise. Never regenerate the folder to make
 that test pass: a failure means that files of users can no longer be read.
 
@@ -297,7 +297,7 @@ def evaluate_scripted(folder: Path, output: Path) -> Any:
 
     return mme_vla.evaluate(
         folder / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3, output=output, base=make_far_env,
-        shown=False, max_steps=24, flow_steps=2, workers=1, max_batch=1, video="all",
+        show_progress=False, max_steps=24, flow_steps=2, workers=1, max_batch=1, video="all",
     )  # fmt: skip
 
 

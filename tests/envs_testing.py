@@ -76,7 +76,7 @@ def replay(env: Task, folder: Path, episode: int) -> np.ndarray:
     for action in actions.astype(np.float32):
         *_, info = env.step(action)
         joints.append(env.qpos)
-        subtasks.append(env.progress.shown.text)
+        subtasks.append(env.progress.displayed.text)
         success = bool(info["success"])
     del env._after_simulation_step
     error = np.abs(np.array(joints) - np.hstack([arm, fingers])).max(1)

@@ -43,7 +43,7 @@ class LastFrames(Memory):
         return MeanBrightness() if self.storage.scorer else None
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        kept = self.storage.kept_frames(step + 1)
+        kept = self.storage.stored_frames(step + 1)
         if self.storage.scorer:
             scores = history.scores.until(step)
             bright = scores.frames[np.argsort(-scores.values.mean(1), kind="stable")]

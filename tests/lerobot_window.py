@@ -74,7 +74,7 @@ def as_batch(policy: MMEPolicy) -> Batch:
         features[..., :STATE] = given["states"]
     mask = given["seen"][:, : memory.capacity]
     places = torch.zeros(*mask.shape, 3)
-    past = PastViews(clips[:, :-1], given["seen"][:, :-1], EVERY) if memory.looks_back is not None else None
+    past = PastViews(clips[:, :-1], given["seen"][:, :-1], EVERY) if memory.past_view_spec is not None else None
     return Batch(
         images=clips[:, -1],
         image_mask=torch.ones(2, 2, dtype=torch.bool),

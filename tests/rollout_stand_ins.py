@@ -78,7 +78,7 @@ def whole_run(
 ) -> Evaluation:
     """These episodes in two worker processes."""
     chosen = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
-    return evaluate(policy, jobs, folder, FACTS, chosen, base=base, shown=False)
+    return evaluate(policy, jobs, folder, FACTS, chosen, base=base, show_progress=False)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from mme_vla.training.checkpoint import trainable
 from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.optim import clip_gradients, make_optimizer
-from mme_vla.training.parallel import ParallelSettings, gathered, is_sharded, shard, whole_number
+from mme_vla.training.parallel import ParallelSettings, full_value, gathered, is_sharded, shard
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import shard_files
@@ -58,7 +58,7 @@ def trainer(folder: Path, steps: int, resumed: bool = False, **changes: Any) -> 
 def finish_run(job: Trainer, line: ProgressLine | None = None) -> bool:
     first, run = job.accelerator.is_main_process, job.run_info
     loggers = open_loggers(run.folder, {}, run.step) if first else Loggers([])
-    with line or ProgressLine(job.settings.steps, 0, shown=False) as shown:
+    with line or ProgressLine(job.settings.steps, 0, visible=False) as shown:
         finished = job.run(shown, loggers)
         job.close()
     return finished
@@ -114,7 +114,7 @@ def update_of(model: Policy, batch: Any, draws: dict[str, Tensor]) -> tuple[floa
     loss, numbers = model(batch, draws)
     loss.backward()
     gradients = [p.grad for p in trainable(model).values() if p.grad is not None]
-    norm = whole_number(clip_gradients(gradients, 1.0))
+    norm = full_value(clip_gradients(gradients, 1.0))
     optimizer.step()
     optimizer.zero_grad()
     torch.manual_seed(3)

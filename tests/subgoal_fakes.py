@@ -66,8 +66,8 @@ def play(predictor, episode, chunks):
     for _ in range(chunks):
         subgoal = predictor.predict([episode])[0]
         said.append(subgoal)
-        asked += [episode.step] if subgoal.asked else []
-        episode.observe(frames(16, episode.frames_seen))
+        asked += [episode.step] if subgoal.queried else []
+        episode.observe(frames(16, episode.n_observed_frames))
     return said, asked
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 
-def _never(valid: object, found: object) -> bool:
+def _never(valid: object, result: object) -> bool:
     return False
 
 
@@ -41,10 +41,10 @@ def every_file(folder: Path) -> list[Path]:
 
 def digest(*values: object) -> str:
     """A hash of arrays and of whatever has a faithful `repr`."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for value in values:
         if isinstance(value, np.ndarray):
-            found.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+            hasher.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
         else:
-            found.update(repr(value).encode("utf-8", "surrogatepass"))
-    return found.hexdigest()
+            hasher.update(repr(value).encode("utf-8", "surrogatepass"))
+    return hasher.hexdigest()

@@ -130,7 +130,7 @@ def read_lerobot(folder: Path) -> object:
     return _read_as(folder, "lerobot")
 
 
-def _always(valid: object, found: object) -> bool:
+def _always(valid: object, result: object) -> bool:
     return True
 
 

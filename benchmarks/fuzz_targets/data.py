@@ -39,8 +39,8 @@ def write_recording(folder: Path) -> None:
             for t in range(length):
                 step = episode.create_group(f"timestep_{t}")
                 for view in ("front", "wrist"):
-                    picture = np.repeat(rng.integers(0, 255, (SIDE, SIDE, 1), np.uint8), 3, axis=2)
-                    step.create_dataset(f"obs/{view}_rgb", data=picture, compression="lzf")
+                    image = np.repeat(rng.integers(0, 255, (SIDE, SIDE, 1), np.uint8), 3, axis=2)
+                    step.create_dataset(f"obs/{view}_rgb", data=image, compression="lzf")
                 step["obs/joint_state"] = rng.normal(size=7).astype(np.float32)
                 step["obs/gripper_state"] = np.array([0.04, 0.04], np.float32)
                 step["action/joint_action"] = rng.normal(size=8)
@@ -96,7 +96,7 @@ def read_dataset(folder: Path) -> object:
     return digest(*read)
 
 
-class _Pictures:
+class _SyntheticSource:
     """As much of an `EpisodeSource` as a cache asks for."""
 
     name, fingerprint = "fuzzed", "0123456789abcdef"
@@ -123,30 +123,30 @@ def _encode(frames: np.ndarray) -> Tensor:
 
 
 def _expected() -> dict[str, Any]:
-    source: Any = _Pictures()
+    source: Any = _SyntheticSource()
     return fingerprint(source, _memory().storage, "encoder")
 
 
 def write_cache(folder: Path) -> None:
     """The vision cache of two episodes, with scores."""
-    source: Any = _Pictures()
+    source: Any = _SyntheticSource()
     build_cache(source, _memory(), _encode, folder / "cache", _expected(), shard=(0, 1))
 
 
 def read_cache(folder: Path) -> object:
     """Every token and score."""
-    source: Any = _Pictures()
+    source: Any = _SyntheticSource()
     cache = VisionCache(folder / "cache", source, _expected())
     read: list[object] = [cache.width]
     for episode in range(len(source)):
         history = cache.history(episode)
-        kept = cache.spec.kept_frames(len(history))
-        every = np.stack([np.repeat(kept, 4), np.tile(np.arange(4), len(kept))], axis=1)
+        stored = cache.spec.stored_frames(len(history))
+        every = np.stack([np.repeat(stored, 4), np.tile(np.arange(4), len(stored))], axis=1)
         read += [history.gather(every).view(torch.int16).numpy(), history.scores.frames, history.scores.values]
     return digest(*read)
 
 
-def _always(valid: object, found: object) -> bool:
+def _always(valid: object, result: object) -> bool:
     return True
 
 

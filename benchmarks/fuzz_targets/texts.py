@@ -16,9 +16,9 @@ from mme_vla.play.vlm_players import parse_choice
 from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.finetuning.rows import RowDataset
 from mme_vla.subgoal.models.api import Api, Reply, Settings
-from mme_vla.subgoal.text import MalformedAnswer, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
+from mme_vla.subgoal.text import MalformedReply, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
 from mme_vla.utils import read_text, write_sums
-from mme_vla.utils.media import film_bytes, png_bytes
+from mme_vla.utils.media import png_bytes, video_bytes
 
 
 def write_logs(folder: Path) -> None:
@@ -41,17 +41,17 @@ def read_logs(folder: Path) -> object:
     return digest(sorted(map(repr, run.items()))), tuple(map(repr, read_records(folder / RECORDS)))
 
 
-def _is_shorter(valid: Any, found: Any) -> bool:
+def _is_shorter(valid: Any, result: Any) -> bool:
     """A log cut after a whole line is that of a run that was stopped there: it goes on with the missing episodes."""
-    return found[0] == valid[0] and found[1] == valid[1][: len(found[1])]
+    return result[0] == valid[0] and result[1] == valid[1][: len(result[1])]
 
 
 QUESTION = ("You plan.", [("user", ["What next?"])])
 
 
-def _api(folder: Path, answer: str) -> Api:
+def _api(folder: Path, reply: str) -> Api:
     api = Api(Settings(cache=str(folder / "answers"), requests_per_minute=None), Usage(), client=object())
-    api._once = lambda connection, system, turns: Reply(answer, 12, 7)  # type: ignore[method-assign]
+    api._once = lambda connection, system, messages: Reply(reply, 12, 7)  # type: ignore[method-assign]
     return api
 
 
@@ -74,22 +74,22 @@ ANSWERS = {
 }
 
 
-def write_said(folder: Path) -> None:
+def write_replies(folder: Path) -> None:
     """What models said."""
     for name, text in ANSWERS.items():
         (folder / name).write_text(text)
 
 
-def read_said(folder: Path) -> object:
+def read_replies(folder: Path) -> object:
     """What the predictors and players understand of it; they count what they cannot, and go on."""
-    said = {name: read_text(folder / name, "an answer") for name in ANSWERS}
+    replies = {name: read_text(folder / name, "an answer") for name in ANSWERS}
     try:
         return (
-            parse_subgoal(said["subgoal.txt"]), parse_memer(said["memer.json"], recent=8),
-            pixels_of_pairs(parse_gemini(said["gemini.json"])),
-            parse_choice(said["choice.json"], [Option("a", "pick", True)]),
+            parse_subgoal(replies["subgoal.txt"]), parse_memer(replies["memer.json"], recent=8),
+            pixels_of_pairs(parse_gemini(replies["gemini.json"])),
+            parse_choice(replies["choice.json"], [Option("a", "pick", True)]),
         )  # fmt: skip
-    except MalformedAnswer as error:
+    except MalformedReply as error:
         raise UserError(str(error)) from None
 
 
@@ -100,9 +100,9 @@ class _Words:
 
 def write_rows(folder: Path) -> None:
     """Two rows, one with a picture and a point, one with a video."""
-    pictures = np.random.default_rng(0).integers(0, 255, (12, 32, 32, 3), np.uint8)
-    (folder / "a.png").write_bytes(png_bytes(pictures[0]))
-    (folder / "a.mp4").write_bytes(film_bytes(pictures))
+    images = np.random.default_rng(0).integers(0, 255, (12, 32, 32, 3), np.uint8)
+    (folder / "a.png").write_bytes(png_bytes(images[0]))
+    (folder / "a.mp4").write_bytes(video_bytes(images))
     rows: list[dict[str, Any]] = [
         {
             "messages": _messages("<image> What next?", "pick up at <bbox>"),
@@ -115,8 +115,8 @@ def write_rows(folder: Path) -> None:
     write_sums(folder, ["simple.jsonl", "a.png", "a.mp4"])
 
 
-def _messages(user: str, answer: str) -> list[dict[str, str]]:
-    texts = {"system": "You plan.", "user": user, "assistant": answer}
+def _messages(user: str, reply: str) -> list[dict[str, str]]:
+    texts = {"system": "You plan.", "user": user, "assistant": reply}
     return [{"role": role, "content": text} for role, text in texts.items()]
 
 
@@ -126,7 +126,7 @@ def read_rows(folder: Path) -> object:
     read: list[object] = [len(dataset), dataset.left_out]
     for i in range(len(dataset)):
         question = dataset[i]
-        read += [question.system, question.user, question.answer, *question.images]
+        read += [question.system, question.user, question.target, *question.images]
         read += [array for clip in question.videos for array in (clip.frames, clip.indices, clip.length)]
     return digest(*read)
 
@@ -144,14 +144,14 @@ def read_metadata(folder: Path) -> object:
     return tuple(map(repr, metadata.episodes("PickXtimes", "test", folder)))
 
 
-def _always(valid: object, found: object) -> bool:
+def _always(valid: object, result: object) -> bool:
     return True
 
 
 TARGETS = [
     Target("logs", write_logs, every_file, read_logs, _is_shorter),
     Target("kept-answers", write_answers, every_file, read_answers),
-    Target("answers", write_said, every_file, read_said, _always),
+    Target("answers", write_replies, every_file, read_replies, _always),
     Target("rows", write_rows, every_file, read_rows),
     Target("metadata", write_metadata, every_file, read_metadata, _always),
 ]

@@ -18,8 +18,8 @@ class Gist(Integration):
         super().__init__(backbone)
         self.memory_width = backbone.action.width
         self.to_condition = nn.Linear(self.memory_width, self.memory_width)
-        seen = {"images", "prompt", "memory"}
-        self.visibility = {**PI05_VISIBILITY, "memory": seen, "action": seen | {"action"}}
+        visible = {"images", "prompt", "memory"}
+        self.visibility = {**PI05_VISIBILITY, "memory": visible, "action": visible | {"action"}}
 
     def condition(self, memory: MemoryTokens | None) -> Callable[[Tensor], Tensor]:
         memory = required(memory)

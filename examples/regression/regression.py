@@ -36,8 +36,8 @@ class Regression(Backbone):
     """Patches, words and memory in one sequence; a learned query for each step of the chunk reads it."""
 
     Config = BackboneConfig  # one's own dataclass will do; integrations read `vlm.width` and the like from it
-    hosts = frozenset({"blocks"})
-    adapted, heads = ("qkv", "out"), ("head",)
+    supports = frozenset({"blocks"})
+    lora_targets, heads = ("qkv", "out"), ("head",)
 
     def __init__(self, config: BackboneConfig, extra_experts: Mapping[str, Any] | None = None) -> None:
         super().__init__(config, extra_experts)
@@ -62,9 +62,9 @@ class Regression(Backbone):
 
     def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
         tokens = self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])  # b v n d
-        seen = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
+        mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.words(batch.prompt) + self.order.weight[: batch.prompt.shape[1]]
-        return [Block("images", tokens.flatten(1, 2), seen, "vlm"), Block("prompt", words, batch.prompt_mask, "vlm")]
+        return [Block("images", tokens.flatten(1, 2), mask, "vlm"), Block("prompt", words, batch.prompt_mask, "vlm")]
 
     def answer(self, batch: Batch, images: Tensor, inject: Inject) -> Tensor:
         """The chunk [b, h, a]."""
@@ -90,8 +90,8 @@ class Regression(Backbone):
     ) -> Tensor:
         return self.answer(batch, images, inject)
 
-    def recompute(self, wanted: bool) -> None:
-        self._recompute = wanted
+    def recompute(self, enabled: bool) -> None:
+        self._recompute = enabled
 
     def parts(self) -> Mapping[str, str]:
         return {"vision": r"vision\.|places", "vlm": r"words\.|order\.", "action": ""}

@@ -8,15 +8,15 @@ from torch import Tensor
 from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-from mme_vla.backbone.blocks import Sight
-from mme_vla.backbone.sparse_attention import FlexSight, PackedSight, attend_by_blocks, attend_packed
+from mme_vla.backbone.blocks import MaskLayout
+from mme_vla.backbone.sparse_attention import FlexMask, PackedMask, attend_by_blocks, attend_packed
 from mme_vla.errors import UserError, did_you_mean
 
 BACKENDS = ("auto", "sdpa", "flex", "varlen")
 """`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the sight, skips what nobody sees.
 `varlen`: flash attention over keys packed for each run of queries. `auto`: see `look`."""
 
-Seen = Tensor | FlexSight | PackedSight | None
+AttentionMask = Tensor | FlexMask | PackedMask | None
 """What `attend` reads of who may see whom: a mask [b, 1, q, k], what another backend makes of a sight, or all."""
 
 BIG_NEGATIVE = -1e30
@@ -37,15 +37,15 @@ def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
     return _padded(mask, dtype)[..., : mask.shape[-1]].unsqueeze(1)
 
 
-def sight_mask(sight: Sight, dtype: torch.dtype) -> Tensor:
+def layout_mask(layout: MaskLayout, dtype: torch.dtype) -> Tensor:
     """The same from who may see whom: [b, 1, n, k]."""
-    return sight.spread(_padded(sight.seen, dtype))[..., : sight.seen.shape[-1]].unsqueeze(1)
+    return layout.expand(_padded(layout.visible, dtype))[..., : layout.visible.shape[-1]].unsqueeze(1)
 
 
-def _padded(seen: Tensor, dtype: torch.dtype) -> Tensor:
-    *rows, keys = seen.shape
-    mask = torch.zeros(*rows, -(-keys // ALIGNMENT) * ALIGNMENT, dtype=dtype, device=seen.device)
-    mask[..., :keys].masked_fill_(~seen, BIG_NEGATIVE)
+def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
+    *rows, keys = visible.shape
+    mask = torch.zeros(*rows, -(-keys // ALIGNMENT) * ALIGNMENT, dtype=dtype, device=visible.device)
+    mask[..., :keys].masked_fill_(~visible, BIG_NEGATIVE)
     return mask
 
 
@@ -60,24 +60,24 @@ def check_backend(name: str) -> str:
     return name
 
 
-def look(sight: Sight, dtype: torch.dtype, backend: str, compiled: bool) -> Seen:
+def build_mask(layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: bool) -> AttentionMask:
     """Who may see whom as one backend reads it, made once per forward and shared by all layers.
 
     `auto` is `flex` for training on a GPU where layers are `compiled`, so that it is part of their code; else `sdpa`.
     """
     if backend == "auto":
-        backend = "flex" if compiled and sight.seen.is_cuda and torch.is_grad_enabled() else "sdpa"
+        backend = "flex" if compiled and layout.visible.is_cuda and torch.is_grad_enabled() else "sdpa"
     if backend == "flex":
-        return FlexSight.of(sight)
-    return PackedSight.of(sight) if backend == "varlen" else sight_mask(sight, dtype)
+        return FlexMask.of(layout)
+    return PackedMask.of(layout) if backend == "varlen" else layout_mask(layout, dtype)
 
 
-def part_of(seen: Seen, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
+def select_rows(mask: AttentionMask, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
     """What some of the queries see, for the last layer: they are few, so that it is a mask whatever the backend."""
-    if isinstance(seen, Tensor):
-        return torch.cat([seen[:, :, at] for at in rows], 2)
-    assert seen is not None
-    return sight_mask(seen.sight.part(rows), dtype)
+    if isinstance(mask, Tensor):
+        return torch.cat([mask[:, :, at] for at in rows], 2)
+    assert mask is not None
+    return layout_mask(mask.layout.part(rows), dtype)
 
 
 def our_kernels(x: Tensor) -> AbstractContextManager[object]:
@@ -85,7 +85,7 @@ def our_kernels(x: Tensor) -> AbstractContextManager[object]:
     return sdpa_kernel(KERNELS) if x.is_cuda else nullcontext()
 
 
-def attend(q: Tensor, k: Tensor, v: Tensor, mask: Seen) -> Tensor:
+def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
     """Scaled dot-product attention with grouped queries: query head n reads key head n // (N/K).
 
     Args:
@@ -95,9 +95,9 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: Seen) -> Tensor:
     Returns:
         [b, q, N·h].
     """
-    if isinstance(mask, FlexSight):
+    if isinstance(mask, FlexMask):
         return attend_by_blocks(q, k, v, mask)
-    if isinstance(mask, PackedSight):
+    if isinstance(mask, PackedMask):
         return attend_packed(q, k, v, mask)
     groups = q.shape[2] // k.shape[2]
     q, k, v = (x.transpose(1, 2) for x in (q, k, v))

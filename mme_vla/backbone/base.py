@@ -88,7 +88,7 @@ class Backbone(nn.Module):
     Config: ClassVar[type[Any]]
     vision_width: int
     token_width: int
-    answer_width: int = 0
+    output_width: int = 0
     depth: int
     head_dim: int
     grid: int
@@ -97,8 +97,8 @@ class Backbone(nn.Module):
     sample_steps: int = 1
     image_size: int
     vocab_size: int | None = None
-    hosts: frozenset[str] = frozenset({"blocks"})
-    agrees: bool = False
+    supports: frozenset[str] = frozenset({"blocks"})
+    supports_rtc: bool = False
     compiles_sampling: bool = False
 
     @property
@@ -161,7 +161,7 @@ class Backbone(nn.Module):
         if check_backend(backend) != "auto":
             raise UserError(f"policy.attention={backend}: {type(self).__name__} has one attention; leave it at auto.")
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Keep no activations inside layers in training, and compute them again in the backward pass; or keep them."""
         raise NotImplementedError
 
@@ -215,11 +215,11 @@ class Backbone(nn.Module):
         """
         raise NotImplementedError
 
-    adapted: Sequence[str] = ()
+    lora_targets: Sequence[str] = ()
     """Linear layers that LoRA wraps unless told otherwise, by the end of their name."""
     heads: Sequence[str] = ()
     """Modules that learn in full beside the adapters, by the end of their name."""
-    unadaptable: str | None = None
+    lora_exclude: str | None = None
     """Pattern of linear layers whose weight is read past any adapter that wraps them."""
 
 

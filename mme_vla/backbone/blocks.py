@@ -92,11 +92,13 @@ def placed(numbered: Tensor, blocks: Sequence[Block]) -> Tensor:
     if all(block.positions is None for block in blocks):
         return numbered
     parts = numbered.float().split([len(block) for block in blocks], 1)
-    own = [part if block.positions is None else block.positions for part, block in zip(parts, blocks, strict=True)]
-    return torch.cat(own, 1)
+    positions = [
+        part if block.positions is None else block.positions for part, block in zip(parts, blocks, strict=True)
+    ]
+    return torch.cat(positions, 1)
 
 
-class Sight(NamedTuple):
+class MaskLayout(NamedTuple):
     """What the visibility table and the valid keys of a batch come to.
 
     Padding asks like any other token of its block: nobody reads the answer, and no row is without a key that a valid
@@ -106,7 +108,7 @@ class Sight(NamedTuple):
     """
 
     lengths: tuple[int, ...]
-    seen: Tensor
+    visible: Tensor
 
     @classmethod
     def of(cls, queries: Sequence[Span], keys: Sequence[Span], valid: Tensor, table: Visibility) -> Self:
@@ -133,19 +135,21 @@ class Sight(NamedTuple):
         ]
         return cls(tuple(length for length, _ in runs), torch.stack(rows, 1))
 
-    def part(self, rows: Sequence[slice]) -> "Sight":
+    def part(self, rows: Sequence[slice]) -> "MaskLayout":
         """The sight of some of the queries, ranges of their numbers in order."""
         lengths, runs, start = [], [], 0
         for run, length in enumerate(self.lengths):
-            kept = sum(max(min(at.stop, start + length) - max(at.start, start), 0) for at in rows)
-            if kept:
-                lengths.append(kept)
+            count = sum(max(min(at.stop, start + length) - max(at.start, start), 0) for at in rows)
+            if count:
+                lengths.append(count)
                 runs.append(run)
             start += length
-        seen = self.seen if len(runs) == len(self.lengths) else torch.stack([self.seen[:, run] for run in runs], 1)
-        return Sight(tuple(lengths), seen)
+        visible = (
+            self.visible if len(runs) == len(self.lengths) else torch.stack([self.visible[:, run] for run in runs], 1)
+        )
+        return MaskLayout(tuple(lengths), visible)
 
-    def spread(self, rows: Tensor) -> Tensor:
+    def expand(self, rows: Tensor) -> Tensor:
         """What is said of each run [b, runs, k], for each query [b, n, k]: a view where there is one run."""
         parts = [rows[:, run, None].expand(-1, length, -1) for run, length in enumerate(self.lengths)]
         return parts[0] if len(parts) == 1 else torch.cat(parts, 1)

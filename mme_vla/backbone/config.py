@@ -132,12 +132,12 @@ def shape_of(section: Mapping[str, Any]) -> Backbone:
     Raises:
         UserError: an unknown backbone or size.
     """
-    found: tuple[Any, Any] = read_backbone(section)
+    shape: tuple[Any, Any] = read_backbone(section)
     try:
-        hash(found)
+        hash(shape)
     except TypeError:  # somebody's dataclass that can be changed
-        return _shape(*found)
-    return _remembered(*found)
+        return _shape(*shape)
+    return _remembered(*shape)
 
 
 def _shape(kind: type[Backbone], sizes: Any) -> Backbone:

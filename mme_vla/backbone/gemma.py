@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import Seen, attend, look, part_of
+from mme_vla.backbone.attention import AttentionMask, attend, build_mask, select_rows
 from mme_vla.backbone.base import Hook, bind_hook
-from mme_vla.backbone.blocks import Block, Sight, Span, Visibility, placed, token_positions
+from mme_vla.backbone.blocks import Block, MaskLayout, Span, Visibility, placed, token_positions
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.layers import AdaRMSNorm, Modulation, RMSNorm, Rotation, compute_dtype, rotate, rotation
 from mme_vla.speed.recompute import Recompute, run_layer
@@ -20,7 +20,7 @@ from mme_vla.speed.recompute import Recompute, run_layer
 KeyValue = tuple[Tensor, Tensor]
 
 
-class Room(NamedTuple):
+class StaticKV(NamedTuple):
     """Keys and values of one layer [b, past + n, K, h]: those of the past, and room for a pass of n tokens."""
 
     k: Tensor
@@ -28,8 +28,8 @@ class Room(NamedTuple):
 
     def filled(self, k: Tensor, v: Tensor) -> KeyValue:
         """All keys and values, this pass's [b, n, K, h] written where the room is."""
-        for whole, new in ((self.k, k), (self.v, v)):
-            whole[:, -new.shape[1] :].copy_(new)
+        for buffer, new in ((self.k, k), (self.v, v)):
+            buffer[:, -new.shape[1] :].copy_(new)
         return self.k, self.v
 
     def past(self, n: int) -> KeyValue:
@@ -93,16 +93,16 @@ class ExpertLayer(nn.Module):
         self.mlp = GatedMLP(expert.width, expert.mlp_dim)
 
     def project(
-        self, x: Tensor, turn: Rotation, condition: Tensor | Modulation | None
+        self, x: Tensor, rope: Rotation, condition: Tensor | Modulation | None
     ) -> tuple[Tensor | None, Tensor, Tensor, Tensor | None]:
         """Normalise [b, n, d] and return q [b, n, N, h] (None if `keys_only`), k, v [b, n, K, h] and the gate.
 
-        Queries and keys come back rotated, by `turn` at their positions.
+        Queries and keys come back rotated, by `rope` at their positions.
         """
         x, gate = self.attention_norm(x, condition)
         heads = (self.kv if self.keys_only else self.qkv)(x).unflatten(-1, (-1, self.head_dim))
         v = heads[..., -self.kv_heads :, :]
-        qk = rotate(heads[..., : -self.kv_heads, :], turn)  # in one go: queries first, keys last
+        qk = rotate(heads[..., : -self.kv_heads, :], rope)  # in one go: queries first, keys last
         k = qk[..., -self.kv_heads :, :]
         return None if self.keys_only else qk[..., : self.heads, :], k, v, gate
 
@@ -127,27 +127,31 @@ def _residual(x: Tensor, update: Tensor, gate: Tensor | None) -> Tensor:
 class JointBlock(nn.Module):
     """One layer of all experts: a real module, so that sharding, checkpointing and compilation wrap it whole."""
 
-    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str, last: bool) -> None:
+    def __init__(
+        self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str, last: bool
+    ) -> None:
         super().__init__()
-        self.answering = answering
+        self.action_expert = action_expert
         self.experts = nn.ModuleDict({
-            name: ExpertLayer(config, expert, expert.width if name == answering else None, last and name != answering)
+            name: ExpertLayer(
+                config, expert, expert.width if name == action_expert else None, last and name != action_expert
+            )
             for name, expert in experts.items()
         })  # fmt: skip
 
     def forward(
         self,
         segments: Sequence[Segment],
-        turn: Rotation,
-        mask: Seen,
+        rope: Rotation,
+        mask: AttentionMask,
         condition: Tensor | LayerModulation | None,
         hook: Callable[[Tensor], Tensor] | None = None,
-        past: KeyValue | Room | None = None,
+        past: KeyValue | StaticKV | None = None,
     ) -> tuple[list[Segment], KeyValue]:
         """Run one layer.
 
         Args:
-            segments: this pass's tokens in sequence order. turn: their rotation.
+            segments: this pass's tokens in sequence order. rope: their rotation.
             mask: additive [b, 1, n, past + n], or what another backend of attention reads.
             condition: what the answering expert's norms are conditioned on: the time embedding [b, c] or a modulation.
             hook: see `Hook`, layer already bound.
@@ -157,28 +161,30 @@ class JointBlock(nn.Module):
             The updated segments (of those that asked), and this pass's keys (rotated) and values.
         """
         of_attention, of_mlp = condition if isinstance(condition, LayerModulation) else (condition, condition)
-        asked, queries, keys, values, row = [], [], [], [], 0
+        querying, queries, keys, values, row = [], [], [], [], 0
         for segment in segments:
             layer: ExpertLayer = self.experts[segment.expert]  # type: ignore[assignment]
-            adaptive = segment.expert == self.answering
+            adaptive = segment.expert == self.action_expert
             rows = slice(row, row + segment.tokens.shape[1])
-            q, k, v, gate = layer.project(segment.tokens, turn.rows(rows), of_attention if adaptive else None)
+            q, k, v, gate = layer.project(segment.tokens, rope.rows(rows), of_attention if adaptive else None)
             keys.append(k)
             values.append(v)
             if q is not None:
-                asked.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
+                querying.append((segment, layer, gate, of_mlp if adaptive else None, hook if adaptive else None, rows))
                 queries.append(q)
             row = rows.stop
         k, v = _join(keys), _join(values)
-        if not asked:
+        if not querying:
             return [], (k, v)
         all_k, all_v = _after(past, k, v)
-        seen = mask if len(asked) == len(segments) else part_of(mask, [rows for *_, rows in asked], k.dtype)
-        attended = attend(_join(queries), all_k, all_v, seen)
-        pieces = attended.split([rows.stop - rows.start for *_, rows in asked], dim=1)
+        query_mask = (
+            mask if len(querying) == len(segments) else select_rows(mask, [rows for *_, rows in querying], k.dtype)
+        )
+        attended = attend(_join(queries), all_k, all_v, query_mask)
+        pieces = attended.split([rows.stop - rows.start for *_, rows in querying], dim=1)
         updated = [
             Segment(segment.expert, layer.finish(segment.tokens, piece, gate, of, change))
-            for (segment, layer, gate, of, change, _), piece in zip(asked, pieces, strict=True)
+            for (segment, layer, gate, of, change, _), piece in zip(querying, pieces, strict=True)
         ]
         return updated, (k, v)
 
@@ -187,20 +193,20 @@ class JointBlock(nn.Module):
 class KVCache:
     """Keys and values of every layer, and what is needed to see them: their blocks and which tokens are valid."""
 
-    layers: Sequence[KeyValue | Room]
+    layers: Sequence[KeyValue | StaticKV]
     spans: list[Span]
     mask: Tensor  # [b, past] bool
 
-    def with_room(self, tokens: int) -> "KVCache":
+    def preallocate(self, tokens: int) -> "KVCache":
         """The same with room behind it, in which every one of many passes of so many tokens writes its own.
 
         It is theirs alone: no pass can be kept (`JointTransformer.forward`), and each overwrites the last.
         """
-        rooms = [
-            Room(*(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1])))
+        static = [
+            StaticKV(*(torch.nn.functional.pad(x, (0, 0, 0, 0, 0, tokens)) for x in (layer[0], layer[1])))
             for layer in self.layers
         ]
-        return KVCache(rooms, self.spans, self.mask)
+        return KVCache(static, self.spans, self.mask)
 
 
 class Layout(NamedTuple):
@@ -208,9 +214,9 @@ class Layout(NamedTuple):
 
     spans: list[Span]  # of this pass and the cached ones before it
     valid: Tensor  # [b, past + n] bool
-    mask: Seen  # additive [b, 1, n, past + n], or what another backend of attention reads
-    turn: Rotation
-    sight: Sight
+    mask: AttentionMask  # additive [b, 1, n, past + n], or what another backend of attention reads
+    rope: Rotation
+    mask_layout: MaskLayout
     dtype: torch.dtype  # of the tokens in all layers
 
 
@@ -233,15 +239,15 @@ class Conditioning:
 class JointTransformer(nn.Module):
     """All layers and the final norm of the one expert that answers; nothing that no action reads."""
 
-    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], answering: str = "action") -> None:
+    def __init__(self, config: BackboneConfig, experts: dict[str, ExpertConfig], action_expert: str = "action") -> None:
         super().__init__()
-        self.head_dim, self.answering, self.experts = config.head_dim, answering, experts
+        self.head_dim, self.action_expert, self.experts = config.head_dim, action_expert, experts
         self.gradient_checkpointing: Recompute = False
         self.attention = "auto"
         self.layers = nn.ModuleList(
-            JointBlock(config, experts, answering, last=i == config.depth - 1) for i in range(config.depth)
+            JointBlock(config, experts, action_expert, last=i == config.depth - 1) for i in range(config.depth)
         )
-        width = experts[answering].width
+        width = experts[action_expert].width
         self.final_norm = AdaRMSNorm(width, width)
 
     def conditioning(self, condition: Tensor) -> Conditioning:
@@ -252,7 +258,7 @@ class JointTransformer(nn.Module):
 
     def modulating(self) -> list[AdaRMSNorm]:
         """The norms that a condition modulates: two of every layer, and the final one."""
-        experts: list[Any] = [block.experts[self.answering] for block in self.layers]  # type: ignore[index]
+        experts: list[Any] = [block.experts[self.action_expert] for block in self.layers]  # type: ignore[index]
         return [norm for expert in experts for norm in (expert.attention_norm, expert.mlp_norm)] + [self.final_norm]
 
     @property
@@ -265,9 +271,9 @@ class JointTransformer(nn.Module):
         asking = torch.cat([block.mask for block in blocks], 1)
         positions = placed(token_positions(asking, past.mask if past else None), blocks)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
-        sight, dtype = Sight.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
-        mask = look(sight, dtype, self.attention, self._compiled)
-        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim), sight, dtype)
+        mask_layout, dtype = MaskLayout.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
+        mask = build_mask(mask_layout, dtype, self.attention, self._compiled)
+        return Layout(all_spans, valid, mask, rotation(positions, self.head_dim), mask_layout, dtype)
 
     def forward(
         self,
@@ -293,24 +299,24 @@ class JointTransformer(nn.Module):
         cached: list[KeyValue] = []
         for i, block in enumerate(self.layers):
             of_layer = condition.layers[i] if isinstance(condition, Conditioning) else condition
-            args = (segments, layout.turn, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
+            args = (segments, layout.rope, layout.mask, of_layer, bind_hook(hook, i), past.layers[i] if past else None)
             segments, kv = run_layer(block, *args, how=self.gradient_checkpointing)
             if keep:
                 # Copies where they are views: a view would keep all queries of its layer alive.
                 k, v = _after(past.layers[i] if past else None, *kv)
                 cached.append((k.contiguous(), v.contiguous()))
-        answer = None
+        output = None
         if segments:
             final = condition.final if isinstance(condition, Conditioning) else condition
-            answer, _ = self.final_norm(segments[-1].tokens, final)
-        return answer, KVCache(cached, layout.spans, layout.valid) if keep else None
+            output, _ = self.final_norm(segments[-1].tokens, final)
+        return output, KVCache(cached, layout.spans, layout.valid) if keep else None
 
 
-def _after(past: KeyValue | Room | None, k: Tensor, v: Tensor) -> KeyValue:
+def _after(past: KeyValue | StaticKV | None, k: Tensor, v: Tensor) -> KeyValue:
     """Keys and values of a pass behind those of the past."""
     if past is None:
         return k, v
-    if isinstance(past, Room):
+    if isinstance(past, StaticKV):
         return past.filled(k, v)
     return torch.cat([past[0], k], 1), torch.cat([past[1], v], 1)
 

@@ -40,11 +40,11 @@ def rotation(positions: Tensor, head_dim: int) -> Rotation:
     return Rotation(angles.cos(), angles.sin())
 
 
-def rotate(x: Tensor, turn: Rotation) -> Tensor:
+def rotate(x: Tensor, rope: Rotation) -> Tensor:
     """Rotate queries or keys [b, n, heads, h]; the result keeps the dtype of x."""
     a, b = x.float().chunk(2, dim=-1)
     quarter_turned = torch.cat([-b, a], dim=-1)
-    return torch.addcmul(x.float() * turn.cos, quarter_turned, turn.sin).to(x.dtype)
+    return torch.addcmul(x.float() * rope.cos, quarter_turned, rope.sin).to(x.dtype)
 
 
 EPS = 1e-6

@@ -114,8 +114,8 @@ class Reader(nn.Module):
             hook: what changes the MLP's input. at: the layer's number.
         """
         normed, gate = self.norm(x, condition)
-        q, own_k, own_v = self.qkv(normed).unflatten(-1, (-1, self.head_dim)).chunk(3, dim=-2)
-        x = x + (1 + gate) * self.out(attend(q, own_k, own_v, None))
+        q, new_k, new_v = self.qkv(normed).unflatten(-1, (-1, self.head_dim)).chunk(3, dim=-2)
+        x = x + (1 + gate) * self.out(attend(q, new_k, new_v, None))
         normed, gate = self.read_norm(x, condition)
         q = self.read_q(normed).unflatten(-1, (-1, self.head_dim))
         # The draws of a sample read the same context: they stand side by side as its queries.
@@ -155,11 +155,11 @@ class NanoBackbone(Backbone):
 
     vision: ConvTower
     Config = NanoConfig
-    hosts = frozenset({"blocks", "expert", "hook"})
-    agrees = True
-    adapted = ("qkv", "read_q", "out", "read_out", "up", "down")
+    supports = frozenset({"blocks", "expert", "hook"})
+    supports_rtc = True
+    lora_targets = ("qkv", "read_q", "out", "read_out", "up", "down")
     heads = ("action_in", "action_out", "state_in", "prompt_in")
-    unadaptable = r"\.\w*norm\.dense$"
+    lora_exclude = r"\.\w*norm\.dense$"
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vision\.",
         "vlm": r"embedding\.|places\.|views\.|positions\.|see\.|see_in\.|prompt_in\.|columns\.vlm\.",
@@ -170,9 +170,9 @@ class NanoBackbone(Backbone):
     def __init__(self, config: NanoConfig, extra_experts: Mapping[str, ExpertConfig] | None = None) -> None:
         super().__init__(config, extra_experts)
         self.config = config
-        tower, width, answer = config.vision, config.vlm.width, config.action.width
+        tower, width, action_width = config.vision, config.vlm.width, config.action.width
         self.token_width = width
-        self.answer_width = answer
+        self.output_width = action_width
         self.depth, self.head_dim = config.depth, config.head_dim
         self.image_size, self.grid = tower.image_size, tower.image_size // 16
         self.horizon, self.action_dim = config.horizon, config.action_dim
@@ -190,16 +190,18 @@ class NanoBackbone(Backbone):
         self.see = nn.Sequential(nn.Linear(width, config.vlm.mlp_dim), nn.GELU(), nn.Linear(config.vlm.mlp_dim, width))
         self.embedding = nn.Embedding(config.vocab_size, width)
         self.positions = nn.Embedding(MAX_WORDS, width)
-        self.prompt_in = nn.Sequential(nn.Linear(width, answer), nn.GELU(), nn.Linear(answer, answer))
-        self.state_in = nn.Linear(2 * len(STATE_FREQUENCIES) * config.state_dim, answer)
-        self.time_in = nn.Sequential(nn.Linear(answer, answer), nn.SiLU(), nn.Linear(answer, answer))
-        self.action_in = nn.Linear(config.action_dim, answer)
-        self.steps = nn.Embedding(config.horizon, answer)
+        self.prompt_in = nn.Sequential(nn.Linear(width, action_width), nn.GELU(), nn.Linear(action_width, action_width))
+        self.state_in = nn.Linear(2 * len(STATE_FREQUENCIES) * config.state_dim, action_width)
+        self.time_in = nn.Sequential(
+            nn.Linear(action_width, action_width), nn.SiLU(), nn.Linear(action_width, action_width)
+        )
+        self.action_in = nn.Linear(config.action_dim, action_width)
+        self.steps = nn.Embedding(config.horizon, action_width)
         contexts = {**(extra_experts or {}), "vlm": config.vlm}
         self.columns = nn.ModuleDict({name: Column(expert.width, config) for name, expert in contexts.items()})
         self.layers = nn.ModuleList(Reader(config) for _ in range(config.depth))
-        self.final = RMSNorm(answer)
-        self.action_out = nn.Linear(answer, config.action_dim)
+        self.final = RMSNorm(action_width)
+        self.action_out = nn.Linear(action_width, config.action_dim)
         for name, module in self.named_children():
             if name != "vision":
                 initialise(module)
@@ -237,9 +239,9 @@ class NanoBackbone(Backbone):
         order = torch.where(order == first[:, None], FIRST, order)
         order[:, FIRST] = first
         groups = torch.cat([order + group * order.shape[1] for group in range(4)], 1)
-        rest = torch.arange(groups.shape[1], tokens.shape[-1], device=prompt.device).expand(len(prompt), -1)
-        whole = torch.cat([groups, rest], 1)
-        return tokens.gather(-1, whole.view(len(prompt), *[1] * (tokens.ndim - 2), -1).expand_as(tokens))
+        remaining = torch.arange(groups.shape[1], tokens.shape[-1], device=prompt.device).expand(len(prompt), -1)
+        permutation = torch.cat([groups, remaining], 1)
+        return tokens.gather(-1, permutation.view(len(prompt), *[1] * (tokens.ndim - 2), -1).expand_as(tokens))
 
     def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
         """`images`, the tokens of all views (`batch.view_tokens` where they were made beforehand), and `prompt`."""
@@ -250,11 +252,11 @@ class NanoBackbone(Backbone):
             tokens = batch.view_tokens.to(self.places.weight.dtype)
         tokens = self.mark(tokens, batch.prompt, batch.prompt_mask)
         placed = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
-        seen = placed + self.see(placed)
+        encoded = placed + self.see(placed)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.embedding(batch.prompt) + self.positions.weight[: batch.prompt.shape[1]]
         return [
-            Block("images", seen.flatten(1, 2), image_mask, "vlm"),
+            Block("images", encoded.flatten(1, 2), image_mask, "vlm"),
             Block("prompt", words, batch.prompt_mask, "vlm"),
         ]
 
@@ -275,7 +277,7 @@ class NanoBackbone(Backbone):
         clean = self._clean(batch, *self._prepare(batch, images, inject), noisy, time, versions)
         return flow.step_loss(clean, actions).unflatten(0, (-1, versions)).mean(1)
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """There is nothing worth recomputing: a layer's activations are a chunk's few tokens."""
 
     def sample_draws(self, generator: torch.Generator) -> Draws:
@@ -301,19 +303,19 @@ class NanoBackbone(Backbone):
         """What does not depend on the noise: each layer's keys and values, their mask, what the goal says."""
         observation = self.observation_blocks(batch, images)
         injection = inject(observation)
-        seen = [block for block in injection.blocks if block.name in injection.visibility["action"]]
-        cached = torch.cat([self.columns[block.expert](block.tokens) for block in seen], 3)
-        mask = additive_mask(torch.cat([block.mask for block in seen], 1)[:, None], cached.dtype)
+        visible = [block for block in injection.blocks if block.name in injection.visibility["action"]]
+        cached = torch.cat([self.columns[block.expert](block.tokens) for block in visible], 3)
+        mask = additive_mask(torch.cat([block.mask for block in visible], 1)[:, None], cached.dtype)
         words = self.prompt_in(observation[1].tokens) * batch.prompt_mask[..., None]
-        said = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
-        return cached, mask, said, injection
+        prompt_mean = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
+        return cached, mask, prompt_mean, injection
 
     def _clean(
         self,
         batch: Batch,
         cached: Tensor,
         mask: Tensor,
-        said: Tensor,
+        prompt_mean: Tensor,
         injection: Injection,
         noisy: Tensor,
         time: Tensor,
@@ -321,13 +323,13 @@ class NanoBackbone(Backbone):
     ) -> Tensor:
         """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]."""
         condition = self.time_in(flow.time_embedding(time, self.config.action.width))
-        known = said if batch.state is None else said + self.state_in(_waves(batch.state.float()))
+        known = prompt_mean if batch.state is None else prompt_mean + self.state_in(_waves(batch.state.float()))
         condition = condition + known.repeat_interleave(versions, 0)
         x = self.action_in(noisy) + self.steps.weight + condition[:, None]
         for at, layer in enumerate(self.layers):
             x = layer(x, condition, *cached[at], mask, versions, injection.hook, at)
-        answer: Tensor = self.action_out(self.final(x)[0]).float()
-        return answer
+        output: Tensor = self.action_out(self.final(x)[0]).float()
+        return output
 
     def parts(self) -> Mapping[str, str]:
         """Tower; words and pictures; columns that an integration asked for; all else acts."""

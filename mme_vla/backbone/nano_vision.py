@@ -113,8 +113,8 @@ def load_shipped(tower: ConvTower) -> None:
     from safetensors.torch import load
 
     state = {name: value.float() for name, value in load(files("mme_vla").joinpath(WEIGHTS).read_bytes()).items()}
-    own = tower.state_dict()
-    if {name: value.shape for name, value in state.items()} != {name: value.shape for name, value in own.items()}:
+    expected = tower.state_dict()
+    if {name: value.shape for name, value in state.items()} != {name: value.shape for name, value in expected.items()}:
         raise UserError(
             "The vision weights that ship with the library are for the sizes in configs/backbone/nano.yaml. With "
             "others set backbone.vision.pretrained=false, or train a tower of that size: python -m "

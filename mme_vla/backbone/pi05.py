@@ -33,18 +33,18 @@ class Pi05Backbone(Backbone):
 
     Config = BackboneConfig
     sample_steps = EULER_STEPS
-    hosts = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
-    agrees = True
+    supports = frozenset({"blocks", "expert", "hook", "condition", "beside", "positions", "past"})
+    supports_rtc = True
     compiles_sampling = True
     heads = ("action_in", "action_out", "time_in", "time_out")
     # `kv` is what the VLM's last layer has in place of `qkv`.
-    adapted = tuple(
+    lora_targets = tuple(
         f"experts.{expert}.{layer}"
         for expert in ("vlm", "action")
         for layer in ("qkv", *(("kv",) if expert == "vlm" else ()), "out", "mlp.gate_up", "mlp.down")
     )
     # These are computed in float32 from their weight alone, past any adapter that wraps them.
-    unadaptable = rf"\.({'|'.join(heads)}|\w*norm\.dense)$"
+    lora_exclude = rf"\.({'|'.join(heads)}|\w*norm\.dense)$"
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vision\.",
         "vlm": r"embedding\.|.*\.experts\.vlm\.",
@@ -56,7 +56,7 @@ class Pi05Backbone(Backbone):
         super().__init__(config, extra_experts)
         self.config = config
         self.vision_width = self.token_width = config.vlm.width
-        self.answer_width = width = config.action.width
+        self.output_width = width = config.action.width
         self.depth, self.head_dim = config.depth, config.head_dim
         self.vocab_size = config.vocab_size
         self.image_size, self.grid = config.vision.image_size, config.vision.image_size // config.vision.patch_size
@@ -68,8 +68,8 @@ class Pi05Backbone(Backbone):
         experts = {**(extra_experts or {}), "vlm": config.vlm, "action": config.action}
         self.transformer = JointTransformer(config, experts)
         self.keep_times = False
-        self._kept: dict[int, Conditioning] = {}
-        self._kept_stamp: tuple[object, ...] = ()
+        self._cached: dict[int, Conditioning] = {}
+        self._cached_stamp: tuple[object, ...] = ()
         self.action_in = nn.Linear(config.action_dim, width)
         self.action_out = nn.Linear(width, config.action_dim)
         self.time_in = nn.Linear(width, width)
@@ -108,8 +108,10 @@ class Pi05Backbone(Backbone):
         if past is None:
             return self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         clips = torch.cat([past.images, images[:, None]], 1).transpose(1, 2)  # b v t 3 s s
-        seen = functional.pad(past.mask, (0, 1), value=True)[:, None].expand(clips.shape[:3])
-        return self._through_tower(clips.flatten(0, 1), seen.flatten(0, 1), past.every).unflatten(0, clips.shape[:2])
+        frame_mask = functional.pad(past.mask, (0, 1), value=True)[:, None].expand(clips.shape[:3])
+        return self._through_tower(clips.flatten(0, 1), frame_mask.flatten(0, 1), past.every).unflatten(
+            0, clips.shape[:2]
+        )
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         """Tokens [n, grid², d] as memories store them."""
@@ -143,9 +145,9 @@ class Pi05Backbone(Backbone):
             x = nn.functional.silu(float32_linear(layer, x))
         return x
 
-    def read_velocity(self, answer: Tensor) -> Tensor:
+    def read_velocity(self, hidden: Tensor) -> Tensor:
         """Read the velocity [b, h, a] off the answer [b, n, d], whose last h tokens are the actions; in float32."""
-        return float32_linear(self.action_out, answer[:, -self.horizon :])
+        return float32_linear(self.action_out, hidden[:, -self.horizon :])
 
     # Training
 
@@ -167,16 +169,16 @@ class Pi05Backbone(Backbone):
         layout = self.transformer.layout(blocks, injection.visibility)
         condition = self.time_condition(time)
         condition = condition if injection.condition is None else injection.condition(condition)
-        answer, _ = self.transformer(blocks, layout, condition, injection.hook)
-        return self.read_velocity(answer)
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
+        return self.read_velocity(hidden)
 
     def choose_attention(self, backend: str) -> None:
         """See `Backbone`; all of them are for this one."""
         self.transformer.attention = check_backend(backend)
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Recompute layers in the backward pass (activation checkpointing)."""
-        self.transformer.gradient_checkpointing = wanted
+        self.transformer.gradient_checkpointing = mode
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """Tower, token embedding, and every layer of all experts."""
@@ -201,7 +203,7 @@ class Pi05Backbone(Backbone):
         prefix, injection = self.prefill(batch, images, inject)
         blocks = [*injection.beside, self.action_block(noise)]
         layout = self.transformer.layout(blocks, injection.visibility, prefix)
-        past = prefix.with_room(sum(map(len, blocks)))
+        past = prefix.preallocate(sum(map(len, blocks)))
         if injection.condition is None:
             conditions, rows = self.conditions(steps), 1
         else:  # what memory says differs from sample to sample: every time for each
@@ -222,11 +224,11 @@ class Pi05Backbone(Backbone):
         if not self.keep_times:
             return self._conditions(steps)
         stamp = self.sampling_stamp()
-        if stamp != self._kept_stamp:
-            self._kept, self._kept_stamp = {}, stamp
-        if steps not in self._kept:
-            self._kept[steps] = self._conditions(steps)
-        return self._kept[steps]
+        if stamp != self._cached_stamp:
+            self._cached, self._cached_stamp = {}, stamp
+        if steps not in self._cached:
+            self._cached[steps] = self._conditions(steps)
+        return self._cached[steps]
 
     def sampling_stamp(self) -> tuple[object, ...]:
         """What kept time modulations were computed from: the weights by place and version, and their precision."""
@@ -253,8 +255,8 @@ class Pi05Backbone(Backbone):
     ) -> Tensor:
         """The velocity at one flow time, from the cached prefix: what one Euler step costs."""
         blocks = [*injection.beside, self.action_block(x_t)]
-        answer, _ = self.transformer(blocks, layout, condition, injection.hook, past=prefix)
-        return self.read_velocity(answer)
+        hidden, _ = self.transformer(blocks, layout, condition, injection.hook, past=prefix)
+        return self.read_velocity(hidden)
 
     # Parts
 

@@ -17,29 +17,29 @@ from mme_vla.errors import UserError
 PERIOD = 10_000.0
 
 
-def through_time(layers: Sequence[Any], x: Tensor, seen: Tensor, every: int) -> Tensor:
+def through_time(layers: Sequence[Any], x: Tensor, visible: Tensor, every: int) -> Tensor:
     """What a transformer's layers make of the last frame of clips.
 
     Args:
-        layers: timm's `Block`s. x: [n, t, p, d]. seen: [n, t] bool, False on frames that are not there.
+        layers: timm's `Block`s. x: [n, t, p, d]. visible: [n, t] bool, False on frames that are not there.
         every: each so-many-th layer looks through time, and at least the last; the past is dropped above them.
 
     Returns:
         [n, p, d].
     """
     n, t = x.shape[:2]
-    looking = {i for i in range(len(layers)) if (i + 1) % every == 0} or {len(layers) - 1}
+    temporal = {i for i in range(len(layers)) if (i + 1) % every == 0} or {len(layers) - 1}
     when = moments(t, x.shape[-1], x.device).to(x.dtype)[:, None]
-    before = (torch.ones(t, t, dtype=torch.bool, device=x.device).tril() & seen[:, None]) | torch.eye(
+    before = (torch.ones(t, t, dtype=torch.bool, device=x.device).tril() & visible[:, None]) | torch.eye(
         t, dtype=torch.bool, device=x.device
     )  # a frame that is not there sees itself, so that no row is empty
     for i, layer in enumerate(layers):
-        if i in looking:
+        if i in temporal:
             x = x + space_time(layer.attn, layer.norm1(x + when), before)
             x = x + layer.mlp(layer.norm2(x))
         else:
             x = layer(x.flatten(0, 1)).unflatten(0, (n, -1))
-        if i == max(looking):
+        if i == max(temporal):
             x = x[:, -1:]
     return x[:, 0]
 
@@ -57,8 +57,8 @@ def space_time(attention: Any, x: Tensor, before: Tensor) -> Tensor:
     mixed = functional.scaled_dot_product_attention(of_patch[0], of_patch[1], of_patch[2], attn_mask=mask)
     mixed = mixed.unflatten(0, (n, p)).permute(0, 3, 2, 1, 4)  # n t h p c
     q, k = (part.transpose(1, 2).flatten(0, 1) for part in (q, k))
-    answer = functional.scaled_dot_product_attention(q, k, mixed.flatten(0, 1))
-    return attention.proj(answer.transpose(1, 2).flatten(2).unflatten(0, (n, t)))
+    output = functional.scaled_dot_product_attention(q, k, mixed.flatten(0, 1))
+    return attention.proj(output.transpose(1, 2).flatten(2).unflatten(0, (n, t)))
 
 
 def moments(count: int, width: int, device: torch.device) -> Tensor:
@@ -97,11 +97,11 @@ class VisionTower(nn.Module):
         """Nothing in it differs in training: it stays as it is, and compiled code serves both modes."""
         return super().train(False)
 
-    def forward(self, images: Tensor, seen: Tensor | None = None, every: int = 0) -> Tensor:
+    def forward(self, images: Tensor, frame_mask: Tensor | None = None, every: int = 0) -> Tensor:
         """Tokens of pictures [n, 3, s, s]; or of clips [n, t, 3, s, s], of the last of whose frames they are.
 
         Args:
-            seen: [n, t] bool, False on frames of clips that are not there. every: see `PastViews`.
+            frame_mask: [n, t] bool, False on frames of clips that are not there. every: see `PastViews`.
         """
         vit: Any = self.vit
         clips, images = images.shape[:-3], images.flatten(0, -4)
@@ -114,11 +114,11 @@ class VisionTower(nn.Module):
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)
         with our_kernels(x):
-            if seen is None:
+            if frame_mask is None:
                 for block in vit.blocks:
                     x = block(x)
             else:
-                x = through_time(vit.blocks, x.unflatten(0, clips), seen, every)
+                x = through_time(vit.blocks, x.unflatten(0, clips), frame_mask, every)
         return vit.head(vit.norm(x)).to(dtype)
 
 

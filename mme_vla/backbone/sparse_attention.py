@@ -9,7 +9,7 @@ from torch.nn import functional
 from torch.nn.attention.flex_attention import BlockMask, create_block_mask, flex_attention
 from torch.nn.attention.varlen import varlen_attn
 
-from mme_vla.backbone.blocks import Sight
+from mme_vla.backbone.blocks import MaskLayout
 
 WIDE_HEAD = 256
 _TILES = ("bwd_BLOCK_M1", "bwd_BLOCK_N1", "bwd_BLOCK_M2", "bwd_BLOCK_N2")
@@ -17,32 +17,32 @@ WIDE_HEAD_OPTIONS = dict.fromkeys(_TILES, 32) | {"bwd_num_warps": 8, "bwd_num_st
 """Tiles of the backward pass at head width 256: the default ones spill registers, these fit cards of 24 GB too."""
 
 
-class FlexSight(NamedTuple):
+class FlexMask(NamedTuple):
     """A sight as `flex_attention` reads it: which tiles have anything to see, and what is seen in them."""
 
-    sight: Sight
+    layout: MaskLayout
     blocks: BlockMask
 
     @classmethod
-    def of(cls, sight: Sight) -> Self:
-        seen, device = sight.seen, sight.seen.device
-        run = torch.cat([torch.full((n,), i, device=device) for i, n in enumerate(sight.lengths)])
+    def of(cls, layout: MaskLayout) -> Self:
+        mask, device = layout.visible, layout.visible.device
+        run = torch.cat([torch.full((n,), i, device=device) for i, n in enumerate(layout.lengths)])
 
         def visible(batch: Tensor, head: Tensor, query: Tensor, key: Tensor) -> Tensor:
-            return seen[batch, run[query], key]
+            return mask[batch, run[query], key]
 
-        queries, keys = sum(sight.lengths), seen.shape[-1]
-        return cls(sight, create_block_mask(visible, len(seen), None, queries, keys, device=device))
+        queries, keys = sum(layout.lengths), mask.shape[-1]
+        return cls(layout, create_block_mask(visible, len(mask), None, queries, keys, device=device))
 
 
-def attend_by_blocks(q: Tensor, k: Tensor, v: Tensor, sight: FlexSight) -> Tensor:
+def attend_by_blocks(q: Tensor, k: Tensor, v: Tensor, mask: FlexMask) -> Tensor:
     """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query that sees no key answers zeros."""
     q, k, v = (x.transpose(1, 2) for x in (q, k, v))
     # Inside a compiled layer it is part of that layer's code; the CPU runs it as it is written.
     flex: Any = flex_attention if torch.compiler.is_compiling() or not q.is_cuda else _compiled_flex()
     options = WIDE_HEAD_OPTIONS if q.is_cuda and q.shape[-1] >= WIDE_HEAD else None
-    answer: Tensor = flex(q, k, v, block_mask=sight.blocks, enable_gqa=True, kernel_options=options)
-    return answer.transpose(1, 2).flatten(2)
+    output: Tensor = flex(q, k, v, block_mask=mask.blocks, enable_gqa=True, kernel_options=options)
+    return output.transpose(1, 2).flatten(2)
 
 
 @cache
@@ -58,33 +58,33 @@ class PackedRun(NamedTuple):
     starts: Tensor  # [b + 1] int32
 
 
-class PackedSight(NamedTuple):
+class PackedMask(NamedTuple):
     """A sight as flash attention over sequences of any length reads it."""
 
-    sight: Sight
+    layout: MaskLayout
     runs: tuple[PackedRun, ...]
 
     @classmethod
-    def of(cls, sight: Sight) -> Self:
+    def of(cls, layout: MaskLayout) -> Self:
         runs = []
-        for length, seen in zip(sight.lengths, sight.seen.unbind(1), strict=True):
+        for length, mask in zip(layout.lengths, layout.visible.unbind(1), strict=True):
             # As many places as there are keys, whatever is valid: the GPU need not say how many that is.
-            order = (~seen).flatten().to(torch.uint8).argsort(stable=True)
-            starts = functional.pad(seen.sum(1).cumsum(0), (1, 0)).to(torch.int32)
+            order = (~mask).flatten().to(torch.uint8).argsort(stable=True)
+            starts = functional.pad(mask.sum(1).cumsum(0), (1, 0)).to(torch.int32)
             runs.append(PackedRun(length, order, starts))
-        return cls(sight, tuple(runs))
+        return cls(layout, tuple(runs))
 
 
-def attend_packed(q: Tensor, k: Tensor, v: Tensor, sight: PackedSight) -> Tensor:
+def attend_packed(q: Tensor, k: Tensor, v: Tensor, mask: PackedMask) -> Tensor:
     """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query that sees no key answers zeros."""
     batch, most = k.shape[:2]
     answers = []
-    for part, run in zip(q.split([run.queries for run in sight.runs], 1), sight.runs, strict=True):
-        asked, keys, values = part.flatten(0, 1), k.flatten(0, 1)[run.order], v.flatten(0, 1)[run.order]
+    for part, run in zip(q.split([run.queries for run in mask.runs], 1), mask.runs, strict=True):
+        queries, keys, values = part.flatten(0, 1), k.flatten(0, 1)[run.order], v.flatten(0, 1)[run.order]
         of_sample = torch.arange(batch + 1, device=q.device, dtype=torch.int32) * run.queries
         attend = varlen_attn if q.is_cuda else _one_by_one
-        answer: Any = attend(asked, keys, values, of_sample, run.starts, run.queries, most)
-        answers.append(answer.unflatten(0, (batch, run.queries)))
+        output: Any = attend(queries, keys, values, of_sample, run.starts, run.queries, most)
+        answers.append(output.unflatten(0, (batch, run.queries)))
     return torch.cat(answers, 1).flatten(2)
 
 
@@ -94,10 +94,10 @@ def _one_by_one(
     """What `varlen_attn` computes, on a CPU, for which it has no kernel."""
     answers = []
     for (q0, q1), (k0, k1) in zip(q_starts.unfold(0, 2, 1).tolist(), k_starts.unfold(0, 2, 1).tolist(), strict=True):
-        asked, keys, values = (x[a:b].transpose(0, 1) for x, a, b in ((q, q0, q1), (k, k0, k1), (v, k0, k1)))
+        queries, keys, values = (x[a:b].transpose(0, 1) for x, a, b in ((q, q0, q1), (k, k0, k1), (v, k0, k1)))
         if k0 == k1:
             answers.append(torch.zeros_like(q[q0:q1]))
             continue
-        answer = functional.scaled_dot_product_attention(asked, keys, values, enable_gqa=True)
-        answers.append(answer.transpose(0, 1))
+        output = functional.scaled_dot_product_attention(queries, keys, values, enable_gqa=True)
+        answers.append(output.transpose(0, 1))
     return torch.cat(answers)

@@ -106,24 +106,24 @@ def recurrence(args: argparse.Namespace) -> None:
     from mme_vla.evaluation.analyses.recurrence import recurrence_curves, recurrence_plot
 
     policy, source, name = _subject(args)
-    chosen = range(len(source)) if args.episodes is None else args.episodes
+    numbers = range(len(source)) if args.episodes is None else args.episodes
     with _rerun(args) as log:  # before the replays: a file that cannot be written is told at once
-        found = [recurrence_curves(policy, source, episode, args.stride) for episode in chosen]
+        episode_curves = [recurrence_curves(policy, source, episode, args.stride) for episode in numbers]
         if log is not None:
-            for curves in found:
+            for curves in episode_curves:
                 _log_curves(log, source, curves)
     path = args.output or Path("outputs/analyse") / f"recurrence_{name}.svg"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(recurrence_plot(found, f"{name} on {source.name}"), encoding="utf-8")
+    path.write_text(recurrence_plot(episode_curves, f"{name} on {source.name}"), encoding="utf-8")
     with path.with_suffix(".csv").open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["episode", "frame", *found[0].curves])
-        for curves in found:
+        writer.writerow(["episode", "frame", *episode_curves[0].curves])
+        for curves in episode_curves:
             for i, frame in enumerate(curves.frames):
                 writer.writerow([curves.episode, frame, *(f"{values[i]:.6g}" for values in curves.curves.values())])
     rows = [
         [str(c.episode), key, f"{values[0]:.4f}", f"{values[-1]:.4f}", f"{values.mean():.4f}"]
-        for c in found
+        for c in episode_curves
         for key, values in c.curves.items()
     ]
     _print(f"{name} on {source.name}", ["episode", "", "first frame", "last frame", "mean"], rows)
@@ -143,7 +143,7 @@ def selection(args: argparse.Namespace) -> None:
     from mme_vla.config.composition import compose
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.evaluation.analyses.selection import selection_sheets
-    from mme_vla.utils.media import of_one_size, write_film
+    from mme_vla.utils.media import of_one_size, write_video
 
     source = EpisodeSource(args.dataset)
     memory = build_memory(compose("inspect", [f"memory={args.memory}", *args.set]))
@@ -153,9 +153,9 @@ def selection(args: argparse.Namespace) -> None:
             sheets.append(sheet)
             if log is not None:
                 log.views(source, args.episode, step)
-                log.picture("remembered", sheet)
+                log.log_image("remembered", sheet)
     path = args.output or Path("outputs/analyse") / f"{source.name}_episode{args.episode}_{args.memory}.mp4"
-    write_film(of_one_size(sheets), path, fps=args.fps)
+    write_video(of_one_size(sheets), path, fps=args.fps)
     sheets[-1].save(path.with_suffix(".png"))
     print(f"wrote {path} ({len(sheets)} pictures) and {path.with_suffix('.png')}")
 
@@ -175,9 +175,9 @@ def cost(args: argparse.Namespace) -> None:
         rows = []
         for model in models:
             for budget in args.budgets or BUDGETS:
-                found = count_model(model, budget, args.backbone)
+                counts = count_model(model, budget, args.backbone)
                 printed = success.get(budget, {}).get(f"{model}_success", "")
-                rows.append([model, f"{budget:,}", _tera(found.forward), _tera(found.chunk), printed])
+                rows.append([model, f"{budget:,}", _tera(counts.forward), _tera(counts.chunk), printed])
         columns = ["model", "memory tokens", "forward pass", "sampled chunk", "paper's success (%)"]
         return _print("FLOPs over the memory budget", columns, rows)
     costs = [count_model(model, backbone=args.backbone) for model in models]

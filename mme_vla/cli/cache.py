@@ -54,8 +54,8 @@ def main(cfg: DictConfig) -> None:
             if cfg.rebuild:
                 clear_cache(folder)
             batch_size = cfg.data.cache.batch_size
-            written = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
-        print(f"{source.name}: {written} episodes encoded, {len(source)} in all, at {folder}")
+            n_encoded = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
+        print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")
 
 
 def _device(name: str) -> "torch.device":
@@ -63,5 +63,5 @@ def _device(name: str) -> "torch.device":
     import torch
 
     device = find_device(name)
-    own = int(os.environ.get("LOCAL_RANK", "0"))
-    return torch.device("cuda", own) if device.type == "cuda" and device.index is None else device
+    local_rank = int(os.environ.get("LOCAL_RANK", "0"))
+    return torch.device("cuda", local_rank) if device.type == "cuda" and device.index is None else device

@@ -18,7 +18,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.episodes is not None:
         episodes = [ref for ref in episodes if ref.index in set(cfg.episodes)]
     output = Path(cfg.output)
-    chosen = {"images": cfg.images, "fps": cfg.fps, "keyframes": cfg.keyframes, "names": cfg.names}
-    written = convert(episodes, output, read_section(ConvertOptions, cfg.video, "video", **chosen))
-    already = len(episodes) - written
-    print(f"{output}: {len(episodes)} episodes ({written} written now, {already} already there).")
+    options = {"images": cfg.images, "fps": cfg.fps, "keyframes": cfg.keyframes, "names": cfg.names}
+    n_converted = convert(episodes, output, read_section(ConvertOptions, cfg.video, "video", **options))
+    already = len(episodes) - n_converted
+    print(f"{output}: {len(episodes)} episodes ({n_converted} written now, {already} already there).")

@@ -56,25 +56,25 @@ def main(cfg: DictConfig) -> None:
 
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
-    plain = {str(key): value for key, value in config.items()}
-    settings = RolloutSettings.from_config(plain)
-    if plain["deterministic"]:
+    values = {str(key): value for key, value in config.items()}
+    settings = RolloutSettings.from_config(values)
+    if values["deterministic"]:
         settings = replace(settings, max_batch=1)
         repeat_exactly()
-    jobs = choose_episodes(named_tasks(plain), plain["episodes"], settings.split)
-    shard = choose_shard(plain["shard"])
+    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split)
+    shard = choose_shard(values["shard"])
     if settings.env == "mme_vla":
         require_simulator()
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "evaluate", logger, device)
     prepare_sampling(policy, cfg.sampling, logger)
-    sessions = plain["recordings"]
+    sessions = values["recordings"]
     recordings = [] if sessions is None else all_recordings(open_sources(sessions, policy.embodiment))
-    subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]), device)
+    subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device)
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
-        None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
+        None if subgoals is None else str(values["subgoal"]["name"]), memory_budget(policy),
         composition_digest(policy.config),
     )  # fmt: skip
     if not settings.render:
@@ -83,9 +83,9 @@ def main(cfg: DictConfig) -> None:
     count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
     logger.info("%s into %s%s", count, output, f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "")
     notes: dict[str, Any] = {"device": str(device), "workers": settings.workers, "max_batch": settings.max_batch}
-    notes["deterministic"] = plain["deterministic"]
+    notes["deterministic"] = values["deterministic"]
     notes |= {"policy": policy_facts(policy.config), "composition": facts.composition}
-    _spawn_as_usual()
+    _use_spawn()
     try:
         done = evaluate(
             with_sessions(policy, settings.split, recordings), jobs, output, facts, settings,
@@ -200,7 +200,7 @@ def report_usage(usage: "Usage") -> None:
         logger.info("subgoals: %s", ", ".join(words))
 
 
-def _spawn_as_usual() -> None:
+def _use_spawn() -> None:
     """Inside a job of joblib the default way to start processes is one that a worker of ours cannot look up."""
     if multiprocessing.get_start_method() == "loky":
         multiprocessing.set_start_method("spawn", force=True)

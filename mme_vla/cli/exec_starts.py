@@ -5,7 +5,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from mme_vla.config.composition import cli
-from mme_vla.data.exec_starts import first_frames, marked_episodes
+from mme_vla.data.exec_starts import annotated_episodes, first_frames
 from mme_vla.errors import UserError
 from mme_vla.utils import write_json
 
@@ -20,8 +20,8 @@ def main(cfg: DictConfig) -> None:
     output = Path(cfg.output)
     if output.exists():
         raise UserError(f"{output} exists: name a new file, nothing is ever written over.")
-    marked = marked_episodes([cfg.input] if isinstance(cfg.input, str) else list(cfg.input))
-    starts = [one.start for one in marked] if cfg.dataset is None else first_frames(cfg.dataset, marked)
+    episodes = annotated_episodes([cfg.input] if isinstance(cfg.input, str) else list(cfg.input))
+    starts = [one.start for one in episodes] if cfg.dataset is None else first_frames(cfg.dataset, episodes)
     write_json(output, {str(episode): start for episode, start in enumerate(starts)})
     videos = sum(start > 0 for start in starts)
     print(f"{output}: {len(starts)} episodes, {videos} of them with a conditioning video.")

@@ -11,7 +11,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.errors import UserError
-from mme_vla.utils.media import RED, Tile, contact_sheet, spread
+from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -29,12 +29,12 @@ class Snapshot:
     """The front view at one step."""
 
     step: int
-    picture: np.ndarray
+    image: np.ndarray
     subtask: str
     video: bool
 
 
-def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
+def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
     """Demonstrate a task and look at it every few steps; also returns whether it succeeded."""
     from mme_vla.envs.observations import Include, Observer
     from mme_vla.envs.recording.recorder import demonstrate
@@ -44,16 +44,16 @@ def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Sn
     observer = Observer(task, Include(), render=True)
     snapshots: list[Snapshot] = []
 
-    def look(evaluated: dict[str, Any]) -> None:
+    def capture(evaluated: dict[str, Any]) -> None:
         observer.follow()
-        shown = task.progress.shown
-        if task.steps_done % every == 1 and shown.text != NO_RECORD:
-            picture = observer.frame(evaluated)["front_rgb"]
-            snapshots.append(Snapshot(task.steps_done, picture, shown.text, shown.video))
+        subtask = task.progress.displayed
+        if task.steps_done % every == 1 and subtask.text != NO_RECORD:
+            image = observer.frame(evaluated)["front_rgb"]
+            snapshots.append(Snapshot(task.steps_done, image, subtask.text, subtask.video))
 
     task.reset()
     observer.start()
-    task.observe = look
+    task.observe = capture
     try:
         success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
     finally:
@@ -63,12 +63,12 @@ def demonstrate_with_pictures(task: "Task", every: int = EVERY) -> tuple[list[Sn
 
 def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
     """Some of the snapshots side by side, spread evenly, each with its step; video frames have a red border."""
-    chosen = [snapshots[i] for i in spread(len(snapshots), tiles)]
-    labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in chosen]
-    pictures = [
-        Tile(shot.picture, label, RED if shot.video else None) for shot, label in zip(chosen, labels, strict=True)
+    selected = [snapshots[i] for i in evenly_spaced(len(snapshots), tiles)]
+    labels = [f"{'video, ' if shot.video else ''}step {shot.step}" for shot in selected]
+    images = [
+        Tile(shot.image, label, RED if shot.video else None) for shot, label in zip(selected, labels, strict=True)
     ]
-    return contact_sheet(pictures, COLUMNS)
+    return contact_sheet(images, COLUMNS)
 
 
 def page(entries: Sequence[tuple[str, str, str]]) -> str:
@@ -80,8 +80,8 @@ def page(entries: Sequence[tuple[str, str, str]]) -> str:
         "Drawn by `mme-vla gallery`.",
         "",
     ]
-    for task, goal, picture in entries:
-        lines += [f"## {task}", "", f"*{goal}*", "", f"![{task}]({picture})", ""]
+    for task, goal, image in entries:
+        lines += [f"## {task}", "", f"*{goal}*", "", f"![{task}]({image})", ""]
     return "\n".join(lines)
 
 
@@ -104,9 +104,9 @@ def run(cfg: "DictConfig") -> None:
         for spec in specs:
             env, snapshots = _demonstrated(spec)
             several = sum(other.task == spec.task for other in specs) > 1
-            picture = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
-            strip(snapshots, cfg.tiles).save(folder / picture, quality=82)
-            entries.append((spec.task, env.goals()[0], picture))
+            image_name = f"{spec.task}-{spec.episode}.jpg" if several else f"{spec.task}.jpg"
+            strip(snapshots, cfg.tiles).save(folder / image_name, quality=82)
+            entries.append((spec.task, env.goals()[0], image_name))
             env.close()
             advance(1)
     (folder / "README.md").write_text(page(entries))
@@ -122,7 +122,7 @@ def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
             env = make_task(spec.task, render=True, seed=seed, difficulty=spec.difficulty)
         except SceneError:
             continue
-        snapshots, success = demonstrate_with_pictures(env)
+        snapshots, success = demonstrate_with_images(env)
         if success:
             return env, snapshots
         env.close()

@@ -44,8 +44,8 @@ def main(cfg: DictConfig) -> None:
     show_episode(source, episode, step, console)
     if cfg.memory is None:
         return None
-    picture = draw_memory(source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console)
-    console.print(f"picture: {picture}", highlight=False, soft_wrap=True)
+    image = draw_memory(source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console)
+    console.print(f"picture: {image}", highlight=False, soft_wrap=True)
     return None
 
 
@@ -70,14 +70,14 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     _show(table, console)
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
-        settings.add_row(name, _plain(section))
+        settings.add_row(name, _summary(section))
     settings.add_row("words", printable(policy.require_processor().words_from))
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
-        settings.add_row("recipe", _plain(state["config"].get("train", {})))
-        settings.add_row("data", _plain(state["config"].get("data", {})))
-        settings.add_row("versions", _plain(state["versions"]))
+        settings.add_row("recipe", _summary(state["config"].get("train", {})))
+        settings.add_row("data", _summary(state["config"].get("data", {})))
+        settings.add_row("versions", _summary(state["versions"]))
     _show(settings, console)
     stats = policy.require_processor().stats
     if stats is not None:
@@ -171,9 +171,9 @@ def build_memory(cfg: DictConfig) -> "Memory":
     from mme_vla.backbone.config import shape_of
     from mme_vla.policy import mme
 
-    chosen: Any = OmegaConf.to_container(cfg, resolve=True)
-    backbone = shape_of(chosen["backbone"])
-    return mme.build_memory(chosen["memory"], backbone.vision_width, backbone.grid, backbone.token_width)
+    config: Any = OmegaConf.to_container(cfg, resolve=True)
+    backbone = shape_of(config["backbone"])
+    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.token_width)
 
 
 def draw_memory(
@@ -191,14 +191,14 @@ def draw_memory(
 
     frames = source.frames(episode, np.arange(step + 1))
     history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
-    kept, patches = history.wanted(len(frames)), memory.storage.grid**2
-    history.append(frames, _no_tokens(len(kept), patches))
+    stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
+    history.append(frames, _no_tokens(len(stored), patches))
     selected = memory.select(history, step)
     remembered = np.unique(selected[:, 0])
     table = _table(f"{name} at step {step}", "", "")
     table.add_row("remembers", f"{len(selected)} of {memory.budget} tokens, in {len(remembered)} of {step + 1} frames")
     table.add_row("frames", ", ".join(map(str, remembered)))
-    table.add_row("stored", f"{len(kept)} frames of {memory.storage.grid}×{memory.storage.grid} tokens")
+    table.add_row("stored", f"{len(stored)} frames of {memory.storage.grid}×{memory.storage.grid} tokens")
     _show(table, console)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"{source.name}_episode{episode}_step{step}_{name}.png"
@@ -216,10 +216,10 @@ def _no_tokens(frames: int, patches: int) -> Any:
 
 def _parts(policy: "Policy") -> dict[str, list[Any]]:
     """Parameters by the parts that fine-tuning speaks of, in the policy's order."""
-    found: dict[str, list[Any]] = {}
+    groups: dict[str, list[Any]] = {}
     for name, parameter in policy.named_parameters():
-        found.setdefault(policy.part_of(name), []).append(parameter)
-    return found
+        groups.setdefault(policy.component_of(name), []).append(parameter)
+    return groups
 
 
 def _table(title: str, *columns: str) -> "Table":
@@ -238,9 +238,9 @@ def _show(table: "Table", console: "Console") -> None:
     console.print(table)
 
 
-def _plain(value: Any) -> str:
+def _summary(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{key}={_plain(inner) if not isinstance(inner, dict) else '{' + _plain(inner) + '}'}"
+        return ", ".join(f"{key}={_summary(inner) if not isinstance(inner, dict) else '{' + _summary(inner) + '}'}"
                          for key, inner in value.items())  # fmt: skip
     return printable(str(value))
 

@@ -105,10 +105,10 @@ def words_of(*keys: str) -> list[str]:
     """The words of the command line that set one of these keys or groups, or something below."""
     from hydra.core.hydra_config import HydraConfig
 
-    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    found = []
-    for word in given:
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    matches = []
+    for word in overrides:
         key = word.lstrip("+~").split("=")[0]
-        if any(key == wanted or key.startswith((f"{wanted}.", f"{wanted}@")) for wanted in keys):
-            found.append(word)
-    return found
+        if any(key == name or key.startswith((f"{name}.", f"{name}@")) for name in keys):
+            matches.append(word)
+    return matches

@@ -44,10 +44,10 @@ def with_settings(words: Sequence[str]) -> list[str]:
     if "nano=null" in words:  # without the task's file; Hydra takes no null for a group
         return [word for word in words if word != "nano=null"]
     tasks = [word.removeprefix("task=") for word in words if word.startswith("task=")]
-    own = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
-    if own is None or not own.is_file() or any(word.startswith("nano=") for word in words):
+    task_file = config_dir() / "nano" / f"{tasks[-1]}.yaml" if tasks else None
+    if task_file is None or not task_file.is_file() or any(word.startswith("nano=") for word in words):
         return list(words)
-    return [f"nano={own.stem}", *words]
+    return [f"nano={task_file.stem}", *words]
 
 
 @cli("nano")
@@ -76,7 +76,7 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     from mme_vla.embodiment import Embodiment
     from mme_vla.envs.recording.frames import DECISIONS, FrameChoice
     from mme_vla.nano.evaluating import NAME as PLANNER
-    from mme_vla.nano.evaluating import film, run_episodes
+    from mme_vla.nano.evaluating import record_videos, run_episodes
     from mme_vla.nano.fitting import compose_policy, train
     from mme_vla.nano.page import write_page
 
@@ -87,19 +87,19 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
     models = list(dict.fromkeys([config["with_memory"], *config["beside"], *config["also"]]))
     how = (config["memories"], words, extra_dirs, config["plugins"])
     composed = {model: compose_policy(model, *how) for model in models}
-    drawn_for = [model for model in config["drawn_for"] if model not in composed]
+    render_for = [model for model in config["drawn_for"] if model not in composed]
     minutes = _Minutes(folder / "minutes.json")
     with minutes.of("demonstrations"):
-        others = [compose_policy(model, *how) for model in drawn_for]
+        others = [compose_policy(model, *how) for model in render_for]
         memories = [each["memory"] for each in (*composed.values(), *others)]
         robot = Embodiment.from_dict(composed[models[0]]["embodiment"])
-        asked = robot.action.execute
-        choices = [FrameChoice(DECISIONS, memory, asked) for memory in [None, *filter(None, memories)]]
+        execute = robot.action.execute
+        choices = [FrameChoice(DECISIONS, memory, execute) for memory in [None, *filter(None, memories)]]
         files = record_all(config, folder / "demonstrations", choices, robot)
     if config["record_only"]:
         return folder / "demonstrations"
     records: dict[str, list[EpisodeRecord]] = {}
-    films: list[Path] = []
+    videos: list[Path] = []
     for model, each in composed.items():
         with minutes.of(f"training {model}"):
             checkpoint = train(each, config["train"], folder / model, files, config["learning"])
@@ -112,14 +112,14 @@ def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
             )  # fmt: skip
         if model == config["with_memory"] and config["films"] and config["shard"] is None:
             with minutes.of("films"):
-                films = film(checkpoint, folder / "films", records[model])
+                videos = record_videos(checkpoint, folder / "films", records[model])
     if config["shard"] is not None:
         return folder
     if config["planner"]:
         with minutes.of("evaluation planner"):
             records[PLANNER] = plan_all(config, folder / "planner" / config["split"])
     blind = [model for model, each in composed.items() if each["memory"] is None and not each["subgoal_text"]]
-    page = write_page(folder, config, records, next(iter(blind), None), minutes.spent, films)
+    page = write_page(folder, config, records, next(iter(blind), None), minutes.spent, videos)
     print(page)
     return page
 
@@ -138,8 +138,8 @@ def plan_all(config: Mapping[str, Any], folder: Path) -> "list[EpisodeRecord]":
     with RecordLog(file) as log:
         for record in carry_out(missing, replay, config["workers"]):
             log.append(record)
-    wanted = {spec.episode for spec in specs}
-    return [record for record in read_records(file) if record.episode in wanted]
+    numbers = {spec.episode for spec in specs}
+    return [record for record in read_records(file) if record.episode in numbers]
 
 
 def check_counts(counts: Any) -> None:
@@ -177,17 +177,17 @@ def record_all(
     counts: dict[str, int] = config["demonstrations"]
     files: list[Path] = []
     with progress("record", sum(counts.values()), unit="demonstrations") as advance:
-        for number, (level, wanted) in enumerate(counts.items()):
+        for number, (level, n_required) in enumerate(counts.items()):
             first = int(config["first_seed"]) + number * SEEDS_APART
             how = (cameras, tuple(choices), config["carried_out"], robot.action)
             scene = Scene(config["task"], first, level, folder, *how)
             scenes = (replace(scene, seed=seed) for seed in count(first))
-            files += demonstrate(scenes, wanted, config["workers"], advance)
+            files += demonstrate(scenes, n_required, config["workers"], advance)
     return files
 
 
 def demonstrate(
-    scenes: "Iterator[Scene]", wanted: int, workers: int = 1, advance: Callable[[int], None] = lambda _: None
+    scenes: "Iterator[Scene]", count: int, workers: int = 1, advance: Callable[[int], None] = lambda _: None
 ) -> list[Path]:
     """The files of the first demonstrations of these scenes that succeed; what is there is not made again, nor tried.
 
@@ -197,23 +197,23 @@ def demonstrate(
     from mme_vla.cli.record import carry_out
     from mme_vla.nano.demonstrations import demonstrated
 
-    found: list[Path] = []
+    files: list[Path] = []
     failed = 0
-    while len(found) < wanted:
-        some = list(islice(scenes, min(RETRIES - failed, wanted - len(found))))
+    while len(files) < count:
+        some = list(islice(scenes, min(RETRIES - failed, count - len(files))))
         missing = [scene for scene in some if not scene.tried]
         advance(sum(scene.path.is_file() for scene in some if scene.tried))
         for made in carry_out(missing, demonstrated, workers):
             advance(int(made))
         new = [scene.path for scene in some if scene.path.is_file()]
-        found += new
+        files += new
         failed = 0 if new else failed + len(some)
         if failed >= RETRIES:
             last = some[-1]
             raise UserError(
                 f"{last.task}: {failed} {last.difficulty} scenes in a row, to seed {last.seed}, cannot be demonstrated."
             )
-    return found
+    return files
 
 
 class _Minutes:

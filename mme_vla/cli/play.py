@@ -34,7 +34,7 @@ def main(cfg: DictConfig) -> None:
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     log_to_terminal(log, clock=True)
     player: dict[str, Any] = config["player"]
-    wanted = choose_episodes(named_tasks(config), config["episodes"], config["split"])
+    specs = choose_episodes(named_tasks(config), config["episodes"], config["split"])
     for name in ("max_steps", "max_choices"):
         if isinstance(config[name], bool) or not isinstance(config[name], int) or config[name] < 1:
             raise UserError(f"{name}={config[name]!r}; expected a positive integer.")
@@ -47,16 +47,16 @@ def main(cfg: DictConfig) -> None:
     built = None if human else build_player(player)
     if human:
         require_page()
-    looks = built is None or built.looks
+    needs_images = built is None or built.needs_images
     if config["env"] == "mme_vla":
-        _check_simulator(looks)
+        _check_simulator(needs_images)
     name, who = (HUMAN, str(player["participant"])) if built is None else (built.model, 0)
     identity = Identity(name, who, player.get("seed", 0), config["max_steps"], settings)
     limits = {limit: config[limit] for limit in ("max_steps", "max_choices")}
-    make = partial(make_session, env=config["env"], **limits, pictures=looks)
+    make = partial(make_session, env=config["env"], **limits, images=needs_images)
     folder = Path(str(config["output"])).expanduser()
     try:
-        with PlayRun(folder, wanted, identity, make, config["retry_errors"]) as run:
+        with PlayRun(folder, specs, identity, make, config["retry_errors"]) as run:
             if built is None:
                 _on_the_page(run, str(who), str(config["host"]), config["port"])
             else:
@@ -72,13 +72,13 @@ def _on_the_page(run: PlayRun, participant: str, host: str, port: int) -> None:
     from mme_vla.play.web import serve
 
     serve(Desk(run, participant), host, port)
-    played = len(run.wanted) - len(run.todo)
-    log.info("ended · %d of %d episodes played; the same command goes on with the others", played, len(run.wanted))
+    played = len(run.episodes) - len(run.todo)
+    log.info("ended · %d of %d episodes played; the same command goes on with the others", played, len(run.episodes))
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:
     todo = list(run.todo)
-    log.info("%d episodes to play, %d played before", len(todo), len(run.wanted) - len(todo))
+    log.info("%d episodes to play, %d played before", len(todo), len(run.episodes) - len(todo))
     for number, which in enumerate(todo, 1):
         log.info("%d/%d %s", number, len(todo), line(_play_one(run, which, player)))
 
@@ -150,10 +150,10 @@ def print_summary(run: PlayRun) -> None:
     console.print(f"records: {run.folder / 'episodes.jsonl'}", markup=False, highlight=False, soft_wrap=True)
 
 
-def _check_simulator(looks: bool) -> None:
+def _check_simulator(needs_images: bool) -> None:
     from mme_vla.envs.make import require_simulator
     from mme_vla.envs.rendering import render_backend
 
     require_simulator()
-    if looks:
+    if needs_images:
         render_backend()

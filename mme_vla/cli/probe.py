@@ -41,48 +41,48 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.evaluation.rollout.settings import RolloutSettings
     from mme_vla.policy.saving import composition_digest
     from mme_vla.probing.offline import OfflineSettings
-    from mme_vla.probing.run import NO_DATA, Wanted, run_probe
+    from mme_vla.probing.run import NO_DATA, ProbePlan, run_probe
     from mme_vla.utils import safe_name
 
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)
-    plain: dict[str, Any] = {str(key): value for key, value in config.items()}
-    if plain["compare"] is not None:
-        print(_table(plain["compare"]))
+    values: dict[str, Any] = {str(key): value for key, value in config.items()}
+    if values["compare"] is not None:
+        print(_table(values["compare"]))
         return
-    if not (plain["offline"] or plain["online"]):
+    if not (values["offline"] or values["online"]):
         raise UserError("offline=false online=false leaves nothing to probe: set one of them to true.")
-    if plain["offline"] and plain["recordings"] is None:
+    if values["offline"] and values["recordings"] is None:
         raise UserError(NO_DATA)
-    settings = RolloutSettings.from_config(plain)
-    offline = OfflineSettings.from_config(plain)
-    jobs = choose_episodes(named_tasks(plain), plain["episodes"], settings.split) if plain["online"] else []
-    shard = choose_shard(plain["shard"])
+    settings = RolloutSettings.from_config(values)
+    offline = OfflineSettings.from_config(values)
+    jobs = choose_episodes(named_tasks(values), values["episodes"], settings.split) if values["online"] else []
+    shard = choose_shard(values["shard"])
     if jobs and settings.env == "mme_vla":
         require_simulator()
     log_to_terminal(logger)
     device = choose_device(str(cfg.device))
     policy, name, source = load_policy(cfg, "probe", logger, device)
-    recordings = _recordings(plain["recordings"], policy)
-    probed = _chosen(recordings, plain["recorded"]) if plain["offline"] else []
-    subgoals = choose_subgoals(policy, plain["subgoal"], str(plain["subgoal_mode"]), device) if jobs else None
+    recordings = _recordings(values["recordings"], policy)
+    probed = _select(recordings, values["recorded"]) if values["offline"] else []
+    subgoals = choose_subgoals(policy, values["subgoal"], str(values["subgoal_mode"]), device) if jobs else None
     facts = RunFacts(
         name, checkpoint_label(source), settings.seed, settings.split, settings.max_steps,
-        None if subgoals is None else str(plain["subgoal"]["name"]), memory_budget(policy),
+        None if subgoals is None else str(values["subgoal"]["name"]), memory_budget(policy),
         composition_digest(policy.config),
     )  # fmt: skip
     folder = Path("outputs", "probe", safe_name(name, "the policy's name"), str(facts.checkpoint))
     folder = folder if cfg.output is None else Path(str(cfg.output)).expanduser()
     logger.info("%d recorded episodes, %d in closed loop, into %s", len(probed), len(jobs), folder)
-    wanted = Wanted(plain["with"], probed, recordings, jobs, offline, shard, source)
+    plan = ProbePlan(values["with"], probed, recordings, jobs, offline, shard, source)
     try:
-        found = run_probe(policy.eval(), wanted, folder, facts, settings, subgoals=subgoals)
+        report = run_probe(policy.eval(), plan, folder, facts, settings, subgoals=subgoals)
     finally:
         if subgoals is not None:
             report_usage(subgoals.usage)
             subgoals.close()
-    print((found.page.parent / "table.md").read_text(encoding="utf-8"))
-    print(found.page)
+    print((report.page.parent / "table.md").read_text(encoding="utf-8"))
+    print(report.page)
 
 
 def _recordings(data: Any, policy: "Policy") -> "list[Recording]":
@@ -92,7 +92,7 @@ def _recordings(data: Any, policy: "Policy") -> "list[Recording]":
     return [] if data is None else all_recordings(open_sources(data, policy.embodiment))
 
 
-def _chosen(recordings: "list[Recording]", which: Any) -> "list[Recording]":
+def _select(recordings: "list[Recording]", which: Any) -> "list[Recording]":
     """The recorded episodes that are probed, by the grammar of all commands."""
     from mme_vla.envs.episodes import choose_numbers
 

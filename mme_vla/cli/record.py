@@ -15,11 +15,11 @@ from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
-from mme_vla.envs.recording.outputs import Job, Wanted
+from mme_vla.envs.recording.outputs import Job, RecordingPlan
 from mme_vla.envs.vector.processes import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
-from mme_vla.utils.processes import end_with_parent, signals_held
+from mme_vla.utils.processes import end_with_parent, signals_deferred
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -53,20 +53,20 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
         scene: dict[str, Any] = {"seed": seed, "difficulty": job.difficulty, "recovery": job.recovery}
         blind: Recording | None = None
         try:
-            drawing = None if job.frames is None else job.frames.beforehand()
-            if job.frames is not None and drawing is None:
+            request = None if job.frames is None else job.frames.beforehand()
+            if job.frames is not None and request is None:
                 blind = _unseen(job.task, scene)
                 if not blind.success:
                     failures[seed] = blind.error or FAILED
                     continue
-                drawing = job.frames.drawing(blind.frames)
+                request = job.frames.render_request(blind.frames)
             task = make_task(job.task, render=True, **scene)
         except SceneError as error:
             failures[seed] = str(error)
             continue
         writer = EpisodeWriter(draft, job.episode, task, job.frames)
         try:
-            result: Recording = Recorder(task, on_step=writer.add, drawing=drawing).record()
+            result: Recording = Recorder(task, on_step=writer.add, render_request=request).record()
         finally:
             writer.close()
             task.close()
@@ -119,26 +119,28 @@ def _pool(workers: int) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(workers, simulating_processes(), begin, begun)
 
 
-def report_coverage(tasks: str | Sequence[str], wanted: Wanted, file: Path, workers: int, split: str = "test") -> None:
+def report_coverage(
+    tasks: str | Sequence[str], plan: RecordingPlan, file: Path, workers: int, split: str = "test"
+) -> None:
     """Say which goals of a split the recorded episodes lack, and write it as JSON.
 
     Args:
-        wanted: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
+        plan: a recording that is there. workers: processes that build the split's scenes, which tell their goals.
     """
     from mme_vla.data.console import progress
     from mme_vla.envs.recording.coverage import compare, goal_of, goals_recorded, in_words
 
     specs, goals = choose_episodes(tasks, None, split), []
     with progress("goals", len(specs), unit="episodes") as advance, ExitStack() as stack:
-        with signals_held():
+        with signals_deferred():
             run = map if workers == 1 else stack.enter_context(_pool(workers)).map
-            found = run(goal_of, specs)
-        for goal in found:
+            episode_goals = run(goal_of, specs)
+        for goal in episode_goals:
             goals.append(goal)
             advance(1)
-    official = [place for place in wanted.places if place != wanted.dataset]
-    coverage = compare(goals_recorded(wanted.dataset, official), zip(specs, goals, strict=True))
-    write_json(file, {task: found.to_dict() for task, found in coverage.items()}, indent=1)
+    official = [place for place in plan.places if place != plan.dataset]
+    coverage = compare(goals_recorded(plan.dataset, official), zip(specs, goals, strict=True))
+    write_json(file, {task: episode_goals.to_dict() for task, episode_goals in coverage.items()}, indent=1)
     print(f"{in_words(coverage, split)}\n{file}")
 
 
@@ -160,7 +162,7 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
         yield from map(work, jobs)
         return
     with _pool(workers) as pool:
-        with signals_held():  # the workers are started here, and inherit that
+        with signals_deferred():  # the workers are started here, and inherit that
             futures = [pool.submit(work, job) for job in jobs]
         try:
             for future in as_completed(futures):
@@ -183,22 +185,22 @@ def plan(cfg: "DictConfig") -> list[Job]:
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)
-    frames = _chosen_frames(cfg)
+    frames = _frame_choice(cfg)
     return [
         Job(s.task, s.episode, s.seed, s.difficulty, s.recovery if cfg.recovery else None, cfg.retries, frames)
         for s in specs
     ]
 
 
-def _chosen_frames(cfg: "DictConfig") -> FrameChoice | None:
-    given: Any
+def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
+    frames: Any
     memory: Any
-    given, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
-    if given == "all":
+    frames, memory = (OmegaConf.to_container(cfg[k]) if OmegaConf.is_config(cfg[k]) else cfg[k] for k in KEYS)
+    if frames == "all":
         if memory is not None:
             raise UserError("frames=all draws every frame, those of a memory too: leave out memory, or set frames.")
         return None
-    return FrameChoice(given, memory)
+    return FrameChoice(frames, memory)
 
 
 def run(cfg: "DictConfig") -> None:
@@ -214,35 +216,37 @@ def run(cfg: "DictConfig") -> None:
         raise UserError("lerobot=false leaves nothing to write: name a folder with hdf5=<folder>.")
     options = read_section(ConvertOptions, cfg.video, "video", images=cfg.images, fps=cfg.fps, names=cfg.names)
     jobs = plan(cfg)
-    wanted = Wanted(jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5))
-    places = ", ".join(map(str, wanted.places))
+    recording_plan = RecordingPlan(
+        jobs, Path(cfg.output) if cfg.lerobot else None, None if cfg.hdf5 is None else Path(cfg.hdf5)
+    )
+    places = ", ".join(map(str, recording_plan.places))
     work = Path(cfg.output).with_name(Path(cfg.output).name + ".recording")
-    if not wanted.missing(options) and not work.exists():
+    if not recording_plan.missing(options) and not work.exists():
         print(f"{places}: {len(jobs)} episodes, all there already.")
         if cfg.coverage is not None:
             require_simulator()
-            report_coverage(named_tasks(cfg), wanted, Path(cfg.coverage), cfg.workers)
+            report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
         return
     require_simulator()
     with FolderLock(work, "recording"):
         _claim(work, jobs)
-        missing = wanted.missing(options)  # asked again: another process may have finished it meanwhile
+        missing = recording_plan.missing(options)  # asked again: another process may have finished it meanwhile
         if missing:
             previews = None if cfg.previews is None else Path(cfg.previews)
             begun, there = time.perf_counter(), {path.stem for path in (work / "episodes").glob("*.json")}
             done = record(jobs, work / "episodes", cfg.workers, previews)
             seconds = time.perf_counter() - begun
-            wanted.write(missing, work / "episodes", options)
+            recording_plan.write(missing, work / "episodes", options)
             steps, again = sum(d["stored"] for d in done), sum(len(d["failed_seeds"]) for d in done)
             print(f"{places}: {len(done)} episodes, {steps} steps; {again} seeds failed and were replaced by the next.")
             if new := [d for job, d in zip(jobs, done, strict=True) if job.name not in there]:
                 print(_throughput(len(new), sum(d["stored"] for d in new), seconds, cfg.workers))
         else:
             print(f"{places}: {len(jobs)} episodes, all there already.")
-        wanted.tidy()
+        recording_plan.tidy()
         drop_plan(work)
     if cfg.coverage is not None:
-        report_coverage(named_tasks(cfg), wanted, Path(cfg.coverage), cfg.workers)
+        report_coverage(named_tasks(cfg), recording_plan, Path(cfg.coverage), cfg.workers)
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:

@@ -110,7 +110,7 @@ def show_curves(curves: Curves, args: argparse.Namespace) -> None:
         args.markdown.parent.mkdir(parents=True, exist_ok=True)
         args.markdown.write_text(to_markdown(table), encoding="utf-8")
     if args.html:
-        boxes = [section(name, drawn, "Episodes that every place of the dial has.") for name, drawn in
+        boxes = [section(name, figure, "Episodes that every place of the dial has.") for name, figure in
                  stress_figures(curves).items()]  # fmt: skip
         args.html.parent.mkdir(parents=True, exist_ok=True)
         page = document(args.title, [f"<h1>{escape(args.title)}</h1>", *boxes, section(table.title, html_table(table))])
@@ -156,10 +156,10 @@ def _tables(results: Results, comparisons: list[Comparison], detailed: bool = Tr
     return [*tables, comparison_table(comparisons)] if comparisons else tables
 
 
-def _pairs(results: Results, asked: Sequence[Sequence[str]] | None) -> list[tuple[Method, Method]]:
+def _pairs(results: Results, requested: Sequence[Sequence[str]] | None) -> list[tuple[Method, Method]]:
     """The pairs asked for; unasked, two methods alone where they share episodes, and otherwise a note."""
-    if asked is not None:
-        return [(results.method(first), results.method(second)) for first, second in asked]
+    if requested is not None:
+        return [(results.method(first), results.method(second)) for first, second in requested]
     if len(results.methods) != 2:
         return []
     first, second = results.methods

@@ -46,21 +46,21 @@ def main(cfg: DictConfig) -> None:
 
 async def run(server: "PolicyServer") -> None:
     """Start, wait for SIGTERM or Ctrl-C, stop; a second signal does not wait for what is running."""
-    loop, asked = asyncio.get_running_loop(), asyncio.Event()
+    loop, stop_requested = asyncio.get_running_loop(), asyncio.Event()
     serving = asyncio.current_task()
     assert serving is not None
 
     def stop() -> None:
-        if asked.is_set():
+        if stop_requested.is_set():
             serving.cancel()
-        asked.set()
+        stop_requested.set()
 
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop)
     await server.start()
     host = f"[{server.settings.host}]" if ":" in server.settings.host else server.settings.host
     logger.info("ready at ws://%s:%d and http://%s:%d (healthz, metadata, stats)", *(host, server.port) * 2)
-    await asked.wait()
+    await stop_requested.wait()
     logger.info("stopping: no new clients, requests that are running are finished")
     try:
         await server.stop()

@@ -37,8 +37,8 @@ def main(cfg: DictConfig) -> dict[str, int]:
 
 def _list(cfg: DictConfig, key: str, kind: type) -> list[Any]:
     """A key that is a list of whole numbers or of words."""
-    given = cfg[key]
-    if not isinstance(given, ListConfig) or any(not isinstance(v, kind) or isinstance(v, bool) for v in given):
-        wanted, example = ("whole numbers", "[0,1]") if kind is int else ("words", f"[{given}]")
-        raise UserError(f"{key}={given} must be a list of {wanted}, such as {key}={example}.")
-    return list(given)
+    value = cfg[key]
+    if not isinstance(value, ListConfig) or any(not isinstance(v, kind) or isinstance(v, bool) for v in value):
+        expected, example = ("whole numbers", "[0,1]") if kind is int else ("words", f"[{value}]")
+        raise UserError(f"{key}={value} must be a list of {expected}, such as {key}={example}.")
+    return list(value)

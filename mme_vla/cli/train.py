@@ -75,12 +75,12 @@ def train(cfg: DictConfig, config: dict[str, Any], folder: Path, begun: float, n
     # Where processes have all weights each, gradients lie in what is sent instead of being copied there.
     one_copy = DistributedDataParallelKwargs(gradient_as_bucket_view=True)
     accelerator = Accelerator(cpu=settings.device == "cpu", kwargs_handlers=[one_copy])
-    chosen: list[Any] = [None]
-    with ExitStack() as held:
+    selection: list[Any] = [None]
+    with ExitStack() as resources:
         if accelerator.is_main_process:  # the clock is in the folder's name: the first process decides
-            chosen[0], lock = claim_run(folder, named, config["resume"], config)
-            held.push(lock)
-        run = broadcast_object_list(chosen)[0]
+            selection[0], lock = claim_run(folder, named, config["resume"], config)
+            resources.push(lock)
+        run = broadcast_object_list(selection)[0]
         if run.folder != folder:
             with suppress(OSError):
                 folder.rmdir()  # Hydra made it for a new run; it stays if it holds anything
@@ -111,7 +111,7 @@ def _train(
     # Of processes that share the weights, one a machine holds them until they are shared: it may have to build a cache.
     sharded = settings.parallel.shards(accelerator.device)
     holds = accelerator.is_local_main_process or not sharded
-    line = ProgressLine(settings.steps, run.step, shown=first)
+    line = ProgressLine(settings.steps, run.step, visible=first)
     # A backbone whose weights are about to be replaced is not drawn first.
     init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
     with nullcontext() if holds else torch.device("meta"):
@@ -166,8 +166,8 @@ def cache_command() -> str:
     """The command that builds the vision cache of this run: the same words, but for those on resuming and output."""
     from hydra.core.hydra_config import HydraConfig
 
-    given = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
-    words = [word for word in given if not word.startswith(("resume=", "output="))]
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else ["model=<model>", "data=<data>"]
+    words = [word for word in overrides if not word.startswith(("resume=", "output="))]
     if "--config-dir" in sys.argv[:-1]:
         words = ["--config-dir", sys.argv[sys.argv.index("--config-dir") + 1], *words]
     return shlex.join(["python", "-m", "mme_vla.data.cache", *words])

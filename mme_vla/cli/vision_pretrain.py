@@ -41,10 +41,10 @@ def run(config: Mapping[str, Any]) -> Path:
     sizes = compose("policy", ["backbone=nano"]).backbone.vision
     width = compose("policy", ["backbone=nano"]).backbone.vlm.width
     folder, tasks = Path(config["output"]), choose_tasks(config["tasks"])
-    wanted = [(task, number) for number in range(config["scenes"]) for task in tasks]
+    scenes = [(task, number) for number in range(config["scenes"]) for task in tasks]
     files = []
-    with progress("scenes", len(wanted)) as advance:
-        for task, number in wanted:
+    with progress("scenes", len(scenes)) as advance:
+        for task, number in scenes:
             scene = task, config["first_seed"] + number, LEVELS[number % len(LEVELS)]
             try:
                 files.append(record_scenes(folder / "scenes", *scene, config["arrangements"], sizes.image_size))
@@ -52,7 +52,7 @@ def run(config: Mapping[str, Any]) -> Path:
                 logger.info("left out: %s", error)
             advance(1)
     if not files:
-        raise UserError(f"None of the {len(wanted)} scenes can be built: change first_seed={config['first_seed']}.")
+        raise UserError(f"None of the {len(scenes)} scenes can be built: change first_seed={config['first_seed']}.")
     settings = PretrainSettings(
         **{key: config[key] for key in ("steps", "batch_size", "lr", "held_out", "save_every", "seed")}
     )

@@ -31,8 +31,8 @@ from mme_vla.weights.writers import WRITERS, check_target
 def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
     """Print which tensor becomes which, and the lists of unread, tied and derived ones. Numbered layers are one row."""
     console = console or Console(width=None if sys.stdout.isatty() else 200)
-    read, written = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
-    console.print(f"{read} → {written}; every tensor fits.", soft_wrap=True)
+    read, target_format = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
+    console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
     sides = {ADAPTERS[fmt]: title for fmt, title in ((to, "written"), (source.format, "read")) if fmt != "ours"}
     if not sides:
         console.print("Both sides have the same names.")
@@ -47,12 +47,12 @@ def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: st
     for column in ("theirs", "shape", "layout", "ours", "tensors"):
         table.add_column(column, overflow="fold", justify="right" if column == "tensors" else "left")
     rows: dict[tuple[str, ...], int] = {}
-    for ours, pieces in adapter.table.items():
+    for target, pieces in adapter.table.items():
         for piece in pieces:
             # A pattern with the same two sides only says how many rows there are.
             left, _, right = (side.strip() for side in piece.pattern.partition("->"))
             layout = "" if left == right else piece.pattern
-            cells = (_starred(piece.path), _shape(shapes[piece.path]), layout, _starred(ours))
+            cells = (_starred(piece.path), _shape(shapes[piece.path]), layout, _starred(target))
             rows[cells] = rows.get(cells, 0) + 1
     for row, count in rows.items():
         table.add_row(*row, str(count))
@@ -114,13 +114,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--base", help="what a run of OpenVLA-OFT was trained on, where it holds its adapters alone")
     parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
     parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
-    given = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
+    args = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
     from mme_vla.config.composition import print_user_errors
 
     with print_user_errors():
         convert(
-            given.source, given.destination, given.overrides, to=given.to, dtype=given.dtype, asset=given.asset,
-            revision=given.revision, base=given.base, dry_run=given.dry_run, trust_plugins=given.trust_plugins,
+            args.source, args.destination, args.overrides, to=args.to, dtype=args.dtype, asset=args.asset,
+            revision=args.revision, base=args.base, dry_run=args.dry_run, trust_plugins=args.trust_plugins,
         )  # fmt: skip
 
 
@@ -148,12 +148,12 @@ def convert(
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
     if not dry_run and target.exists():
         raise UserError(f"{target} exists: give a new folder, nothing is ever written over.")
-    found = open_source(source, revision, base=base)
-    policy = _policy(found, overrides, trust_plugins)
+    opened = open_source(source, revision, base=base)
+    policy = _policy(opened, overrides, trust_plugins)
     check_target(policy, to)
-    tensors = read_as(policy, found)
+    tensors = read_as(policy, opened)
     if dry_run:
-        print_mapping(policy, found, to)
+        print_mapping(policy, opened, to)
         return
     if to == "ours" and policy.processor is None:
         from mme_vla.policy.build import build_processor
@@ -161,7 +161,7 @@ def convert(
         policy.processor = build_processor(policy.config)
     with torch.no_grad():
         assign_tensors(policy, tensors, str(source), torch.float32)
-    stats = read_stats(found.folder, asset)
+    stats = read_stats(opened.folder, asset)
     if policy.processor is not None and stats is not None:
         policy.processor.stats = stats
     draft = target.with_name(f".{target.name}.partial")
@@ -174,28 +174,28 @@ def convert(
         shutil.rmtree(draft, ignore_errors=True)
 
 
-def _policy(found: Source, overrides: Sequence[str], trust_plugins: bool) -> Policy:
+def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Policy:
     """The policy a source belongs to, on meta, with its processor if that can be had."""
     from mme_vla.config.composition import compose
     from mme_vla.processing.base import load_processor
 
-    if found.format == "ours":
+    if opened.format == "ours":
         if overrides:
-            raise UserError(f"{found.folder} brings its own configuration: {' '.join(overrides)} would contradict it.")
-        config = {key: value for key, value in found.config.items() if key != "adapters"}
+            raise UserError(f"{opened.folder} brings its own configuration: {' '.join(overrides)} would contradict it.")
+        config = {key: value for key, value in opened.config.items() if key != "adapters"}
         if "backbone" not in config:
-            raise UserError(f"{found.folder} holds our weights but no config.json that describes them.")
-        import_trusted(config, str(found.folder), trust_plugins)
-        policy: Policy = policy_class(config).from_saved(config, str(found.folder / CONFIG))
-        policy.processor = load_processor(found.folder)
-        policy.check_processor(str(found.folder))
+            raise UserError(f"{opened.folder} holds our weights but no config.json that describes them.")
+        import_trusted(config, str(opened.folder), trust_plugins)
+        policy: Policy = policy_class(config).from_saved(config, str(opened.folder / CONFIG))
+        policy.processor = load_processor(opened.folder)
+        policy.check_processor(str(opened.folder))
         return policy
-    words, said = list(overrides), found.model
+    words, declared = list(overrides), opened.model
     named = [word.partition("=")[2] for word in words if word.startswith("model=")]
-    if said is not None and named and named[-1] != said:
-        raise UserError(f"{found.folder} says it is {said}, but model={named[-1]} was given.")
+    if declared is not None and named and named[-1] != declared:
+        raise UserError(f"{opened.folder} says it is {declared}, but model={named[-1]} was given.")
     if not named:
-        words.insert(0, f"model={said or 'pi05'}")
+        words.insert(0, f"model={declared or 'pi05'}")
     if not any(word.startswith("backbone=") for word in words):
         words.append(f"backbone={compose('policy', words).full_size}")
     from mme_vla.policy.build import build_from_config

@@ -25,9 +25,9 @@ from mme_vla.config import plugins
 from mme_vla.config.errors import COMPOSITION_ERRORS, ConfigTree, paths
 from mme_vla.config.errors import print_user_errors as print_user_errors
 from mme_vla.config.help import help_page, unknown_option
-from mme_vla.config.hydra_engine import VERSION_BASE, is_fixed, own_hydra, parse
+from mme_vla.config.hydra_engine import VERSION_BASE, is_fixed, local_hydra, parse
 from mme_vla.config.hydra_engine import config_dir as config_dir
-from mme_vla.config.naming import join_memories, remember_name, several_memories, true_name
+from mme_vla.config.naming import join_memories, several_memories, store_name, true_name
 from mme_vla.errors import UserError, printable
 
 
@@ -67,7 +67,7 @@ def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, .
     for folder in trees:
         if not folder.is_dir():
             raise UserError(f"The config folder {str(folder)!r} does not exist.")
-    with own_hydra(directory, extra_dirs) as engine:
+    with local_hydra(directory, extra_dirs) as engine:
         tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
         try:
             cfg = join_memories(tree.composed(overrides))
@@ -75,7 +75,7 @@ def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, .
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
     if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
-        remember_name(cfg, tree)
+        store_name(cfg, tree)
         cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
 
@@ -95,8 +95,10 @@ def check_overrides(
     columns = [_choices(override) for override in parse(overrides)]
     for row in zip_longest(*columns) if columns else [()]:
         # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
-        chosen = [column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column]
-        compose(config_name, chosen, directory=directory, extra_dirs=extra_dirs)
+        combination = [
+            column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column
+        ]
+        compose(config_name, combination, directory=directory, extra_dirs=extra_dirs)
 
 
 def _name_under_hydra(*, _root_: DictConfig) -> str:
@@ -210,20 +212,20 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
         UserError: a word that is neither a group nor an override that fits.
     """
 
-    def chosen(overrides: Sequence[str]) -> dict[str, str]:
+    def selected_groups(overrides: Sequence[str]) -> dict[str, str]:
         compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
-        with own_hydra(trees[0], trees[1:]):
+        with local_hydra(trees[0], trees[1:]):
             cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
             taken = cfg.hydra.runtime.choices.items()
             words = {group: "null" if name is None else str(name) for group, name in taken}
             return {group: name for group, name in words.items() if not group.startswith("hydra/")}
 
-    return help_page(config_name, words, trees, chosen)
+    return help_page(config_name, words, trees, selected_groups)
 
 
 def known_keys(config_name: str, tree: Path) -> list[str]:
     """Every dotted key of a command's configuration as it is by default."""
-    with own_hydra(tree, []):
+    with local_hydra(tree, []):
         return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
 
 

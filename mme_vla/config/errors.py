@@ -97,9 +97,9 @@ def _say(text: str, bold: str) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    rest = printable(text.removeprefix(bold))
+    remaining = printable(text.removeprefix(bold))
     try:
-        Console(stderr=True, soft_wrap=True).print(Text(bold, "bold red"), Text(rest), sep="")
+        Console(stderr=True, soft_wrap=True).print(Text(bold, "bold red"), Text(remaining), sep="")
     except OSError:  # the terminal, or the disk that standard error goes to, is what gave way
         sys.stderr = None
 
@@ -132,11 +132,11 @@ class ConfigTree:
 
         Of the library's own files the choices are composed once, and Hydra then sets the values: a fifth of the time.
         """
-        plain = all(isinstance(o.value(), str) and not o.is_add() and not o.is_delete() for o in self.choices)
-        usual = not any(str(o.key_or_group).startswith("hydra") or o.is_sweep_override() for o in self.overrides)
-        if self.fixed and plain and usual:
+        are_simple = all(isinstance(o.value(), str) and not o.is_add() and not o.is_delete() for o in self.choices)
+        are_default = not any(str(o.key_or_group).startswith("hydra") or o.is_sweep_override() for o in self.overrides)
+        if self.fixed and are_simple and are_default:
             with suppress(*COMPOSITION_ERRORS):  # Hydra's own way has the words for it
-                cfg = self._chosen()
+                cfg = self._selection()
                 ConfigLoaderImpl._apply_overrides_to_config(self.values, cfg)
                 return cfg
         return hydra.compose(self.config_name, list(words))
@@ -145,9 +145,9 @@ class ConfigTree:
         """Compose with the group choices alone, as plain containers; not to be changed."""
         if self.fixed:
             return _remembered_defaults(self.config_name, self._words())
-        return OmegaConf.to_container(self._chosen())
+        return OmegaConf.to_container(self._selection())
 
-    def _chosen(self) -> DictConfig:
+    def _selection(self) -> DictConfig:
         return pickle.loads((_remembered if self.fixed else _pickled)(self.config_name, self._words()))
 
     def _words(self) -> tuple[str, ...]:
@@ -172,13 +172,13 @@ class ConfigTree:
             defaults = self.defaults()
         except COMPOSITION_ERRORS:  # it is a choice that does not fit
             return text
-        ours = [o.input_line for o in self.values if str(o.key_or_group).startswith("memory.")]
-        if ours and isinstance(members := defaults.get("memory"), list):
+        memory_lines = [o.input_line for o in self.values if str(o.key_or_group).startswith("memory.")]
+        if memory_lines and isinstance(members := defaults.get("memory"), list):
             names = ", ".join(str(m.get("name") if isinstance(m, Mapping) else m) for m in members)
             return (
-                f"{ours[0]!r}: the model's file gives memory as the list [{names}], without keys. In that file write "
-                f"`/memory: joined` under defaults and `memory: {{members: [{names}]}}`: the same memory with keys. Or "
-                f"choose it on the command line, memory=[{names.replace(' ', '')}], for a model that has a memory."
+                f"{memory_lines[0]!r}: the model's file gives memory as the list [{names}], without keys. In that file "
+                f"write `/memory: joined` under defaults and `memory: {{members: [{names}]}}`: the same memory with "
+                f"keys. Or choose it on the command line, memory=[{names.replace(' ', '')}], for a model with a memory."
             )
         unknown = _BAD_KEY.match(text)
         key = (unknown[1] or unknown[2]) if unknown else ""
@@ -200,8 +200,8 @@ class ConfigTree:
         defaults = self.defaults() if self.values else {}
         for override in self.values:
             default = _select(defaults, override.key_or_group)
-            given = override.value()
-            expected = _expected(default, given)
+            value = override.value()
+            expected = _expected(default, value)
             if expected and not override.is_delete():
                 raise UserError(f"{override.input_line!r} does not fit: {override.key_or_group!r} is {expected}.")
 
@@ -218,15 +218,15 @@ def _remembered_defaults(config_name: str, words: tuple[str, ...]) -> Any:
     return OmegaConf.to_container(pickle.loads(_remembered(config_name, words)))
 
 
-def _expected(default: Any, given: Any) -> str:
-    """What `default` asks for where `given` is of another kind; empty where it may pass."""
-    if given is None or default is None or (isinstance(given, str) and "${" in given):
+def _expected(default: Any, value: Any) -> str:
+    """What `default` asks for where `value` is of another kind; empty where it may pass."""
+    if value is None or default is None or (isinstance(value, str) and "${" in value):
         return ""
-    if isinstance(default, Mapping) and not isinstance(given, Mapping):
+    if isinstance(default, Mapping) and not isinstance(value, Mapping):
         return f"a section with the keys {', '.join(map(str, default)) or '(none)'}"
     if isinstance(default, bool):
-        return "" if isinstance(given, bool) else "true or false"
-    if isinstance(default, int | float) and isinstance(given, str | bool | Mapping):
+        return "" if isinstance(value, bool) else "true or false"
+    if isinstance(default, int | float) and isinstance(value, str | bool | Mapping):
         return f"a number (default {default})"
     return ""
 
@@ -241,10 +241,10 @@ def _select(tree: Any, key: str) -> Any:
 
 def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
     """Walk down `key` as far as it exists and name what is near there, or the same word elsewhere in the tree."""
-    section, parents, rest = defaults, [], key.split(".")
-    while len(rest) > 1 and isinstance(section, Mapping) and rest[0] in section:
-        parents.append(rest[0])
-        section = section[rest.pop(0)]
+    section, parents, remaining = defaults, [], key.split(".")
+    while len(remaining) > 1 and isinstance(section, Mapping) and remaining[0] in section:
+        parents.append(remaining[0])
+        section = section[remaining.pop(0)]
     where = ".".join(parents)
     if where and not section:
         return f"Unknown config key {key!r}: {where!r} has no keys under these choices."
@@ -252,16 +252,18 @@ def _unknown_key(key: str, defaults: Any, groups: Sequence[str]) -> str:
         return f"Unknown config key {key!r}: {where!r} is a value ({section!r}), not a section."
     options = {str(name) for name in section} | (set() if parents else set(groups) - {"hydra"})
     everywhere = list(paths(defaults))
-    elsewhere = [path for path in everywhere if path.split(".")[-1] == rest[0]]
-    if not elsewhere and not parents:
+    other_paths = [path for path in everywhere if path.split(".")[-1] == remaining[0]]
+    if not other_paths and not parents:
         # `train.device` where there is `device`, `mode` where there is `subgoal_mode`.
-        last = rest[-1]
-        elsewhere = [p for p in everywhere if last == p.split(".")[-1] or last in p.split(".")[-1].split("_")]
-        elsewhere += [name for name in get_close_matches(rest[0], options) if elsewhere and len(rest) == 1]
-    if elsewhere:
-        return f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, elsewhere[:3]))}?"
+        last = remaining[-1]
+        other_paths = [p for p in everywhere if last == p.split(".")[-1] or last in p.split(".")[-1].split("_")]
+        other_paths += [
+            name for name in get_close_matches(remaining[0], options) if other_paths and len(remaining) == 1
+        ]
+    if other_paths:
+        return f"Unknown config key {key!r}. Did you mean {' or '.join(map(repr, other_paths[:3]))}?"
     within = f" In {where!r}:" if where else ""
-    return f"Unknown config key {key!r}.{within} {did_you_mean(rest[0], options)}"
+    return f"Unknown config key {key!r}.{within} {did_you_mean(remaining[0], options)}"
 
 
 def paths(tree: Any, prefix: str = "") -> Iterator[str]:

@@ -61,7 +61,7 @@ class Defaults:
 
 def keys(file: Path) -> list[Key]:
     """Every key of a file in its order; the lists `defaults` and `hydra` are left out."""
-    found: list[Key] = []
+    result: list[Key] = []
     path: list[str] = []
     for line in file.read_text().splitlines():
         match = _KEY.match(line)
@@ -70,17 +70,19 @@ def keys(file: Path) -> list[Key]:
         depth = len(match["indent"]) // 2
         path = [*path[:depth], match["key"]]
         if path[0] not in ("defaults", "hydra"):
-            found.append(Key(".".join(path), (match["value"] or "").strip(), match["comment"] or ""))
-    return found
+            result.append(Key(".".join(path), (match["value"] or "").strip(), match["comment"] or ""))
+    return result
 
 
 def explained(file: Path) -> list[Key]:
     """`keys`, with what another file of the group says of a key where this one says nothing."""
-    own = keys(file)
-    if all(key.comment for key in own):
-        return own
-    said = {key.name: key.comment for other in sorted(file.parent.glob("*.yaml")) for key in keys(other) if key.comment}
-    return [Key(key.name, key.default, key.comment or said.get(key.name, "")) for key in own]
+    local_keys = keys(file)
+    if all(key.comment for key in local_keys):
+        return local_keys
+    comments = {
+        key.name: key.comment for other in sorted(file.parent.glob("*.yaml")) for key in keys(other) if key.comment
+    }
+    return [Key(key.name, key.default, key.comment or comments.get(key.name, "")) for key in local_keys]
 
 
 def heading(file: Path) -> tuple[list[str], str]:
@@ -120,8 +122,8 @@ def defaults(file: Path) -> Defaults:
 
 def choices(trees: Iterable[Path], group: str) -> dict[str, Path]:
     """The files of a group by name, of all trees; a later tree's file stands before an earlier one's."""
-    found = {file.stem: file for tree in trees for file in sorted((tree / group).glob("*.yaml"))}
-    return dict(sorted(found.items()))
+    files = {file.stem: file for tree in trees for file in sorted((tree / group).glob("*.yaml"))}
+    return dict(sorted(files.items()))
 
 
 OPTIONS = (
@@ -132,16 +134,16 @@ OPTIONS = (
 )
 WIDEST, UNKNOWN_WIDTH = 120, 100
 """Columns at most; columns where there is no terminal."""
-Chosen = Callable[[Sequence[str]], dict[str, str]]
+SelectGroups = Callable[[Sequence[str]], dict[str, str]]
 """From the words of a command line to the file that each group then takes."""
 
 
-def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], chosen: Chosen) -> str:
+def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], select: SelectGroups) -> str:
     """The text of `--help`.
 
     Args:
         config_name: the command's file. words: what stands beside `--help`: names of groups, and overrides.
-        trees: folders of YAML files, the library's first. chosen: composes.
+        trees: folders of YAML files, the library's first. select: composes.
 
     Raises:
         UserError: a word that is neither a group nor `key=value`.
@@ -149,7 +151,7 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], cho
     file = next(tree / f"{config_name}.yaml" for tree in trees if (tree / f"{config_name}.yaml").is_file())
     overrides = [word for word in words if "=" in word]
     named = [word for word in words if "=" not in word]
-    groups = chosen(overrides)
+    groups = select(overrides)
     for word in named:
         if word not in groups:
             raise UserError(f"{word!r} is no group of this command. {did_you_mean(word, groups)}")
@@ -164,22 +166,22 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], cho
         if rows:
             of = "" if part == file else f" of {COMMANDS.get(part.stem, part.stem)}"
             lines += [f"Keys{of}", *_table([(_assigned(key), key.comment) for key in rows]), ""]
-    lines += _chosen_groups(groups, {word.partition("=")[0] for word in overrides}, trees)
+    lines += _group_pages(groups, {word.partition("=")[0] for word in overrides}, trees)
     lines += ["Options", *_table(OPTIONS)]
     return "\n".join(lines)
 
 
 def _included(file: Path, trees: Sequence[Path]) -> list[Path]:
     """The files of the top level that a command's file is built on, theirs included."""
-    found: list[Path] = []
+    files: list[Path] = []
     for name in defaults(file).files:
         part = next((tree / f"{name}.yaml" for tree in trees if (tree / f"{name}.yaml").is_file()), None)
         if part is not None:
-            found += [part, *_included(part, trees)]
-    return found
+            files += [part, *_included(part, trees)]
+    return files
 
 
-def _chosen_groups(groups: dict[str, str], asked: set[str], trees: Sequence[Path]) -> list[str]:
+def _group_pages(groups: dict[str, str], requested: set[str], trees: Sequence[Path]) -> list[str]:
     """Each group with its choices; of those that were asked for (a model stands for its parts) the keys too."""
     if not groups:
         return []
@@ -187,8 +189,8 @@ def _chosen_groups(groups: dict[str, str], asked: set[str], trees: Sequence[Path
         (f"{group}={name}", " · ".join(choices(trees, group)) or "(none)") for group, name in sorted(groups.items())
     ]
     lines = ["Groups: GROUP=NAME takes another file; --help GROUP shows what is in them", *_table(rows), ""]
-    shown = {"model", "memory", "integration"} if "model" in asked else set()
-    for group in sorted((asked | shown) & groups.keys()):
+    displayed = {"model", "memory", "integration"} if "model" in requested else set()
+    for group in sorted((requested | displayed) & groups.keys()):
         lines += _file(group, groups[group], trees)
     return lines
 
@@ -205,8 +207,8 @@ def _file(group: str, name: str, trees: Sequence[Path]) -> list[str]:
     if file is None:  # null, or several
         return []
     text = heading(file)[1]
-    own = [key for key in explained(file) if key.default or key.comment]
-    rows = [(f"{package(file, group)}{_assigned(key)}", key.comment) for key in own]
+    local_keys = [key for key in explained(file) if key.default or key.comment]
+    rows = [(f"{package(file, group)}{_assigned(key)}", key.comment) for key in local_keys]
     taken = [f"{part.strip('/')}={choice}" for part, choice in defaults(file).groups.items()]
     lines = [f"{group}={name}", *_wrapped(text, "  ")]
     lines += [f"  takes {' '.join(taken)}"] if taken else []
@@ -233,14 +235,14 @@ def _table(rows: Sequence[tuple[str, str]]) -> list[str]:
     first = min(max((len(left) for left, _ in rows), default=0), 34)
     lines = []
     for left, right in rows:
-        rest = textwrap.wrap(right, max(_width() - first - 4, 30), break_on_hyphens=False, break_long_words=False) or [
-            ""
-        ]
+        remaining = textwrap.wrap(
+            right, max(_width() - first - 4, 30), break_on_hyphens=False, break_long_words=False
+        ) or [""]
         if len(left) > first:
             lines.append(f"  {left}")
         else:
-            lines.append(f"  {left:<{first}}  {rest.pop(0)}".rstrip())
-        lines += [f"{'':<{first + 4}}{line}" for line in rest if line]
+            lines.append(f"  {left:<{first}}  {remaining.pop(0)}".rstrip())
+        lines += [f"{'':<{first + 4}}{line}" for line in remaining if line]
     return lines
 
 

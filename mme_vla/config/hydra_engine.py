@@ -46,10 +46,10 @@ class RememberedFiles(ConfigRepository):
 
     def load_config(self, config_path: str) -> ConfigResult | None:
         if config_path not in self._read:
-            found = super().load_config(config_path)
-            if found is None:
+            result = super().load_config(config_path)
+            if result is None:
                 return None
-            self._read[config_path] = pickle.dumps(found)
+            self._read[config_path] = pickle.dumps(result)
         read: ConfigResult = pickle.loads(self._read[config_path])
         return read
 
@@ -78,14 +78,14 @@ def _keep_hydra_to_installed_plugins() -> None:
     before = list(sys.path)
     sys.path[:] = [place for place in sys.path if Path(place).resolve() != here]
     try:
-        found = importlib.import_module("hydra_plugins")
+        package = importlib.import_module("hydra_plugins")
         # A plain list: a namespace's own path would follow sys.path again.
-        found.__path__ = [place for place in found.__path__ if Path(place).resolve().parent != here]
+        package.__path__ = [place for place in package.__path__ if Path(place).resolve().parent != here]
     except ModuleNotFoundError:
-        found = ModuleType("hydra_plugins")
-        found.__spec__ = ModuleSpec("hydra_plugins", None, is_package=True)
-        found.__path__ = []
-        sys.modules["hydra_plugins"] = found
+        package = ModuleType("hydra_plugins")
+        package.__spec__ = ModuleSpec("hydra_plugins", None, is_package=True)
+        package.__path__ = []
+        sys.modules["hydra_plugins"] = package
     finally:
         sys.path[:] = before
 
@@ -127,7 +127,7 @@ config_loader_impl.ConfigRepository = _repository  # type: ignore[misc, assignme
 
 
 @contextmanager
-def own_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
+def local_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
     """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
     base = version.VersionBase.instance()
     outer, outer_base = GlobalHydra.instance().hydra, base.version_base

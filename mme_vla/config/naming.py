@@ -12,7 +12,7 @@ from typing import Any
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from mme_vla.config.errors import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.config.hydra_engine import is_fixed, own_hydra, parse
+from mme_vla.config.hydra_engine import is_fixed, local_hydra, parse
 from mme_vla.errors import UserError
 
 JOINED = "joined"
@@ -50,11 +50,11 @@ def several_memories(overrides: Iterable[str]) -> list[str]:
     Hydra itself would lay the two files over each other.
     """
 
-    def written(word: str) -> Iterator[str]:
+    def expand_word(word: str) -> Iterator[str]:
         several = _SEVERAL.fullmatch(word)
         yield from [f"memory={JOINED}", f"memory.members={several[1]}"] if several else [word]
 
-    return [new for word in overrides for new in written(word)]
+    return [new for word in overrides for new in expand_word(word)]
 
 
 def join_memories(cfg: DictConfig) -> DictConfig:
@@ -72,7 +72,7 @@ DECISIVE = ("memory", "integration", "processor", "subgoal_text", "token_budget"
 """Sections that make one variant another; the backbone's size and the training do not."""
 FREE = ("memory.budget", "processor.tokenizer", "processor.text", "processor.side")
 """Keys in them that do not: a budget has a field of its own in records; pixels and words go with the backbone."""
-POLICY, USUAL_POLICY = "policy.name", "mme"
+POLICY, DEFAULT_POLICY = "policy.name", "mme"
 LONGEST = 32
 """Letters that differences may take in a name; more are a digest."""
 
@@ -84,15 +84,15 @@ Reference = Callable[[str], tuple[str, Sections] | None]
 
 def decisive(cfg: DictConfig) -> Sections:
     """The keys of a composed configuration that make it the variant it is."""
-    found: Sections = {}
+    values: Sections = {}
     for key in DECISIVE:
         if key in cfg:
             value = cfg[key]
-            plain = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
-            found |= flat({key: plain})
+            container = OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
+            values |= flat({key: container})
     if "policy" in cfg:
-        found |= of_policy(cfg.policy)
-    return {key: value for key, value in found.items() if value is not None and key not in FREE}
+        values |= of_policy(cfg.policy)
+    return {key: value for key, value in values.items() if value is not None and key not in FREE}
 
 
 def may_be_of(model: Path, sections: Sections) -> bool:
@@ -106,8 +106,10 @@ def may_be_of(model: Path, sections: Sections) -> bool:
 def _may_choose(tree: Path, described: dict[Any, Any], part: str, sections: Sections) -> bool:
     if "name" in (described.get(part) or {}):
         return True
-    chosen = [one[f"/{part}"] for one in described.get("defaults") or () if isinstance(one, dict) and f"/{part}" in one]
-    file = tree / part / f"{chosen[0]}.yaml" if chosen else None
+    choices = [
+        one[f"/{part}"] for one in described.get("defaults") or () if isinstance(one, dict) and f"/{part}" in one
+    ]
+    file = tree / part / f"{choices[0]}.yaml" if choices else None
     if file is None or not file.is_file():
         return True
     name = _read(file)
@@ -125,39 +127,46 @@ def _parsed(file: Path, changed: int) -> Any:
 
 
 def variant_name(
-    given: str, sections: Sections, models: Iterable[str], reference: Reference, parts: Callable[[], Sections | None]
+    name_in_config: str,
+    sections: Sections,
+    models: Iterable[str],
+    reference: Reference,
+    parts: Callable[[], Sections | None],
 ) -> str:
     """The name of a composition.
 
     Args:
-        given: what the chosen model's file calls it. sections: `decisive` of the composition.
+        name_in_config: what the chosen model's file calls it. sections: `decisive` of the composition.
         models: the files of the group `model`. reference: what each of them composes to; None also where it cannot be
             a composition of the same parts.
         parts: what the memory and the integration compose to with no value changed; None where that is not known.
 
     Returns:
-        `given` if the user chose a name that is no model's, or if it is true; else the name of the model that equals
-        the composition; else that of the nearest model with the same parts (or the parts' names) with the differences.
+        `name_in_config` if the user chose a name that is no model's, or if it is true; else the name of the model that
+        equals the composition; else that of the nearest model with the same parts (or the parts' names) with the
+        differences.
     """
     names = sorted(models)
-    if given not in names:
-        return given
-    own = reference(given)
-    if own is not None and own[1] == sections:
-        return own[0]
-    known = [found for found in map(reference, names) if found is not None]
-    for name, theirs in known:
-        if theirs == sections:
+    if name_in_config not in names:
+        return name_in_config
+    base_variant = reference(name_in_config)
+    if base_variant is not None and base_variant[1] == sections:
+        return base_variant[0]
+    known = [variant for variant in map(reference, names) if variant is not None]
+    for name, known_sections in known:
+        if known_sections == sections:
             return name
-    alike = [found for found in known if _kind(found[1]) == _kind(sections)]
+    alike = [variant for variant in known if _kind(variant[1]) == _kind(sections)]
     if alike:
-        name, base = min(alike, key=lambda found: (found[0] != given, len(_differences(found[1], sections))))
+        name, base = min(
+            alike, key=lambda variant: (variant[0] != name_in_config, len(_differences(variant[1], sections)))
+        )
         return f"{name}-{_suffix(_differences(base, sections))}"
     name = "_".join(part for part in (sections.get(POLICY, ""), *_parts(sections)) if part) or "memoryless"
-    plain = parts()
-    if plain == sections:
+    part_sections = parts()
+    if part_sections == sections:
         return name
-    return f"{name}-{_suffix(_differences(plain or {}, sections), words=plain is not None)}"
+    return f"{name}-{_suffix(_differences(part_sections or {}, sections), words=part_sections is not None)}"
 
 
 def _parts(sections: Sections) -> tuple[str, str]:
@@ -172,8 +181,8 @@ def _kind(sections: Sections) -> tuple[str, ...]:
 
 def of_policy(section: Mapping[str, Any]) -> Sections:
     """The kind of policy, where it is not the usual one, which configurations did not use to name."""
-    name = section.get("name", USUAL_POLICY)
-    return {} if name == USUAL_POLICY else {POLICY: name}
+    name = section.get("name", DEFAULT_POLICY)
+    return {} if name == DEFAULT_POLICY else {POLICY: name}
 
 
 def _differences(base: Sections, sections: Sections) -> Sections:
@@ -188,8 +197,8 @@ def _suffix(differences: Sections, words: bool = True) -> str:
 
 
 def _word(value: Any) -> str:
-    plain = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    return re.sub(r"[^\w.]+", "_", plain).strip("_.")
+    text = "none" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    return re.sub(r"[^\w.]+", "_", text).strip("_.")
 
 
 def digest(values: Mapping[str, Any], letters: int) -> str:
@@ -200,10 +209,10 @@ def digest(values: Mapping[str, Any], letters: int) -> str:
 
 def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
     """Nested sections as one, under dotted keys."""
-    found: Sections = {}
+    result: Sections = {}
     for key, value in values.items():
-        found |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
-    return found
+        result |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return result
 
 
 _names: dict[str, str] = {}
@@ -214,7 +223,7 @@ def _what_names(cfg: DictConfig) -> str:
     return json.dumps([str(cfg.name), decisive(cfg)], sort_keys=True, default=str)
 
 
-def remember_name(cfg: DictConfig, tree: ConfigTree) -> None:
+def store_name(cfg: DictConfig, tree: ConfigTree) -> None:
     """Spare `true_name` the search where a composition is a model as its file says, whatever it is trained with."""
     model = [str(choice.input_line) for choice in tree.choices] == [f"model={cfg.name}"]
     values = {str(value.key_or_group).partition(".")[0] for value in tree.values}
@@ -231,54 +240,54 @@ def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str
     if isinstance(cfg.get("memory"), ListConfig):
         cfg = join_memories(cfg.copy())
     if not is_fixed(trees, ()):
-        return found_name(cfg, config_name, trees)
+        return resolve_name(cfg, config_name, trees)
     key = _what_names(cfg)
     if key not in _names:
-        _names[key] = found_name(cfg, config_name, trees)
+        _names[key] = resolve_name(cfg, config_name, trees)
     return _names[key]
 
 
-def found_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
+def resolve_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
     """`true_name`, found by comparing the models of these trees."""
-    given = str(cfg.name)
+    configured_name = str(cfg.name)
     config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
     mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
-    theirs = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
+    plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
 
     def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
         return (_cached_sections if is_fixed(searched, words) else _composed_sections)(config_name, words, searched)
 
     def parts() -> Sections | None:
-        chosen = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
-        for group, section in chosen.items():
+        groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
+        for group, section in groups.items():
             if section and not section.get("name"):
                 raise UserError(
                     f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
                     f"keys are set beside it, {group}.<key>=<value>."
                 )
-        words = [f"{group}={section.name if section else 'none'}" for group, section in chosen.items()]
+        words = [f"{group}={section.name if section else 'none'}" for group, section in groups.items()]
         if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
-            words.insert(0, f"model={given}")
-        if "members" in (chosen.get("memory") or {}):
-            words.append(f"memory.members={literal(OmegaConf.to_container(chosen['memory'].members, resolve=True))}")
-        found = composed(tuple(words), trees)
-        return None if found is None else found[1]
+            words.insert(0, f"model={configured_name}")
+        if "members" in (groups.get("memory") or {}):
+            words.append(f"memory.members={literal(OmegaConf.to_container(groups['memory'].members, resolve=True))}")
+        result = composed(tuple(words), trees)
+        return None if result is None else result[1]
 
     sections = decisive(cfg)
 
     def reference(model: str) -> tuple[str, Sections] | None:
-        if model in theirs and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
+        if model in plugin_models and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
             return None
-        return composed((f"model={model}",), trees[:1] if model in theirs else trees)
+        return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
 
-    return variant_name(str(cfg.name), sections, mine | theirs, reference, parts)
+    return variant_name(str(cfg.name), sections, mine | plugin_models, reference, parts)
 
 
 def _composed_sections(
     config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
 ) -> tuple[str, Sections] | None:
     """Name and decisive keys of a composition; None where these words do not compose."""
-    with own_hydra(trees[0], trees[1:]) as engine:
+    with local_hydra(trees[0], trees[1:]) as engine:
         try:
             tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
             cfg = join_memories(tree.composed(overrides))

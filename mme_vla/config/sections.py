@@ -19,14 +19,14 @@ class _MisfitError(Exception):
     """A value of another kind than its key's."""
 
 
-def read_section[T](kind: type[T], given: Any, where: str = "", *, others: bool = False, **fixed: Any) -> T:
+def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool = False, **fixed: Any) -> T:
     """Build a dataclass from a mapping.
 
     Args:
         kind: a dataclass; the annotations of its fields say what their values must be: `bool`, `int`, `float` (whole
             numbers too), `str`, a dataclass (a section of its own), tuples of these (lists are taken), mappings, `Any`,
             and unions with None.
-        given: the section. where: its dotted name in messages; empty for the top level.
+        values: the section. where: its dotted name in messages; empty for the top level.
         others: whether keys of other purposes may stand in it; they are left aside.
         fixed: fields that the section does not decide.
 
@@ -35,43 +35,43 @@ def read_section[T](kind: type[T], given: Any, where: str = "", *, others: bool 
     """
     specs = {spec.name: spec for spec in fields(kind) if spec.init and spec.name not in fixed}  # type: ignore[arg-type]
     needed = [n for n, spec in specs.items() if spec.default is MISSING and spec.default_factory is MISSING]
-    if others and isinstance(given, Mapping):
-        given = {key: value for key, value in given.items() if key in specs}
-    found, hints = section_keys(given, where, specs), get_type_hints(kind)
+    if others and isinstance(values, Mapping):
+        values = {key: value for key, value in values.items() if key in specs}
+    parsed, hints = section_keys(values, where, specs), get_type_hints(kind)
     for key in needed:
-        if key not in found:
-            raise _lacking(where, key, found)
+        if key not in parsed:
+            raise _lacking(where, key, parsed)
     read: dict[str, Any] = {}
-    for key, value in found.items():
+    for key, value in parsed.items():
         name = f"{where}.{key}" if where else key
         try:
             read[key] = _converted(value, hints[key], name)
         except _MisfitError:
-            shown = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
-            raise UserError(f"{name}{shown} must be {_expected(hints[key])}.") from None
+            assigned = f"={brief(value)}" if specs[key].repr else ""  # some values are secrets
+            raise UserError(f"{name}{assigned} must be {_expected(hints[key])}.") from None
     return kind(**read, **fixed)
 
 
-def section_keys(given: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
+def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
     """A mapping with no unknown key, and with a value for every required one.
 
     Raises:
         UserError: it is something else; `where` names it.
     """
-    if not isinstance(given, Mapping):
-        raise UserError(f"{where or 'the configuration'} must be a section of keys, got {brief(given)}.")
-    for key in given:
+    if not isinstance(values, Mapping):
+        raise UserError(f"{where or 'the configuration'} must be a section of keys, got {brief(values)}.")
+    for key in values:
         if key not in known:
             name = brief(key, quote=False)
             raise UserError(f"Unknown key {f'{where}.' if where else ''}{name}. {did_you_mean(str(key), list(known))}")
     for key in required:
-        if given.get(key) is None:
-            raise _lacking(where, key, given)
-    return {str(key): value for key, value in given.items()}
+        if values.get(key) is None:
+            raise _lacking(where, key, values)
+    return {str(key): value for key, value in values.items()}
 
 
-def _lacking(where: str, key: str, given: Iterable[Any]) -> UserError:
-    return UserError(f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(given) or 'none'}.")
+def _lacking(where: str, key: str, keys: Iterable[Any]) -> UserError:
+    return UserError(f"{where or 'the configuration'} lacks the key {key!r}; it has {listed(keys) or 'none'}.")
 
 
 def _converted(value: Any, kind: Any, name: str) -> Any:

@@ -74,10 +74,10 @@ def cache_folder(root: Path, source: EpisodeSource, expected: dict[str, Any]) ->
     return root / f"{source.name}-{source.fingerprint[:8]}" / name
 
 
-def kept_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
+def stored_frames(source: EpisodeSource, episode: int, spec: StorageSpec) -> np.ndarray:
     """Frames of an episode whose tokens are stored: those that `spec` keeps, as far as they were drawn."""
-    kept = spec.kept_frames(int(source.lengths[episode]))
-    return kept[source.drawn(episode)[kept]]
+    stored = spec.stored_frames(int(source.lengths[episode]))
+    return stored[source.rendered(episode)[stored]]
 
 
 def token_file(folder: Path, episode: int) -> Path:
@@ -146,7 +146,7 @@ class VisionCache:
             self._histories[episode] = CachedHistory(
                 self.spec,
                 self._tokens(episode),
-                kept_frames(self._source, episode, self.spec),
+                stored_frames(self._source, episode, self.spec),
                 length,
                 self._scores(episode),
                 int(self._exec_starts[episode]),
@@ -175,7 +175,7 @@ class VisionCache:
 
     def _tokens(self, episode: int) -> np.ndarray:
         path = token_file(self.folder, episode)
-        rows = len(kept_frames(self._source, episode, self.spec))
+        rows = len(stored_frames(self._source, episode, self.spec))
         with decoding(require_file(path), "tokens of a vision cache", self._remedy):
             tokens = np.lib.format.open_memmap(path, mode="r")
         if tokens.ndim != 3 or tokens.shape[:2] != (rows, self.spec.grid**2) or tokens.dtype != self._dtype:
@@ -222,8 +222,10 @@ def check_fingerprint(folder: Path, expected: dict[str, Any], command: str = COM
         if folder.is_dir() and any(folder.iterdir()):
             raise UserError(f"{folder} has no {FINGERPRINT}: it is not a vision cache. Choose another data.cache.root.")
         raise CacheMissingError(f"There is no vision cache at {folder}. Build it with: {command}")
-    found = read_json(path, "what a vision cache was made of")
-    differing = [key for key, value in expected.items() if found.get(key) != value]
+    recorded = read_json(path, "what a vision cache was made of")
+    differing = [key for key, value in expected.items() if recorded.get(key) != value]
     if differing:
-        details = "; ".join(f"{key} is {brief(found.get(key), 200)}, expected {expected[key]!r}" for key in differing)
+        details = "; ".join(
+            f"{key} is {brief(recorded.get(key), 200)}, expected {expected[key]!r}" for key in differing
+        )
         raise UserError(f"The vision cache {folder} is stale: {details}. Rebuild it with: {command} rebuild=true")

@@ -26,8 +26,8 @@ from mme_vla.data.cache import (
     check_fingerprint,
     default_cache_root,
     fingerprint,
-    kept_frames,
     score_file,
+    stored_frames,
     sum_file,
     token_file,
 )
@@ -106,7 +106,7 @@ def build_cache(
         # Pictures are decoded in a thread while the ones before them are encoded.
         closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
     ):
-        for episode, of_episode in groupby(chunks, lambda found: found[0]):
+        for episode, of_episode in groupby(chunks, lambda chunk: chunk[0]):
             some = (chunk for _, chunk in of_episode)
             _build_episode(source, episode, some, memory, encode, folder, expected["dtype"], advance)
     return len(missing)
@@ -126,19 +126,19 @@ def estimate(
     source: EpisodeSource, memory: Memory, encode: Encode, dtype: str = "bfloat16", batch_size: int = 32
 ) -> Estimate:
     """Measure a few batches of the first episode and extrapolate to the dataset."""
-    kept = sum(len(kept_frames(source, episode, memory.storage)) for episode in range(len(source)))
+    n_stored = sum(len(stored_frames(source, episode, memory.storage)) for episode in range(len(source)))
     chunk = next(_chunks(source, 0, memory, batch_size))
-    encode(chunk.kept_pictures[:1])  # the first call pays for warming up
+    encode(chunk.stored_images[:1])  # the first call pays for warming up
     started = time.perf_counter()
-    seen, bytes_per_frame = 0, 0
+    n_frames, bytes_per_frame = 0, 0
     for chunk in _chunks(source, 0, memory, batch_size):
-        tokens = encode(chunk.kept_pictures)
+        tokens = encode(chunk.stored_images)
         bytes_per_frame = tokens[0].numel() * np.dtype(DTYPES[dtype]).itemsize
-        seen += chunk.length
+        n_frames += chunk.length
         if time.perf_counter() - started > 5:
             break
-    seconds = (time.perf_counter() - started) / seen * int(source.lengths.sum())
-    return Estimate(kept, kept * bytes_per_frame, seconds)
+    seconds = (time.perf_counter() - started) / n_frames * int(source.lengths.sum())
+    return Estimate(n_stored, n_stored * bytes_per_frame, seconds)
 
 
 @dataclass(frozen=True)
@@ -146,30 +146,30 @@ class _Chunk:
     """A stretch of an episode: how many frames it spans, the pictures to encode, and the scores that came up."""
 
     length: int
-    kept_pictures: np.ndarray
+    stored_images: np.ndarray
     score_frames: list[int]
     score_values: list[np.ndarray]
 
 
 def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
     spec, length, scorer = memory.storage, int(source.lengths[episode]), memory.make_scorer()
-    kept, scored = kept_frames(source, episode, memory.storage), memory.frames_scored(length)
+    stored, scored = stored_frames(source, episode, memory.storage), memory.frames_scored(length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
     for start in range(0, length, span):
         stop = min(start + span, length)
-        here = kept[(kept >= start) & (kept < stop)]
-        wanted = np.union1d(here, scored[(scored >= start) & (scored < stop)])
-        if not len(wanted):
+        here = stored[(stored >= start) & (stored < stop)]
+        required = np.union1d(here, scored[(scored >= start) & (scored < stop)])
+        if not len(required):
             continue
-        pictures = source.frames(episode, wanted)
+        images = source.frames(episode, required)
         frames, values = [], []
         if scorer is not None:
-            for frame, picture in zip(wanted.tolist(), pictures, strict=True):
-                row = scorer(frame, picture)
+            for frame, image in zip(required.tolist(), images, strict=True):
+                row = scorer(frame, image)
                 if row is not None:
                     frames.append(frame)
                     values.append(np.asarray(row, np.float32))
-        yield _Chunk(stop - start, pictures[np.isin(wanted, here)], frames, values)
+        yield _Chunk(stop - start, images[np.isin(required, here)], frames, values)
 
 
 def _build_episode(
@@ -189,10 +189,10 @@ def _build_episode(
     for chunk in chunks:
         frames += chunk.score_frames
         values += chunk.score_values
-        if len(chunk.kept_pictures):
-            tokens = encode(chunk.kept_pictures)
-            if tokens.shape[:2] != (len(chunk.kept_pictures), patches):
-                raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.kept_pictures)} frames")
+        if len(chunk.stored_images):
+            tokens = encode(chunk.stored_images)
+            if tokens.shape[:2] != (len(chunk.stored_images), patches):
+                raise ValueError(f"encode() gave {list(tokens.shape)} for {len(chunk.stored_images)} frames")
             rows.append(_to_numpy(tokens, dtype))
         advance(chunk.length)
     if not rows:

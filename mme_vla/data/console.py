@@ -63,22 +63,24 @@ class _Lines:
     def __init__(self, say: Callable[[str], None], description: str, total: int, done: int, unit: str) -> None:
         self._say, self._description, self._total, self._unit = say, description, total, unit
         self._before = self._done = done
-        self._begun = self._said = time.monotonic()
+        self._begun = self._reported = time.monotonic()
 
     def advance(self, steps: int) -> None:
         """Count; say so if it is time."""
         self._done += steps
         now = time.monotonic()
-        if self._done < self._total and now - self._said < LINE_SECONDS:
+        if self._done < self._total and now - self._reported < LINE_SECONDS:
             return
-        self._said = now
+        self._reported = now
         each = (now - self._begun) / max(self._done - self._before, 1)
-        rest = f", about {_spoken(each * (self._total - self._done))} left" if self._done < self._total else ""
+        remaining = (
+            f", about {_duration_text(each * (self._total - self._done))} left" if self._done < self._total else ""
+        )
         count = f"{self._done:,} of {self._total:,} {self._unit}".rstrip()
-        self._say(f"{self._description}: {count} in {_spoken(now - self._begun)}{rest}")
+        self._say(f"{self._description}: {count} in {_duration_text(now - self._begun)}{remaining}")
 
 
-def _spoken(seconds: float) -> str:
+def _duration_text(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

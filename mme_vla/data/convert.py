@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.data.hdf5 import all_have_choices, all_have_poses, any_chosen_frames, open_episode, pose_columns
+from mme_vla.data.hdf5 import all_have_choices, all_have_poses, any_selected_frames, open_episode, pose_columns
 from mme_vla.data.hdf5_episode import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame
 from mme_vla.data.keyframes import file_of, write_keyframes
-from mme_vla.data.lerobot_files import DRAWN, NAMES
+from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, file_sum, read_json, write_sums
-from mme_vla.utils.media import RED, Tile, contact_sheet, film_frame, spread, write_film
+from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced, video_frame, write_video
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -40,12 +40,12 @@ def episodes_without_statistics() -> Iterator[None]:
     """
     from lerobot.datasets import dataset_metadata
 
-    theirs = dataset_metadata.load_episodes
+    original = dataset_metadata.load_episodes
     dataset_metadata.load_episodes = _columns
     try:
         yield
     finally:
-        dataset_metadata.load_episodes = theirs
+        dataset_metadata.load_episodes = original
 
 
 def _columns(root: Path) -> dict[str, list[Any]]:
@@ -65,10 +65,10 @@ TILES, COLUMNS, SIDE = 12, 6, 192
 
 def episode_sheet(frames: Sequence[RawFrame], title: str) -> "Image":
     """Front views spread evenly over an episode, each with its step and sub-task."""
-    shown = [(step, frames[step]) for step in spread(len(frames), TILES)]
+    displayed = [(step, frames[step]) for step in evenly_spaced(len(frames), TILES)]
     tiles = [
         Tile(frame.front, f"{step} {frame.subgoals['simple_subgoal_online']}", RED if frame.is_demo else None)
-        for step, frame in shown
+        for step, frame in displayed
     ]
     return contact_sheet(tiles, COLUMNS, title, side=SIDE)
 
@@ -76,13 +76,13 @@ def episode_sheet(frames: Sequence[RawFrame], title: str) -> "Image":
 def write_previews(file: Path, index: int, task: str, folder: Path) -> tuple[Path, Path]:
     """Write `<task>-<index>.png` and `.mp4` of a recorded episode; return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    sheet, film = (folder / f"{task}-{index:04d}.{end}" for end in ("png", "mp4"))
+    sheet, video = (folder / f"{task}-{index:04d}.{end}" for end in ("png", "mp4"))
     with open_episode(EpisodeRef(file, index, task)) as episode:
         frames, goal = list(episode), episode.goals[0]
     episode_sheet(frames, f"{task} {index}: {goal}").save(sheet)
-    pictures = (film_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo) for f in frames)
-    write_film(pictures, film)
-    return sheet, film
+    images = (video_frame((f.front, f.wrist), f.subgoals["simple_subgoal_online"], f.is_demo) for f in frames)
+    write_video(images, video)
+    return sheet, video
 
 
 SIDE_FILE = "meta/robomme_episodes.json"  # what LeRobot's columns have no place for: task, seed, difficulty, …
@@ -133,7 +133,7 @@ class ConvertOptions:
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
     """The dataset's columns, spelt as `options.names` says."""
     tool = [*POSE, "gripper"]
-    chosen = [CHOICE_ACTIONS] if options.choices else []
+    choice_columns = [CHOICE_ACTIONS] if options.choices else []
     joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
     kind = "video" if options.images == "video" else "image"
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
@@ -144,12 +144,15 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
         **({POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}} if options.tool_pose else {}),
-        **{name: {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS} for name in chosen},
+        **{
+            name: {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS}
+            for name in choice_columns
+        },
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
         **{name: {"dtype": "string", "shape": (1,), "names": None} for name in SUBGOALS},
-        **{f"{c}{DRAWN}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
+        **{f"{c}{RENDERED_SUFFIX}": {"dtype": "bool", "shape": (1,), "names": None} for c in CAMERAS if options.partly},
     }
     return _spelt(columns, options)
 
@@ -171,9 +174,9 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     """
     if not episodes:
         raise UserError("There is no episode to convert.")
-    kept: dict[str, Any] = {"poses": pose_columns(episodes), "choices": all_have_choices(episodes)}
-    kept["tool_pose"] = all_have_poses(episodes)
-    options = replace(options or ConvertOptions(), partly=any_chosen_frames(episodes), **kept)
+    content: dict[str, Any] = {"poses": pose_columns(episodes), "choices": all_have_choices(episodes)}
+    content["tool_pose"] = all_have_poses(episodes)
+    options = replace(options or ConvertOptions(), partly=any_selected_frames(episodes), **content)
     plan = _plan(episodes, options)
     partial = _work_folder(output)
     if _finished(output, plan) and not partial.exists():
@@ -347,7 +350,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
             **{name: rows[step] for name, rows in tool.items()},
             **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
             **frame.subgoals,
-            **{f"{c}{DRAWN}": np.array([c in frame.drawn]) for c in CAMERAS if options.partly},
+            **{f"{c}{RENDERED_SUFFIX}": np.array([c in frame.rendered]) for c in CAMERAS if options.partly},
             "task": goal,
         }
         dataset.add_frame(_spelt(row, options))

@@ -100,9 +100,9 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         self.caches = list(caches) if memory is not None and caches is not None else []
         self.action_offset, self.mask_padding = action_offset, mask_padding
         self.jitter, self.subgoal, self.seed, self.epoch = jitter, subgoal, seed, 0
-        chosen = [np.arange(len(source)) for source in sources] if episodes is None else episodes
-        self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(chosen)]).astype(np.int64)
-        self._episode = np.concatenate([np.asarray(part, np.int64) for part in chosen])
+        selected = [np.arange(len(source)) for source in sources] if episodes is None else episodes
+        self._source = np.concatenate([np.full(len(part), i) for i, part in enumerate(selected)]).astype(np.int64)
+        self._episode = np.concatenate([np.asarray(part, np.int64) for part in selected])
         pairs = zip(self._source, self._episode, strict=True)
         self._ends = np.cumsum([len(self.decisions(int(s), int(e))) for s, e in pairs], dtype=np.int64)
         if not self.steps:
@@ -190,13 +190,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         step = self.step(index)
         rng = np.random.default_rng([self.seed, self.epoch, index])
-        return self.seen(step, rng) | {
+        return self.inputs_at(step, rng) | {
             "goal": step.goal,
             "subgoals": step.subgoals,
             "place": (step.source, step.episode, step.index),
         }
 
-    def seen(self, step: Step, rng: np.random.Generator) -> dict[str, Any]:
+    def inputs_at(self, step: Step, rng: np.random.Generator) -> dict[str, Any]:
         """What the network reads and learns of a step, with what its memory selects: its `history` and `past`."""
         subgoal = None if self.subgoal is None else self.subgoal(step.subgoals, rng)
         item = self.processor.item(self._sample(step, subgoal))
@@ -208,16 +208,16 @@ class TrainingDataset(Dataset[dict[str, Any]]):
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
             item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
-            if self.memory.looks_back is not None:
-                read = partial(self._pictures, step.source, step.episode)
-                item["past"] = past_views(self.memory.looks_back, step.index, read, self.processor.images)
+            if self.memory.past_view_spec is not None:
+                read = partial(self._images, step.source, step.episode)
+                item["past"] = past_views(self.memory.past_view_spec, step.index, read, self.processor.images)
         return item
 
-    def _pictures(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:
+    def _images(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:
         return [self.sources[source].frames(episode, frames, name) for name in self.processor.cameras]
 
     def _motion(self, source: int, episode: int, frames: np.ndarray) -> Tensor:
-        return self.processor.motion(*self.sources[source].own_motion(episode, frames, self.action_offset))
+        return self.processor.motion(*self.sources[source].robot_motion(episode, frames, self.action_offset))
 
     def _sample(self, step: Step, subgoal: str | None) -> Sample:
         """A step with the frames of its window; before the episode's first frame that one is repeated."""
@@ -280,7 +280,7 @@ class GroupDataset(TrainingDataset):
     def _group(self, s: int, episode: int, frames: np.ndarray, rng: np.random.Generator) -> dict[str, Any]:
         steps = [self.step_at(s, episode, int(frame)) for frame in frames]
         return {
-            "moments": [self.seen(step, rng) for step in steps],
+            "moments": [self.inputs_at(step, rng) for step in steps],
             "times": frames.astype(np.int64),
             "goal": steps[-1].goal,
             "subgoals": steps[-1].subgoals,

@@ -16,7 +16,7 @@ import numpy as np
 
 from mme_vla.data.hdf5_episode import SUBGOALS
 from mme_vla.data.lerobot_files import (
-    DRAWN,
+    RENDERED_SUFFIX,
     SAMPLE,
     content_fingerprint,
     find_columns,
@@ -74,17 +74,17 @@ class EpisodeSource:
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
         info = read_info(self.root)
         features = info["features"]
-        found = find_columns(self.root, features, robot)
-        self.state_names = names_of([features[column] for column in found.state])
-        action_names = names_of([features[column] for column in found.action])
+        matches = find_columns(self.root, features, robot)
+        self.state_names = names_of([features[column] for column in matches.state])
+        action_names = names_of([features[column] for column in matches.action])
         self.robot = replace(robot, action=robot.action.with_names(action_names))
-        columns, self.columns = list(found.tables), found.cameras
+        columns, self.columns = list(matches.tables), matches.cameras
         self.fps = float(info["fps"])
         if robot.fps is not None and robot.fps != self.fps:
             log.warning("%s has %g frames per second; the robot %s has %g.", self.name, self.fps, robot.name, robot.fps)
         self._vectors_of = {
             kind: {name: width_of(features[name]) for name in names}
-            for kind, names in (("state", found.state), ("action", found.action), ("pose", found.pose))
+            for kind, names in (("state", matches.state), ("action", matches.action), ("pose", matches.pose))
         }
         self._motions: dict[int, Motions] = {}
         videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
@@ -105,8 +105,10 @@ class EpisodeSource:
         for vectors in self._vectors_of.values():
             for name, width in vectors.items():
                 check_vectors(self.root, self._table, name, width)
-        self._drawn = {
-            name: self._column(f"{name}{DRAWN}").astype(bool) for name in self.columns if f"{name}{DRAWN}" in columns
+        self._rendered = {
+            name: self._column(f"{name}{RENDERED_SUFFIX}").astype(bool)
+            for name in self.columns
+            if f"{name}{RENDERED_SUFFIX}" in columns
         }
         self.exec_starts = self._read_exec_starts(columns, None if exec_starts is None else Path(exec_starts))
 
@@ -132,10 +134,10 @@ class EpisodeSource:
         side = self.root / SIDE_FILE
         if not side.exists() and not side.is_symlink():
             return []
-        found = read_json(side, "what is known of a dataset's episodes").get("episodes")
-        if not isinstance(found, list) or not all(isinstance(record, dict) for record in found):
+        records = read_json(side, "what is known of a dataset's episodes").get("episodes")
+        if not isinstance(records, list) or not all(isinstance(record, dict) for record in records):
             raise UserError(f"{side} holds no list of episodes. {REMEDY}")
-        return found
+        return records
 
     def locate(self, row: int) -> tuple[int, int]:
         """The episode and the frame in it of a row of the tables; LeRobot calls the row `index`."""
@@ -211,22 +213,22 @@ class EpisodeSource:
         first, length = int(self.exec_starts[episode]), int(self.lengths[episode])
         motions = self.robot.action.frames is None
         decided = self._motions_of(episode).decisions if motions else range(first, length)
-        if not self._drawn:
+        if not self._rendered:
             return decided
-        seen = np.logical_and.reduce([self.drawn(episode, name) for name in self.columns])
+        rendered = np.logical_and.reduce([self.rendered(episode, name) for name in self.columns])
         decided = np.asarray(decided)
-        return decided[seen[decided]]
+        return decided[rendered[decided]]
 
-    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+    def rendered(self, episode: int, camera: str | None = None) -> np.ndarray:
         """Which frames of an episode show what was seen, bool [t]; by default of the camera that feeds memory.
 
         All, unless the dataset was recorded at a choice of frames; the pictures of others are placeholders.
         """
         camera = self.robot.memory_camera if camera is None else camera
         start, length = int(self._starts[episode]), int(self.lengths[episode])
-        if camera not in self._drawn:
+        if camera not in self._rendered:
             return np.ones(length, bool)
-        return self._drawn[camera][start : start + length]
+        return self._rendered[camera][start : start + length]
 
     def action_chunk(self, episode: int, start: int, horizon: int, offset: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """The chunk decided at frame `start`, the last action repeated past the episode's end (differences are 0).
@@ -258,7 +260,7 @@ class EpisodeSource:
             return np.zeros((0, self.robot.action.width), np.float32)
         return self.actions(episode, first, stop)
 
-    def own_motion(self, episode: int, frames: np.ndarray, offset: int = 0) -> tuple[np.ndarray, ...]:
+    def robot_motion(self, episode: int, frames: np.ndarray, offset: int = 0) -> tuple[np.ndarray, ...]:
         """What the robot felt and did at frames [n] of an episode.
 
         Returns:
@@ -267,9 +269,9 @@ class EpisodeSource:
             action is a motion of many frames.
         """
         stop = int(np.max(frames, initial=0)) + 1
-        own = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
+        is_known = (frames > self.exec_starts[episode]) & (self.robot.action.frames is not None)
         led = np.clip(frames - 1 + offset, 0, stop - 1)
-        return self.states(episode, 0, stop)[frames], self.actions(episode, 0, stop)[led], own
+        return self.states(episode, 0, stop)[frames], self.actions(episode, 0, stop)[led], is_known
 
     def _motions_of(self, episode: int) -> Motions:
         if episode not in self._motions:
@@ -297,10 +299,10 @@ class EpisodeSource:
         camera = self.robot.memory_camera if camera is None else camera
         if camera not in self.columns:
             raise UserError(f"{self.name} has no camera {camera!r}. {did_you_mean(camera, self.columns)}")
-        if not (drawn := self.drawn(episode, camera)[indices]).all():
+        if not (rendered := self.rendered(episode, camera)[indices]).all():
             raise UserError(
-                f"{self.name}, episode {episode}: {camera} was not drawn at frames {indices[~drawn].tolist()[:5]}. It "
-                "was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
+                f"{self.name}, episode {episode}: {camera} was not drawn at frames {indices[~rendered].tolist()[:5]}. "
+                "It was recorded at a choice of frames: record it again with frames=… that holds these, or frames=all."
             )
         if camera in self._videos:
             path, offset = self._videos[camera].locate(episode)

@@ -21,7 +21,7 @@ _UNMARKED = replace(ROBOMME_JOINT, conditioning_video=False)
 
 
 @dataclass(frozen=True)
-class Marked:
+class AnnotatedEpisode:
     """A recorded episode that says where its video ends.
 
     goals: its wordings, lower-case. joints: [t, 7] radians. start: the first execution frame.
@@ -32,52 +32,52 @@ class Marked:
     start: int
 
 
-def marked_episodes(inputs: Sequence[str | Path]) -> list[Marked]:
+def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
     """All episodes, in order, of official HDF5 files or folders of them, and of LeRobot datasets that mark the video.
 
     Raises:
         UserError: an input is neither, or a file is damaged.
     """
-    found: list[Marked] = []
-    for given in inputs:
-        marked = _of_dataset(Path(given)) if (Path(given) / "meta").is_dir() else _of_files(given)
-        found += marked
-    return found
+    episodes: list[AnnotatedEpisode] = []
+    for path in inputs:
+        annotated = _of_dataset(Path(path)) if (Path(path) / "meta").is_dir() else _of_files(path)
+        episodes += annotated
+    return episodes
 
 
-def _of_dataset(root: Path) -> Iterator[Marked]:
+def _of_dataset(root: Path) -> Iterator[AnnotatedEpisode]:
     source = EpisodeSource(root)
     for episode in range(len(source)):
         joints = source.states(episode)[:, :ARM_JOINTS]
-        yield Marked((source.goal(episode),), joints, int(source.exec_starts[episode]))
+        yield AnnotatedEpisode((source.goal(episode),), joints, int(source.exec_starts[episode]))
 
 
-def _of_files(given: str | Path) -> Iterator[Marked]:
-    for ref in list_episodes(find_files([given])):
+def _of_files(path: str | Path) -> Iterator[AnnotatedEpisode]:
+    for ref in list_episodes(find_files([path])):
         with open_episode(ref) as episode:
-            yield Marked(tuple(episode.goals), episode.joints()[0].astype(np.float32), episode.exec_start)
+            yield AnnotatedEpisode(tuple(episode.goals), episode.joints()[0].astype(np.float32), episode.exec_start)
 
 
-def first_frames(dataset: str | Path, marked: Sequence[Marked]) -> list[int]:
+def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> list[int]:
     """The first execution frame of every episode of a dataset that does not mark its videos.
 
     Raises:
         UserError: an episode is not among the marked ones, or two of these fit it that differ.
     """
     source = EpisodeSource(dataset, robot=_UNMARKED)
-    return [_start_of(source, episode, marked) for episode in range(len(source))]
+    return [_start_of(source, episode, annotated) for episode in range(len(source))]
 
 
-def _start_of(source: EpisodeSource, episode: int, marked: Sequence[Marked]) -> int:
+def _start_of(source: EpisodeSource, episode: int, annotated: Sequence[AnnotatedEpisode]) -> int:
     goal, joints = source.goal(episode), source.states(episode)[:, :ARM_JOINTS]
-    alike = [one for one in marked if len(one.joints) == len(joints) and goal in one.goals]
+    alike = [one for one in annotated if len(one.joints) == len(joints) and goal in one.goals]
     apart = [float(np.abs(one.joints - joints).mean()) for one in alike]
     nearest = min(apart, default=np.inf)
-    starts = sorted({one.start for one, far in zip(alike, apart, strict=True) if far <= nearest + 1e-6})
+    starts = sorted({one.start for one, distance in zip(alike, apart, strict=True) if distance <= nearest + 1e-6})
     if nearest > NEAR:
         near = f"the nearest is {nearest:.2f} rad away" if alike else "none has its goal and length"
         raise UserError(
-            f"{source.root}, episode {episode} ({goal!r}, {len(joints)} frames) is not among the {len(marked)} "
+            f"{source.root}, episode {episode} ({goal!r}, {len(joints)} frames) is not among the {len(annotated)} "
             f"episodes given: {near}. Give the recordings that the dataset was made from, all of them."
         )
     if len(starts) > 1:

@@ -19,8 +19,8 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
     """
     files: set[Path] = set()
     for entry in map(Path, inputs):
-        found = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
-        if not found or not all(path.is_file() for path in found):
+        matches = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
+        if not matches or not all(path.is_file() for path in matches):
             advice = "give record_dataset_<Task>.h5 files or their folder."
             if (entry / "meta" / "info.json").is_file():
                 advice = (
@@ -28,7 +28,7 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
                     "such as keyframes, needs the HDF5 files: `mme-vla record` writes them with hdf5=…"
                 )
             raise UserError(f"No HDF5 file at {str(entry)!r}: {advice}")
-        files.update(found)
+        files.update(matches)
     return sorted(files, key=lambda path: (path.name, str(path)))
 
 
@@ -52,11 +52,11 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
 def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
     """The columns of `POSE_ACTIONS` that every one of these episodes has."""
     files = {file: [ref.group for ref in refs if ref.file == file] for file in dict.fromkeys(ref.file for ref in refs)}
-    found = set(POSE_ACTIONS)
+    columns = set(POSE_ACTIONS)
     for file, groups in files.items():
         with _open(file) as handle:
-            found = {n for n in found if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
-    return tuple(name for name in POSE_ACTIONS if name in found)
+            columns = {n for n in columns if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
+    return tuple(name for name in POSE_ACTIONS if name in columns)
 
 
 def all_have_poses(refs: Sequence[EpisodeRef]) -> bool:
@@ -78,7 +78,7 @@ def all_have_choices(refs: Sequence[EpisodeRef]) -> bool:
     return True
 
 
-def any_chosen_frames(refs: Sequence[EpisodeRef]) -> bool:
+def any_selected_frames(refs: Sequence[EpisodeRef]) -> bool:
     """Whether one of these episodes was drawn at a choice of its frames only."""
     for file in dict.fromkeys(ref.file for ref in refs):
         with _open(file) as handle:

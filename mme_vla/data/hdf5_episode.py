@@ -53,29 +53,29 @@ class StoredValues:
             stored = h5d.open(self._group.id, name.encode())
             if stored.get_space().get_simple_extent_type() == h5s.NULL:
                 return Empty(stored.dtype)
-            found = np.empty(stored.shape, stored.dtype)
-            stored.read(h5s.ALL, h5s.ALL, found)
-            return found[()]
+            array = np.empty(stored.shape, stored.dtype)
+            stored.read(h5s.ALL, h5s.ALL, array)
+            return array[()]
 
     def _numbers(self, step: int, name: str, least: int, finite: bool = True) -> np.ndarray:
         """A list of at least `least` numbers, finite unless told otherwise."""
-        found = np.atleast_1d(np.asarray(self._step(step, name)))
-        right = found.dtype.kind in "fiu" and found.ndim == 1 and len(found) >= least
-        if not right or (finite and not np.isfinite(found).all()):
+        numbers = np.atleast_1d(np.asarray(self._step(step, name)))
+        right = numbers.dtype.kind in "fiu" and numbers.ndim == 1 and len(numbers) >= least
+        if not right or (finite and not np.isfinite(numbers).all()):
             raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected at "
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(numbers.tolist())}; expected at "
                 f"least {least} {'finite ' if finite else ''}numbers. {REMEDY}"
             )
-        return found
+        return numbers
 
     def _flag(self, step: int, name: str) -> bool:
-        found = np.asarray(self._step(step, name))
-        if found.size != 1 or found.dtype.kind not in "biu":
+        flag = np.asarray(self._step(step, name))
+        if flag.size != 1 or flag.dtype.kind not in "biu":
             raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(found.tolist())}; expected a "
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {brief(flag.tolist())}; expected a "
                 f"flag. {REMEDY}"
             )
-        return bool(found.reshape(-1)[0])
+        return bool(flag.reshape(-1)[0])
 
     def _text(self, value: Any) -> str:
         if not isinstance(value, bytes | str):
@@ -95,7 +95,7 @@ CHOICES = ("setup/available_multi_choices", "timestep_0/action/choice_action", "
 """What an episode has whose options and choices were recorded."""
 FRAMES = "setup/frames"
 """Where a file keeps the choice of frames it was recorded at, as JSON, if not all were drawn."""
-_PICTURES = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
+_IMAGE_KEYS = {camera: f"obs/{camera}_rgb" for camera in CAMERAS}
 _REQUIRED = (
     "obs/joint_state", "obs/gripper_state", "action/joint_action", "info/is_video_demo", "info/is_completed",
     *(f"info/{name}" for name in SUBGOALS),
@@ -120,7 +120,7 @@ class RawFrame:
     action: np.ndarray
     is_demo: bool
     subgoals: dict[str, str]
-    drawn: frozenset[str] = frozenset(CAMERAS)
+    rendered: frozenset[str] = frozenset(CAMERAS)
 
 
 class RawEpisode(StoredValues):
@@ -138,8 +138,8 @@ class RawEpisode(StoredValues):
         self.length = len(steps)
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
             # A recording at a chosen list of frames has pictures at these alone.
-            pictures = () if FRAMES in group else _PICTURES.values()
-            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*pictures, *_REQUIRED)))
+            image_keys = () if FRAMES in group else _IMAGE_KEYS.values()
+            needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*image_keys, *_REQUIRED)))
             missing = [name for name in needed if name not in group]
         if missing:
             raise UserError(f"{ref.file} {ref.group} lacks {', '.join(missing)}: not the layout of RoboMME's recorder.")
@@ -148,20 +148,20 @@ class RawEpisode(StoredValues):
         if demo[self.exec_start :].any() or self.exec_start == self.length:
             raise UserError(f"{ref.file} {ref.group}: video frames must come first, then at least one execution frame.")
 
-    def _picture(self, step: int, camera: str) -> np.ndarray:
-        name = _PICTURES[camera]
-        if self.frames is not None and not self.drawn[camera][step]:
+    def _image(self, step: int, camera: str) -> np.ndarray:
+        name = _IMAGE_KEYS[camera]
+        if self.frames is not None and not self.rendered[camera][step]:
             raise UserError(
                 f"{self.ref.file} {self.ref.group}: {camera} was not drawn at step {step}; the episode was recorded "
                 f"with frames={self.frames['at']}."
             )
-        found = np.asarray(self._step(step, name))
-        if found.dtype != np.uint8 or found.ndim != 3 or found.shape[-1] != 3:
+        image = np.asarray(self._step(step, name))
+        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[-1] != 3:
             raise UserError(
-                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {found.dtype} {list(found.shape)}; "
+                f"{self.ref.file} {self.ref.group}/timestep_{step}/{name} holds {image.dtype} {list(image.shape)}; "
                 f"expected uint8 [height, width, 3]. {REMEDY}"
             )
-        return found
+        return image
 
     @property
     def goals(self) -> list[str]:
@@ -175,10 +175,10 @@ class RawEpisode(StoredValues):
     def seed(self) -> int | None:
         if "setup/seed" not in self._group:
             return None
-        found = np.asarray(self._value("setup/seed"))
-        if found.size != 1 or found.dtype.kind not in "iu":
-            raise UserError(f"{self.ref.file} {self.ref.group}/setup/seed is {brief(found.tolist())}. {REMEDY}")
-        return int(found.reshape(-1)[0])
+        value = np.asarray(self._value("setup/seed"))
+        if value.size != 1 or value.dtype.kind not in "iu":
+            raise UserError(f"{self.ref.file} {self.ref.group}/setup/seed is {brief(value.tolist())}. {REMEDY}")
+        return int(value.reshape(-1)[0])
 
     @property
     def difficulty(self) -> str | None:
@@ -192,19 +192,19 @@ class RawEpisode(StoredValues):
         """The choice of frames it was recorded at; None for one that was drawn whole."""
         if FRAMES not in self._group:
             return None
-        found: dict[str, Any] = parse_json(
+        settings: dict[str, Any] = parse_json(
             self._text(self._value(FRAMES)), f"{self.ref.file} {self.ref.group}/{FRAMES}"
         )
-        return found
+        return settings
 
     @cached_property
-    def drawn(self) -> dict[str, np.ndarray]:
+    def rendered(self) -> dict[str, np.ndarray]:
         """Which steps each camera shows, bool [t]."""
         if self.frames is None:
             return {camera: np.ones(self.length, bool) for camera in CAMERAS}
         return {
             camera: np.array([f"timestep_{k}/{name}" in self._group for k in range(self.length)])
-            for camera, name in _PICTURES.items()
+            for camera, name in _IMAGE_KEYS.items()
         }
 
     def subgoals(self) -> Iterator[dict[str, str]]:
@@ -270,12 +270,12 @@ class RawEpisode(StoredValues):
             UserError: the file holds something else.
         """
         place = f"{self.ref.file} {self.ref.group}/{CHOICES[0]}"
-        given = parse_json(self._text(self._value(CHOICES[0])), place, list)
+        values = parse_json(self._text(self._value(CHOICES[0])), place, list)
         try:
-            found = read_options(given, len(LETTERS))
+            options = read_options(values, len(LETTERS))
         except UserError as error:
             raise UserError(f"{place}: {error} {REMEDY}") from None
-        return [option.to_dict() for option in found]
+        return [option.to_dict() for option in options]
 
     def shot(self, step: int, camera: str) -> dict[str, np.ndarray]:
         """What a camera (`front`, `wrist`) recorded at a step, and where it stood.
@@ -287,24 +287,24 @@ class RawEpisode(StoredValues):
         Raises:
             UserError: the episode holds no depth or no poses of cameras, or something else in their place.
         """
-        colours = self._picture(step, camera)
+        colours = self._image(step, camera)
         parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",
                  "extrinsic": f"timestep_{step}/obs/{camera}_camera_extrinsic"}  # fmt: skip
         missing = [name for name in parts.values() if name not in self._group]
         if missing:
             raise UserError(f"{self.ref.file} {self.ref.group} lacks {', '.join(missing)}: record it with depth.")
-        found = {name: np.asarray(self._value(place)) for name, place in parts.items()}
-        found["depth"] = found["depth"].reshape(found["depth"].shape[:2])
+        arrays = {name: np.asarray(self._value(place)) for name, place in parts.items()}
+        arrays["depth"] = arrays["depth"].reshape(arrays["depth"].shape[:2])
         shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
         for name, shape in shapes.items():
-            numbers = found[name].dtype.kind in "fiu" and np.isfinite(found[name]).all()
-            if found[name].shape != shape or not numbers:
+            numbers = arrays[name].dtype.kind in "fiu" and np.isfinite(arrays[name]).all()
+            if arrays[name].shape != shape or not numbers:
                 raise UserError(
-                    f"{self.ref.file} {self.ref.group}/{parts[name]} holds {found[name].dtype} "
-                    f"{list(found[name].shape)}; expected {list(shape)} finite numbers. {REMEDY}"
+                    f"{self.ref.file} {self.ref.group}/{parts[name]} holds {arrays[name].dtype} "
+                    f"{list(arrays[name].shape)}; expected {list(shape)} finite numbers. {REMEDY}"
                 )
         kinds = {"depth": np.float32, "intrinsic": np.float64, "extrinsic": np.float64}
-        return {"colours": colours, **{name: found[name].astype(kind) for name, kind in kinds.items()}}
+        return {"colours": colours, **{name: arrays[name].astype(kind) for name, kind in kinds.items()}}
 
     def commanded_open(self, step: int) -> bool:
         """Whether the gripper's command at a step is to be open."""
@@ -312,20 +312,20 @@ class RawEpisode(StoredValues):
 
     def front(self, step: int) -> np.ndarray:
         """The front picture of one step, [H, W, 3] uint8."""
-        return self._picture(step, "front")
+        return self._image(step, "front")
 
     def __iter__(self) -> Iterator[RawFrame]:
-        for camera, drawn in self.drawn.items():
-            if not drawn.any():
+        for camera, rendered in self.rendered.items():
+            if not rendered.any():
                 raise UserError(f"{self.ref.file} {self.ref.group} has no picture of the camera {camera!r}. {REMEDY}")
-        held = {camera: self._picture(int(drawn.argmax()), camera) for camera, drawn in self.drawn.items()}
+        latest = {camera: self._image(int(rendered.argmax()), camera) for camera, rendered in self.rendered.items()}
         for k, subgoals in enumerate(self.subgoals()):
             fingers = self._numbers(k, "obs/gripper_state", 1)
-            now = frozenset(camera for camera, drawn in self.drawn.items() if drawn[k])
-            held |= {camera: self._picture(k, camera) for camera in now}
+            now = frozenset(camera for camera, rendered in self.rendered.items() if rendered[k])
+            latest |= {camera: self._image(k, camera) for camera in now}
             yield RawFrame(
-                **held,
-                drawn=now,
+                **latest,
+                rendered=now,
                 state=np.concatenate([self._numbers(k, "obs/joint_state", 7), fingers[:1]]).astype(np.float32),
                 action=self._numbers(k, "action/joint_action", 8),
                 is_demo=k < self.exec_start,

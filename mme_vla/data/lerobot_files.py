@@ -16,7 +16,7 @@ from mme_vla.errors import UserError, brief, listed
 from mme_vla.utils import decoding, inside, read_json, require_file
 
 OPTIONAL = ("is_demo", "exec_start_idx", *SUBGOALS)
-DRAWN = "_drawn"
+RENDERED_SUFFIX = "_drawn"
 """After a camera's name: the column that says which frames it was drawn at, where not at all."""
 NAMES: Mapping[str, Mapping[str, str]] = {
     "robomme": {},
@@ -28,7 +28,7 @@ NAMES: Mapping[str, Mapping[str, str]] = {
     },
 }
 """Spellings of a dataset's columns, each by how it differs from the released datasets'."""
-_USUAL = {"state": ("observation.state",), "action": ("action", "actions")}
+_DEFAULT_COLUMNS = {"state": ("observation.state",), "action": ("action", "actions")}
 
 
 @dataclass(frozen=True)
@@ -52,18 +52,18 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     Raises:
         UserError: a feature is absent, or the numbers are more or fewer than the robot's; `root` is for the message.
     """
-    found = {
+    matches = {
         **{camera.name: _first(_spellings_of(camera), features) for camera in robot.cameras},
         **{key: _first((key, f"observation.{key}"), features) for key in robot.state.key},
         **{key: _first((key, *_also(key)), features) for key in robot.action.key},
         **{key: _first((key, f"observation.{key}"), features) for key in robot.action.pose_key},
     }
     if not robot.state.key:
-        found["state"] = _first(("observation.state", "state"), features)
+        matches["state"] = _first(("observation.state", "state"), features)
     if not robot.action.key:
-        found["action"] = _first(("action", "actions"), features)
+        matches["action"] = _first(("action", "actions"), features)
     keys = {camera.name: camera.key or camera.name for camera in robot.cameras}
-    missing = [keys.get(name, name) for name, column in found.items() if column is None]
+    missing = [keys.get(name, name) for name, column in matches.items() if column is None]
     if missing:
         raise UserError(
             f"{root} lacks the feature{'s'[: len(missing) > 1]} {', '.join(missing)}; it has {listed(features)}. "
@@ -71,7 +71,7 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
             "name its columns in a configs/embodiment file of your own. (RoboMME's poses and waypoints are columns of "
             "datasets that this library converts or records.)"
         )
-    columns = {name: str(column) for name, column in found.items()}
+    columns = {name: str(column) for name, column in matches.items()}
     cameras = {name: columns[name] for name in robot.camera_names}
     for name, column in cameras.items():
         if features[column]["dtype"] not in ("image", "video"):
@@ -87,7 +87,7 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     if pose:
         _check_width(root, "tool's pose", pose, features, POSE_WIDTH, robot)
     tables = ["episode_index", *state, *action, *pose, *(name for name in OPTIONAL if name in features)]
-    tables += [f"{name}{DRAWN}" for name in cameras if f"{name}{DRAWN}" in features]
+    tables += [f"{name}{RENDERED_SUFFIX}" for name in cameras if f"{name}{RENDERED_SUFFIX}" in features]
     tables += [column for column in cameras.values() if features[column]["dtype"] == "image"]
     return Columns(cameras, state, action, pose, tuple(dict.fromkeys(tables)))
 
@@ -120,7 +120,7 @@ def _spellings_of(camera: Camera) -> list[str]:
 
 
 def _also(key: str) -> tuple[str, ...]:
-    return tuple(name for name in _USUAL["action"] if key in _USUAL["action"] and name != key)
+    return tuple(name for name in _DEFAULT_COLUMNS["action"] if key in _DEFAULT_COLUMNS["action"] and name != key)
 
 
 def _first(names: Iterable[str], features: Mapping[str, Any]) -> str | None:
@@ -222,8 +222,8 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
     )
     require_file(file, "exec_starts, first execution frames")
     if file.suffix == ".json":
-        found = list(read_json(file, "first execution frames").items())
-        pairs = [(int(key) if key.isdecimal() and len(key) < 10 else key, value) for key, value in found]
+        entries = list(read_json(file, "first execution frames").items())
+        pairs = [(int(key) if key.isdecimal() and len(key) < 10 else key, value) for key, value in entries]
     else:
         import pyarrow.parquet as pq
 

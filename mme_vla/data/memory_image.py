@@ -24,12 +24,12 @@ def memory_sheet(
     """
     counts = np.bincount(selected[:, 0], minlength=len(frames))
     remembered = np.flatnonzero(counts)
-    shown = remembered
+    displayed = remembered
     if len(remembered) > MOST:  # the first frame, and those of which most is kept
         fullest = remembered[np.argsort(-counts[remembered], kind="stable")[:MOST]]
-        shown = np.unique(np.append(fullest, remembered[0]))[:MOST]
+        displayed = np.unique(np.append(fullest, remembered[0]))[:MOST]
     tiles = []
-    for frame in shown.tolist():
+    for frame in displayed.tolist():
         patches = selected[selected[:, 0] == frame, 1]
         kind, colour = ("video", VIDEO) if frame < exec_start else ("execution", EXECUTION)
         label = f"{frame} {kind} {len(patches)}/{grid**2}"
@@ -38,7 +38,7 @@ def memory_sheet(
     header = Image.new("RGB", (max(min(COLUMNS, len(tiles)), 6) * (TILE + GAP) - GAP, TIMELINE + 2 * LABEL), "white")
     draw = ImageDraw.Draw(header)
     _timeline(draw, counts, grid**2, exec_start, step, (0, 0, header.width, TIMELINE))
-    hidden = len(remembered) - len(shown)
+    hidden = len(remembered) - len(displayed)
     note = "In colour: remembered patches. Dimmed: the rest of those frames."
     note += f" {hidden} more frames are remembered in part." if hidden else ""
     draw.text((0, header.height - LABEL - 4), note, FAINT, font(13))
@@ -47,12 +47,12 @@ def memory_sheet(
 
 def _highlighted(frame: np.ndarray, patches: np.ndarray, grid: int) -> Image.Image:
     """The frame, bright in the remembered patches and outlined around them."""
-    picture = thumbnail(frame)
+    image = thumbnail(frame)
     mask = np.isin(np.arange(grid**2), patches).reshape(grid, grid)
     large = Image.fromarray(mask.astype(np.uint8) * 255).resize((TILE, TILE), Image.Resampling.NEAREST)
-    grey = picture.convert("L").convert("RGB")
+    grey = image.convert("L").convert("RGB")
     dimmed = Image.blend(grey, Image.new("RGB", grey.size, "white"), 0.62)
-    tile = Image.composite(picture, dimmed, large)
+    tile = Image.composite(image, dimmed, large)
     draw = ImageDraw.Draw(tile)
     edge = np.linspace(0, TILE, grid + 1).round().astype(int)
     padded = np.pad(mask, 1)

@@ -65,11 +65,11 @@ def compute_norm_stats(
 
 def _of_letters(stats: QuantileStats, letters: list[int]) -> QuantileStats:
     """Statistics in which these numbers go from 0 to 1: a letter that is seldom chosen would else have no range."""
-    found = stats.to_dict()
+    values = stats.to_dict()
     for name, value in {"q01": 0.0, "q99": 1.0, "min": 0.0, "max": 1.0}.items():
-        for place in letters if name in found else ():
-            found[name][place] = value
-    return QuantileStats.from_dict(found)
+        for place in letters if name in values else ():
+            values[name][place] = value
+    return QuantileStats.from_dict(values)
 
 
 def _counted_steps(sources: Sequence[EpisodeSource], episodes: Sequence[np.ndarray] | None, video: bool) -> np.ndarray:

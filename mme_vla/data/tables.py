@@ -17,7 +17,11 @@ from mme_vla.utils import decoding, inside, require_file
 
 REMEDY = "Copy, download or convert the dataset again."
 _MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
-_WHOLE = ("episode_index", "is_demo", "exec_start_idx")  # columns of whole numbers or flags, whatever is announced
+_INTEGER_COLUMNS = (
+    "episode_index",
+    "is_demo",
+    "exec_start_idx",
+)  # columns of whole numbers or flags, whatever is announced
 _FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
 
 
@@ -42,10 +46,10 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
     """
     import pyarrow as pa
 
-    whole = ["episode_index", "dataset_from_index", "dataset_to_index"]
+    integers = ["episode_index", "dataset_from_index", "dataset_to_index"]
     places = {f"{view}/{key}": f"videos/{view}/{key}" for view in video_views for key in ("chunk_index", "file_index")}
     times = {f"{view}/from_timestamp": f"videos/{view}/from_timestamp" for view in video_views}
-    kinds = dict.fromkeys([*whole, *places.values()], pa.types.is_integer)
+    kinds = dict.fromkeys([*integers, *places.values()], pa.types.is_integer)
     kinds |= dict.fromkeys(times.values(), pa.types.is_floating)
     tables = [_read_columns(file, {**kinds, "tasks": _is_list}) for file in parquet_files(root, "meta/episodes")]
     meta = root / "meta" / "episodes"
@@ -74,7 +78,7 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
     for name in times.values():
         if not np.isfinite(columns[name]).all() or (columns[name] < 0).any():
             raise UserError(f"{meta}: {name} holds a time that is no number of seconds from 0. {REMEDY}")
-    named = {ours: columns[theirs] for ours, theirs in {**places, **times}.items()}
+    named = {name: columns[column] for name, column in {**places, **times}.items()}
     return {"starts": starts, "lengths": stops - starts, "goals": [str(goal).lower() for goal in goals], **named}
 
 
@@ -88,13 +92,13 @@ def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> 
     from lerobot.utils.utils import SuppressProgressBars
 
     with decoding(root / "meta" / "info.json", "a description of features", REMEDY):
-        wanted = Features({name: _kind(**features[name]) for name in columns})
+        target = Features({name: _kind(**features[name]) for name in columns})
     large = any(features[name]["dtype"] == "image" for name in columns)
     files = parquet_files(root, "data")
     for file in files:
         _check_schema(file, columns, features)
     with decoding(root / "data", "tables of frames", REMEDY), nullcontext() if large else SuppressProgressBars():
-        table = Dataset.from_parquet([str(file) for file in files], columns=list(columns), features=wanted)
+        table = Dataset.from_parquet([str(file) for file in files], columns=list(columns), features=target)
     return table.with_format("arrow")
 
 
@@ -131,8 +135,8 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
             wrong = ~np.isfinite(values).all(axis=1)
         if wrong.any():
             row = int(np.flatnonzero(wrong)[0])
-            found = brief(chunk[row].as_py())
-            raise UserError(f"{root}: row {first + row} has {name} {found}; expected {width} finite numbers. {REMEDY}")
+            value = brief(chunk[row].as_py())
+            raise UserError(f"{root}: row {first + row} has {name} {value}; expected {width} finite numbers. {REMEDY}")
         first += len(chunk)
 
 
@@ -181,21 +185,21 @@ def _check_schema(file: Path, columns: Sequence[str], features: dict[str, Any]) 
     with decoding(file, "a table of frames", REMEDY), pq.ParquetFile(file) as opened:
         schema = opened.schema_arrow
     for name in columns:
-        found = schema.field(name).type if name in schema.names else None
-        inner = found.value_type if found is not None and _is_list(found) else found
+        kind = schema.field(name).type if name in schema.names else None
+        inner = kind.value_type if kind is not None and _is_list(kind) else kind
         if features[name]["dtype"] == "image":
-            right = found is not None and (pa.types.is_struct(found) or pa.types.is_binary(found))
+            right = kind is not None and (pa.types.is_struct(kind) or pa.types.is_binary(kind))
         elif name in SUBGOALS:
             right = inner is not None and (pa.types.is_string(inner) or pa.types.is_large_string(inner))
         elif len(features[name]["shape"]) == 1 and features[name]["shape"][0] > 1:
-            right = found is not None and _is_list(found) and _is_number(inner)
-        elif name not in _WHOLE and features[name]["dtype"] != "bool":
+            right = kind is not None and _is_list(kind) and _is_number(inner)
+        elif name not in _INTEGER_COLUMNS and features[name]["dtype"] != "bool":
             right = inner is not None and _is_number(inner)
         else:
             right = inner is not None and (pa.types.is_integer(inner) or pa.types.is_boolean(inner))
         if not right:
             raise UserError(
-                f"{file}: the column {name} is {found or 'absent'}, where meta/info.json announces "
+                f"{file}: the column {name} is {kind or 'absent'}, where meta/info.json announces "
                 f"{brief(features[name]['dtype'])} {list(features[name]['shape'])}. {REMEDY}"
             )
 

@@ -88,8 +88,8 @@ def row_of(text: str) -> np.ndarray | None:
         UserError: something else.
     """
     try:
-        found = parse_json(text, "a recorded choice")
-        letter, point = found["choice"].strip().lower(), np.asarray(found.get("point") or (), np.float64)
+        choice = parse_json(text, "a recorded choice")
+        letter, point = choice["choice"].strip().lower(), np.asarray(choice.get("point") or (), np.float64)
     except (UserError, ValueError, TypeError, KeyError, AttributeError):
         letter, point = None, np.zeros(0)
     right = letter == "" or (letter is not None and len(letter) == 1 and letter in LETTERS)

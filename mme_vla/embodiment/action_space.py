@@ -18,19 +18,19 @@ if TYPE_CHECKING:
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
 
 
-def columns(given: Any, where: str) -> tuple[str, ...]:
+def columns(value: Any, where: str) -> tuple[str, ...]:
     """One column of a dataset or several to be joined; none where the usual names are meant."""
-    names = [] if given is None else [given] if isinstance(given, str) else given
+    names = [] if value is None else [value] if isinstance(value, str) else value
     if not isinstance(names, Sequence) or not all(isinstance(name, str) and name for name in names):
-        raise UserError(f"{where} must be a column of the dataset or a list of columns, got {brief(given)}.")
+        raise UserError(f"{where} must be a column of the dataset or a list of columns, got {brief(value)}.")
     return tuple(names)
 
 
-def whole(given: Any, where: str) -> int:
+def integer(value: Any, where: str) -> int:
     """A positive whole number, no larger than `LARGEST`."""
-    if isinstance(given, bool) or not isinstance(given, int) or not 1 <= given <= LARGEST:
-        raise UserError(f"{where} must be a positive whole number to {LARGEST}, got {brief(given)}.")
-    return given
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= LARGEST:
+        raise UserError(f"{where} must be a positive whole number to {LARGEST}, got {brief(value)}.")
+    return value
 
 
 def column_indices(given: Any, where: str, width: int) -> tuple[int, ...]:
@@ -43,24 +43,24 @@ def column_indices(given: Any, where: str, width: int) -> tuple[int, ...]:
     return tuple(sorted(numbers))
 
 
-def centres(given: Any, where: str, width: int) -> dict[int, float]:
+def centres(value: Any, where: str, width: int) -> dict[int, float]:
     """A centre in radians for some numbers of a vector; keys may be texts, as JSON writes them."""
-    found = {} if given is None else given
+    mapping = {} if value is None else value
     try:
-        read = {int(place): float(centre) for place, centre in found.items()}
+        read = {int(place): float(centre) for place, centre in mapping.items()}
         if not all(map(math.isfinite, read.values())):
             raise ValueError
     except (AttributeError, TypeError, ValueError, OverflowError):
-        raise UserError(f"{where} must be a map such as {{3: 3.14}}, number to centre, got {brief(given)}.") from None
+        raise UserError(f"{where} must be a map such as {{3: 3.14}}, number to centre, got {brief(value)}.") from None
     column_indices(list(read), where, width)
     return read
 
 
-def words(given: Any, where: str, width: int, default: Sequence[str]) -> tuple[str, ...]:
+def words(value: Any, where: str, width: int, default: Sequence[str]) -> tuple[str, ...]:
     """One text for each of `width` numbers."""
-    texts = list(default) if given is None else given
+    texts = list(default) if value is None else value
     if isinstance(texts, str) or not isinstance(texts, Sequence) or len(texts) != width:
-        raise UserError(f"{where} must hold {width} texts, one a number, got {brief(given)}.")
+        raise UserError(f"{where} must hold {width} texts, one a number, got {brief(value)}.")
     return tuple(map(str, texts))
 
 
@@ -88,7 +88,7 @@ class Option:
         return {"label": self.label, "action": self.action, "need_parameter": self.needs_point}
 
 
-def read_options(given: Any, letters: int) -> tuple[Option, ...]:
+def read_options(value: Any, letters: int) -> tuple[Option, ...]:
     """Options as the benchmark gives them: a list of `label`, `action` and `need_parameter`.
 
     Args:
@@ -99,20 +99,20 @@ def read_options(given: Any, letters: int) -> tuple[Option, ...]:
     """
     known = ascii_lowercase[:letters]
     expected = f'a list of {{"label": "a", "action": "…", "need_parameter": false}}, labels {known[0]} to {known[-1]}'
-    if not isinstance(given, Sequence) or isinstance(given, str) or not 1 <= len(given) <= letters:
-        raise UserError(f"The options to choose from are {brief(given)}; expected {expected}.")
-    found = []
-    for option in given:
+    if not isinstance(value, Sequence) or isinstance(value, str) or not 1 <= len(value) <= letters:
+        raise UserError(f"The options to choose from are {brief(value)}; expected {expected}.")
+    options = []
+    for option in value:
         right = isinstance(option, Mapping) and isinstance(option.get("action"), str)
         label = str(option.get("label")).strip().lower() if right else ""
         needs = option.get("need_parameter", False) if right else None
         wordy = right and len(option["action"]) > MOST_WORDS
         if len(label) != 1 or label not in known or wordy or not isinstance(needs, bool):
             raise UserError(f"The option {brief(option)} cannot be chosen; expected {expected}.")
-        found.append(Option(label, " ".join(option["action"].split()), needs))
-    if len({option.label for option in found}) < len(found):
-        raise UserError(f"The options {brief(given)} have a letter twice.")
-    return tuple(found)
+        options.append(Option(label, " ".join(option["action"].split()), needs))
+    if len({option.label for option in options}) < len(options):
+        raise UserError(f"The options {brief(value)} have a letter twice.")
+    return tuple(options)
 
 
 def in_words(options: Sequence[Option]) -> str:
@@ -171,53 +171,53 @@ class ActionSpace:
     pose_key: tuple[str, ...] = ()
 
     @classmethod
-    def from_dict(cls, given: Any, state_width: int) -> Self:
+    def from_dict(cls, section: Any, state_width: int) -> Self:
         """Read the section `embodiment.action`.
 
         Raises:
             UserError: an unknown or missing key, or a value that cannot be.
         """
         where = "embodiment.action"
-        found = section_keys(given, where, _KEYS, required=("width",))
-        width = whole(found["width"], f"{where}.width")
-        horizon = whole(found.get("horizon", 20), f"{where}.horizon")
-        execute = whole(found.get("execute", min(16, horizon)), f"{where}.execute")
+        values = section_keys(section, where, _KEYS, required=("width",))
+        width = integer(values["width"], f"{where}.width")
+        horizon = integer(values.get("horizon", 20), f"{where}.horizon")
+        execute = integer(values.get("execute", min(16, horizon)), f"{where}.execute")
         if execute > horizon:
             raise UserError(f"{where}.execute={execute}: a chunk has {horizon} actions (horizon); execute fewer.")
-        frames = found.get("frames", 1)
+        frames = values.get("frames", 1)
         if frames not in (1, None):
             raise UserError(f"{where}.frames={brief(frames)}: expected 1; null if an action is one planned motion.")
-        choice, point, length = _choices(found, where, width)
+        choice, point, length = _choices(values, where, width)
         return cls(
             width=width,
-            key=columns(found.get("key"), f"{where}.key"),
-            space=None if found.get("space") is None else str(found["space"]),
-            names=words(found.get("names"), f"{where}.names", width, numbered(width)),
-            units=words(found.get("units"), f"{where}.units", width, [""] * width),
-            relative=column_indices(found.get("relative"), f"{where}.relative", min(width, state_width)),
-            angles=centres(found.get("angles"), f"{where}.angles", width),
-            binary=column_indices(found.get("binary"), f"{where}.binary", width),
+            key=columns(values.get("key"), f"{where}.key"),
+            space=None if values.get("space") is None else str(values["space"]),
+            names=words(values.get("names"), f"{where}.names", width, numbered(width)),
+            units=words(values.get("units"), f"{where}.units", width, [""] * width),
+            relative=column_indices(values.get("relative"), f"{where}.relative", min(width, state_width)),
+            angles=centres(values.get("angles"), f"{where}.angles", width),
+            binary=column_indices(values.get("binary"), f"{where}.binary", width),
             horizon=horizon,
             execute=execute,
             frames=frames,
             choice=choice,
             point=point,
             options_length=length,
-            of_pose=_of_pose(found, where, width),
-            pose_key=columns(found.get("pose_key"), f"{where}.pose_key"),
+            of_pose=_of_pose(values, where, width),
+            pose_key=columns(values.get("pose_key"), f"{where}.pose_key"),
         )
 
     def to_dict(self) -> dict[str, Any]:
         """The section that `from_dict` reads, fit for JSON."""
         listed = {name: list(getattr(self, name)) for name in ("key", "names", "units", "relative", "binary")}
-        plain = {name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")}
-        chosen = {"choice": list(self.choice), "point": list(self.point), "options_length": self.options_length}
+        scalars = {name: getattr(self, name) for name in ("space", "width", "horizon", "execute", "frames")}
+        choices = {"choice": list(self.choice), "point": list(self.point), "options_length": self.options_length}
         posed = {"of_pose": list(self.of_pose), "pose_key": list(self.pose_key)}
         return {
-            **plain,
+            **scalars,
             **listed,
             "angles": {str(place): centre for place, centre in self.angles.items()},
-            **(chosen if self.choice else {}),  # which robots of earlier versions did not say
+            **(choices if self.choice else {}),  # which robots of earlier versions did not say
             **(posed if self.of_pose else {}),  # likewise
         }
 
@@ -323,10 +323,10 @@ def _require(options: Sequence[Option]) -> None:
         )
 
 
-def _of_pose(found: Mapping[str, Any], where: str, width: int) -> tuple[int, ...]:
+def _of_pose(values: Mapping[str, Any], where: str, width: int) -> tuple[int, ...]:
     """`of_pose`, which needs poses to differ from, and steps that have one."""
-    places = column_indices(found.get("of_pose"), f"{where}.of_pose", min(width, POSE_WIDTH))
-    if places and (not found.get("pose_key") or found.get("frames", 1) is None or found.get("relative")):
+    places = column_indices(values.get("of_pose"), f"{where}.of_pose", min(width, POSE_WIDTH))
+    if places and (not values.get("pose_key") or values.get("frames", 1) is None or values.get("relative")):
         raise UserError(
             f"{where}.of_pose={list(places)}: name the columns of the tool's pose (pose_key), one action a frame "
             "(frames=1), and nothing relative to the state besides (relative=[])."
@@ -334,17 +334,17 @@ def _of_pose(found: Mapping[str, Any], where: str, width: int) -> tuple[int, ...
     return places
 
 
-def _choices(found: Mapping[str, Any], where: str, width: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
+def _choices(values: Mapping[str, Any], where: str, width: int) -> tuple[tuple[int, ...], tuple[int, ...], int]:
     """`choice`, `point` and `options_length`."""
-    choice = column_indices(found.get("choice"), f"{where}.choice", width)
-    point = column_indices(found.get("point"), f"{where}.point", width)
+    choice = column_indices(values.get("choice"), f"{where}.choice", width)
+    point = column_indices(values.get("point"), f"{where}.point", width)
     if len(point) not in (0, 2) or set(point) & set(choice) or (point and not choice):
         raise UserError(
-            f"{where}.point={brief(found.get('point'))}: expected the two numbers y, x beside the choice's."
+            f"{where}.point={brief(values.get('point'))}: expected the two numbers y, x beside the choice's."
         )
-    if len(choice) > len(ascii_lowercase) or (choice and found.get("frames", 1) is not None):
+    if len(choice) > len(ascii_lowercase) or (choice and values.get("frames", 1) is not None):
         raise UserError(
             f"{where}.choice: at most {len(ascii_lowercase)} letters, each a motion of any length: frames=null."
         )
-    length = found.get("options_length", 0)
-    return choice, point, whole(length, f"{where}.options_length") if length else 0
+    length = values.get("options_length", 0)
+    return choice, point, integer(length, f"{where}.options_length") if length else 0

@@ -50,10 +50,10 @@ def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
     backbone = config.get("backbone", {})
     if config.get("embodiment") is None:
         return ROBOMME_JOINT.with_horizon(backbone.get("horizon", ROBOMME_JOINT.action.horizon))
-    found = Embodiment.from_dict(config["embodiment"])
+    robot = Embodiment.from_dict(config["embodiment"])
     if {"action_dim", "horizon"} <= set(backbone):
-        found.check_network(backbone["action_dim"], backbone["horizon"])
-    return found
+        robot.check_network(backbone["action_dim"], backbone["horizon"])
+    return robot
 
 
 def benchmark_action(
@@ -107,8 +107,8 @@ def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
         )
     other = [name for name in robot.camera_names if name not in CAMERAS]
     if other or robot.state.width != ROBOMME_JOINT.state.width:
-        seen = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"
+        difference = f"the cameras {', '.join(other)}" if other else f"a state of {robot.state.width} numbers"
         raise UserError(
-            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {seen}, and the benchmark gives "
-            f"the cameras {', '.join(CAMERAS)} and {ROBOMME_JOINT.state.width} numbers."
+            f"The robot {robot.name!r} cannot be evaluated on the benchmark: it has {difference}, and the benchmark "
+            f"gives the cameras {', '.join(CAMERAS)} and {ROBOMME_JOINT.state.width} numbers."
         )

@@ -79,32 +79,32 @@ class Embodiment:
         return tuple(camera.augment for camera in self.cameras)
 
     @classmethod
-    def from_dict(cls, given: Mapping[str, Any]) -> Self:
+    def from_dict(cls, section: Mapping[str, Any]) -> Self:
         """Read the section `embodiment` of a configuration.
 
         Raises:
             UserError: an unknown or missing key, or a value that cannot be; it is named.
         """
-        found = section_keys(given, "embodiment", _KEYS, required=("name", "cameras", "state", "action"))
-        cameras = _cameras(found["cameras"])
+        values = section_keys(section, "embodiment", _KEYS, required=("name", "cameras", "state", "action"))
+        cameras = _cameras(values["cameras"])
         names = [camera.name for camera in cameras]
-        memory_camera = found.get("memory_camera") or names[0]
+        memory_camera = values.get("memory_camera") or names[0]
         if memory_camera not in names:
             near = did_you_mean(str(memory_camera), names)
             raise UserError(f"embodiment.memory_camera={brief(memory_camera)} is none of the cameras. {near}")
-        state = section_keys(found["state"], "embodiment.state", ("key", "width"), required=("width",))
-        width = action_space.whole(state["width"], "embodiment.state.width")
-        fps, video = found.get("fps"), found.get("conditioning_video", False)
+        state = section_keys(values["state"], "embodiment.state", ("key", "width"), required=("width",))
+        width = action_space.integer(state["width"], "embodiment.state.width")
+        fps, video = values.get("fps"), values.get("conditioning_video", False)
         if fps is not None and (isinstance(fps, bool) or not isinstance(fps, int | float) or not 0 < fps <= 1000):
             raise UserError(f"embodiment.fps must be a positive number to 1000 or null, got {brief(fps)}.")
         if not isinstance(video, bool):
             raise UserError(f"embodiment.conditioning_video must be true or false, got {brief(video)}.")
         return cls(
-            name=str(found["name"]),
+            name=str(values["name"]),
             cameras=cameras,
             memory_camera=str(memory_camera),
             state=State(width, action_space.columns(state.get("key"), "embodiment.state.key")),
-            action=ActionSpace.from_dict(found["action"], width),
+            action=ActionSpace.from_dict(values["action"], width),
             fps=None if fps is None else float(fps),
             conditioning_video=video,
         )
@@ -149,19 +149,19 @@ def _described(camera: Camera) -> dict[str, Any]:
     return {"key": camera.key, "augment": camera.augment, **depth}
 
 
-def _cameras(given: Any) -> tuple[Camera, ...]:
-    if not isinstance(given, Mapping) or not given:
-        raise UserError(f"embodiment.cameras must name at least one camera with its settings, got {brief(given)}.")
+def _cameras(section: Any) -> tuple[Camera, ...]:
+    if not isinstance(section, Mapping) or not section:
+        raise UserError(f"embodiment.cameras must name at least one camera with its settings, got {brief(section)}.")
     cameras = []
-    for name, settings in given.items():
+    for name, settings in section.items():
         where = f"embodiment.cameras.{name}"
-        found = section_keys(settings or {}, where, ("key", "augment", "depth"))
-        augment, key = found.get("augment", "all"), found.get("key")
+        options = section_keys(settings or {}, where, ("key", "augment", "depth"))
+        augment, key = options.get("augment", "all"), options.get("key")
         if augment not in AUGMENTATIONS:
             raise UserError(f"{where}.augment={brief(augment)}. {did_you_mean(str(augment), AUGMENTATIONS)}")
         if key is not None and not isinstance(key, str):
             raise UserError(f"{where}.key must be a column of the dataset, got {brief(key)}.")
-        if not isinstance(depth := found.get("depth", False), bool):
+        if not isinstance(depth := options.get("depth", False), bool):
             raise UserError(f"{where}.depth must be true or false, got {brief(depth)}.")
         if name == "state":
             raise UserError(f"{where}: the state goes under this name in messages; call the camera something else.")

@@ -52,11 +52,11 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
             alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
             raise UserError(f"episodes={episodes} asks for the first {episodes}; {what} has {count}.{alone}")
         return list(range(episodes))
-    found = spans(episodes, "episodes", GRAMMAR)
-    for span in found:
+    ranges = spans(episodes, "episodes", GRAMMAR)
+    for span in ranges:
         if span.stop > count:
             raise UserError(f"There is no episode {span.stop - 1} in {what}, which has {count}: 0 to {count - 1}.")
-    numbers = [number for span in found for number in span]
+    numbers = [number for span in ranges for number in span]
     if not numbers or len(set(numbers)) < len(numbers):
         raise UserError(f"episodes={episodes} must name each episode once, and at least one.")
     return numbers
@@ -68,11 +68,11 @@ def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, spli
     Raises:
         UserError: an unknown task or split, or as `choose_numbers`.
     """
-    chosen = []
+    specs = []
     for task in choose_tasks(tasks):
         known = metadata.episodes(task, split)
-        chosen += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
-    return chosen
+        specs += [known[number] for number in choose_numbers(episodes, len(known), f"{task} in {split!r}")]
+    return specs
 
 
 def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
@@ -87,13 +87,13 @@ def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
     tasks, task = (config.get(key) for key in ("tasks", "task"))
     if task is not None and tasks not in (None, ALL, task):
         raise UserError(f"tasks={tasks} and task={task} mean the same: give one of them.")
-    given = tasks if task is None else task
-    if given is None:
+    names = tasks if task is None else task
+    if names is None:
         raise UserError("Name the tasks: tasks=StopCube, tasks=[StopCube,BinFill] or tasks=all.")
-    return given if isinstance(given, str) else [str(name) for name in given]
+    return names if isinstance(names, str) else [str(name) for name in names]
 
 
-def spans(given: Any, key: str, grammar: str) -> list[range]:
+def spans(value: Any, key: str, grammar: str) -> list[range]:
     """Read numbers and ranges: text such as `0-9` or `0-3,7`, or a list of such.
 
     Args:
@@ -102,21 +102,21 @@ def spans(given: Any, key: str, grammar: str) -> list[range]:
     Raises:
         UserError: another form.
     """
-    if isinstance(given, str):
-        parts: list[Any] = given.split(",")
-    elif isinstance(given, Sequence):
-        parts = list(given)
+    if isinstance(value, str):
+        parts: list[Any] = value.split(",")
+    elif isinstance(value, Sequence):
+        parts = list(value)
     else:
-        raise UserError(f"{key}={given!r} is not understood; write {grammar}.")
-    return [_span(part, given, key, grammar) for part in parts]
+        raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
+    return [_span(part, value, key, grammar) for part in parts]
 
 
-def _span(part: Any, given: Any, key: str, grammar: str) -> range:
+def _span(part: Any, value: Any, key: str, grammar: str) -> range:
     """The numbers of one part: a number, or `first-last`, both included."""
-    found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
-    if found is None or isinstance(part, bool | float):
-        raise UserError(f"{key}={given!r} is not understood; write {grammar}.")
-    first, last = int(found[1]), int(found[2] or found[1])
+    match = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", str(part))
+    if match is None or isinstance(part, bool | float):
+        raise UserError(f"{key}={value!r} is not understood; write {grammar}.")
+    first, last = int(match[1]), int(match[2] or match[1])
     if first > last:
-        raise UserError(f"{key}={given}: the range {part} ends before it begins.")
+        raise UserError(f"{key}={value}: the range {part} ends before it begins.")
     return range(first, last + 1)

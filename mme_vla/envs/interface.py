@@ -17,7 +17,7 @@ import torch
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.grounding import Grounding
 from mme_vla.envs.observations import INTRINSIC, Include, Observer, as_lists, frame_keys, observation_space
-from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.render_request import RenderRequest
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.saved_state import EpisodeState, play_again
@@ -42,7 +42,7 @@ class _Run:
     """One episode under way."""
 
     control: Control
-    shown: "SubTask"
+    displayed: "SubTask"
     """Whose text describes the present frame."""
     last_action: np.ndarray
     in_video: bool = True
@@ -59,7 +59,7 @@ class _Run:
     options: dict[str, Any] = field(default_factory=dict)
     actions: list[Any] = field(default_factory=list)
     """Of the reset, and all since: what the episode can be played again from."""
-    told: str = ""
+    subgoal_text: str = ""
     began: list[int] = field(default_factory=list)
     """Frames at which another sub-task was told."""
     terminated: torch.Tensor = field(default_factory=lambda: torch.tensor(False))
@@ -106,7 +106,7 @@ class RoboMMEEnv(gymnasium.Env):
         self.include = include or Include()
         self.max_steps = max_steps
         self.on_frame: FrameHook | None = None
-        self.drawing: Drawing | None = None
+        self.render_request: RenderRequest | None = None
         self.render_mode = "rgb_array" if render else None
         self.action_space = self._space.space(task.stick)
         self._keys = frame_keys(self.include, render)
@@ -150,7 +150,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._muted = False
         self._episodes += 1
         control = Control(task, self._step_control, Demonstrator(task, self._step_control))
-        run = self._run = _Run(control, task.progress.shown, task.reset_action, options=options)
+        run = self._run = _Run(control, task.progress.displayed, task.reset_action, options=options)
         self._grounding.clear()
         self._observer.start()
         for subtask in task.progress.subtasks:
@@ -254,15 +254,17 @@ class RoboMMEEnv(gymnasium.Env):
             return {}
         run = self._require_run()
         self._observer.follow()
-        if run.in_video and run.shown.text == NO_RECORD:
+        if run.in_video and run.displayed.text == NO_RECORD:
             return {}  # neither rendered nor returned
         cameras: tuple[str, ...] = tuple(CAMERAS)
-        if self.drawing is not None:
-            cameras = self.drawing.cameras(run.returned, newest=not run.in_video and not run.control.demonstrator.left)
+        if self.render_request is not None:
+            cameras = self.render_request.cameras(
+                run.returned, newest=not run.in_video and not run.control.demonstrator.left
+            )
         frame = run.newest = self._observer.frame(info, cameras)
-        if run.shown.text != run.told:
+        if run.displayed.text != run.subgoal_text:
             run.began.append(run.returned)
-            run.told = run.shown.text
+            run.subgoal_text = run.displayed.text
         run.returned += 1
         run.info = self._info(run, info)
         run.frames.append(frame)
@@ -275,9 +277,9 @@ class RoboMMEEnv(gymnasium.Env):
         run.count += not run.in_video
         # A frame is described by the sub-task its step was made in, not by the one that its evaluation moves on to. The
         # video shows what is being demonstrated where either of the two has no words.
-        run.shown, demonstrated = task.progress.shown, task.progress.demonstrated
-        if run.in_video and NO_RECORD in (run.shown.text, demonstrated.text):
-            run.shown = demonstrated
+        run.displayed, demonstrated = task.progress.displayed, task.progress.demonstrated
+        if run.in_video and NO_RECORD in (run.displayed.text, demonstrated.text):
+            run.displayed = demonstrated
         run.last_action = np.asarray(action, np.float32)
         _, _, terminated, _, _ = task.step(run.last_action)
         run.terminated = terminated.reshape(-1)[0].clone()
@@ -323,19 +325,19 @@ class RoboMMEEnv(gymnasium.Env):
 
     def _info(self, run: _Run, evaluated: dict[str, Any]) -> dict[str, Any]:
         task = self._open_task()
-        shown = run.shown
+        subtask = run.displayed
         success, fail = evaluated["success"].clone(), evaluated["fail"].clone()
         info: dict[str, Any] = {
             "task_goal": list(task.goals()),
-            "simple_subgoal_online": shown.text,
+            "simple_subgoal_online": subtask.text,
             "status": self._status(run, bool(success), bool(fail)),
             "success": success,
             "fail": fail,
             "elapsed_steps": evaluated["elapsed_steps"].clone(),
         }
-        if self.drawing is None or self.drawing.grounded:
-            look = self._observer.segmentation if self._render else None
-            info["grounded_subgoal_online"] = self._grounding.update(shown, look)
+        if self.render_request is None or self.render_request.grounded:
+            segmentation = self._observer.segmentation if self._render else None
+            info["grounded_subgoal_online"] = self._grounding.update(subtask, segmentation)
         if self.include.available_multi_choices or self._space.name == "multi_choice":
             info["available_multi_choices"] = [
                 {"label": choice.label, "action": choice.action, "need_parameter": choice.needs_point}

@@ -80,21 +80,21 @@ def make_env(
         seed, difficulty = spec.seed, spec.difficulty
         varied = metadata.check_split(split)
         variant = {} if varied is None else varied.options
-    return _make_own(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
+    return _make_library_env(task, action_space, max_steps, render, reward, include, seed=seed, difficulty=difficulty,
                      recovery=recovery, **variant)  # fmt: skip
 
 
-def check_sessions(split: str, shown: int) -> None:
+def check_sessions(split: str, sessions: int) -> None:
     """Refuse a split with sessions before each episode where nobody shows them.
 
     Raises:
         UserError: fewer or more are shown than the split asks for.
     """
     variant = read_variant(split)
-    wanted = 0 if variant is None else variant.sessions
-    if wanted != shown:
+    required = 0 if variant is None else variant.sessions
+    if required != sessions:
         raise UserError(
-            f"split={split}: {wanted} unrelated episodes come before each, and {shown} are shown. `python -m "
+            f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
             "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; whoever shows them "
             "otherwise says so: make_env(…, sessions=2)."
         )
@@ -167,7 +167,7 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
     return TASKS[task](obs_mode=obs_mode, render_backend=backend, sim_backend="physx_cpu", **options)
 
 
-def _make_own(
+def _make_library_env(
     task: str, space: str, max_steps: int, render: bool, reward: str, options: dict[str, Any], **scene: Any
 ) -> "RoboMMEEnv":
     from mme_vla.envs.observations import Include

@@ -82,9 +82,9 @@ class Variant:
         if task not in TASK_NAMES:
             raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
         if self.dial and self.dial != SESSIONS and task not in DIALS[self.dial]:
-            own = [dial for dial, tasks in DIALS.items() if task in tasks]
+            dials = [dial for dial, tasks in DIALS.items() if task in tasks]
             raise UserError(
-                f"{task} has no dial {self.dial!r}; it has {', '.join(own) or 'none'}. {self.dial} is for "
+                f"{task} has no dial {self.dial!r}; it has {', '.join(dials) or 'none'}. {self.dial} is for "
                 f"{', '.join(DIALS[self.dial])}."
             )
 
@@ -99,14 +99,14 @@ def read_variant(split: str) -> Variant | None:
         return Variant(twin=True)
     if not str(split).startswith(STRESS):
         return None
-    found, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
-    if found is None:
+    match, known = _STRESS.fullmatch(split), (*DIALS, SESSIONS)
+    if match is None:
         raise UserError(
             f"split={split!r}: say which dial is turned how far, as {STRESS}:count=2; the dials are {', '.join(known)}."
         )
-    if found[1] not in known:
-        raise UserError(f"split={split!r}: there is no dial {found[1]!r}. {did_you_mean(found[1], known)}")
-    return Variant(dial=found[1], turned=int(found[2]))
+    if match[1] not in known:
+        raise UserError(f"split={split!r}: there is no dial {match[1]!r}. {did_you_mean(match[1], known)}")
+    return Variant(dial=match[1], turned=int(match[2]))
 
 
 SPLITS = {"train": 100, "val": 50, "test": 50}
@@ -158,9 +158,9 @@ def _further_place(split: str, episode: int) -> int:
     first, level = SPLITS["test"], split.removeprefix(FURTHER).removeprefix("_")
     if not level:
         return first + episode
-    round_, rest = divmod(episode, _CYCLE.count(level))
+    round_, index = divmod(episode, _CYCLE.count(level))
     places = [place for place in range(first, first + len(_CYCLE)) if _CYCLE[place % len(_CYCLE)] == level]
-    return places[rest] + round_ * len(_CYCLE)
+    return places[index] + round_ * len(_CYCLE)
 
 
 def episodes(task: str, split: str = "test", folder: str | Path | None = None) -> list[EpisodeSpec]:
@@ -247,9 +247,9 @@ def file_name(task: str) -> str:
 
 def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
     """Episode, seed and difficulty of one official record."""
-    found: dict[str, Any] = record if isinstance(record, dict) else {}
-    numbers: list[Any] = [found.get("episode"), found.get("seed")]
-    difficulty: Any = found.get("difficulty")
+    fields: dict[str, Any] = record if isinstance(record, dict) else {}
+    numbers: list[Any] = [fields.get("episode"), fields.get("seed")]
+    difficulty: Any = fields.get("difficulty")
     if not all(type(n) is int and 0 <= n < 2**31 for n in numbers) or difficulty not in list(_CYCLE):
         raise UserError(
             f"{path} is not official metadata: a record has episode {brief(numbers[0])}, seed {brief(numbers[1])} and "

@@ -136,15 +136,15 @@ class Observer:
             frame["maniskill_obs"] = type(self.task).get_obs(self.task, info)
             self._taken |= set(SENSORS)
         elif self.render:
-            self._take_pictures(cameras)
+            self._render_cameras(cameras)
         for name, camera in SENSORS.items():
             if self.render:
                 depth = getattr(self.include, f"{name}_depth")
-                seen = name in cameras
-                images = self._read(camera, rgb=True, depth=depth) if seen else {}
+                is_rendered = name in cameras
+                images = self._read(camera, rgb=True, depth=depth) if is_rendered else {}
                 frame[f"{name}_rgb"] = images.get("rgb")
                 if depth:
-                    frame[f"{name}_depth"] = images["depth"].astype(np.int16) if seen else None
+                    frame[f"{name}_depth"] = images["depth"].astype(np.int16) if is_rendered else None
             if getattr(self.include, f"{name}_camera_extrinsic"):
                 frame[f"{name}_camera_extrinsic"] = self.extrinsic(name)
         return frame
@@ -152,7 +152,7 @@ class Observer:
     def segmentation(self) -> np.ndarray:
         """Object ids [256, 256] of the present front picture, which is taken if the frame has none."""
         if "front" not in self._taken:
-            self._take_pictures(["front"])
+            self._render_cameras(["front"])
         return self._read(SENSORS["front"], segmentation=True)["segmentation"][..., 0]
 
     def extrinsic(self, name: str) -> np.ndarray:
@@ -162,7 +162,7 @@ class Observer:
     def _wrist_pose(self) -> "sapien.Pose":
         return self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
 
-    def _take_pictures(self, cameras: Collection[str]) -> None:
+    def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
         if not cameras:
             return

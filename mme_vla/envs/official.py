@@ -47,7 +47,7 @@ class OfficialEnv:
         """
         observation, info = self._open().reset()
         self._started = True
-        self._remember(observation)
+        self._keep_newest(observation)
         return observation, _flat(info)
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
@@ -60,7 +60,7 @@ class OfficialEnv:
         if not self._started:
             raise UserError("step() before reset(): call reset() first.")
         observation, reward, terminated, truncated, info = env.step(action)
-        self._remember(observation)
+        self._keep_newest(observation)
         return observation, reward, terminated, truncated, _flat(info)
 
     def render(self) -> np.ndarray | None:
@@ -79,7 +79,7 @@ class OfficialEnv:
             raise UserError("The environment is closed; make a new one.")
         return self._env
 
-    def _remember(self, observation: Any) -> None:
+    def _keep_newest(self, observation: Any) -> None:
         if observation and observation.get("front_rgb_list"):
             self._newest = np.asarray(observation["front_rgb_list"][-1])
 
@@ -107,8 +107,8 @@ def make_official_env(
     count = builder.get_episode_num()
     if not 0 <= episode < count:
         raise UserError(f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
-    wanted = {name: True for name, yes in include.options.items() if yes}
-    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **wanted), max_steps, include)
+    flags = {name: True for name, yes in include.options.items() if yes}
+    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags), max_steps, include)
 
 
 def _flat(info: dict[str, Any]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ NOTHING: Container[int] = frozenset()
 
 
 @dataclass(frozen=True)
-class Drawing:
+class RenderRequest:
     """What of an episode is drawn; all else is simulated without a look.
 
     frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on, those of the

@@ -54,8 +54,8 @@ def coarsen(corners: np.ndarray, cell: float = CELL) -> np.ndarray:
     different = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
     triangles = triangles[different]
     # Turned, so that a triangle begins with its lowest corner whichever it began with.
-    turns = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    triangles = np.unique(np.take_along_axis(triangles, turns, axis=1), axis=0)
+    rotation = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
+    triangles = np.unique(np.take_along_axis(triangles, rotation, axis=1), axis=0)
     return means[triangles].astype(np.float32)
 
 
@@ -93,7 +93,7 @@ def lean_shaders() -> "ShaderConfig | None":
     """
     from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
-    folder = _written()
+    folder = _pipeline_folder()
     if folder is None:
         return None
     stock = PREBUILT_SHADER_CONFIGS[PACK]
@@ -102,21 +102,21 @@ def lean_shaders() -> "ShaderConfig | None":
 
 
 @cache
-def _written() -> Path | None:
+def _pipeline_folder() -> Path | None:
     """The folder of changed shaders, made once for an installed SAPIEN."""
     import sapien
 
     from mme_vla.utils import user_cache, write_atomically
 
     stock = Path(sapien.__file__).parent / "vulkan_shader"
-    found = {
+    shaders = {
         file.relative_to(stock): file.read_text(encoding="utf-8")
         for part in (PACK, "common")
         for file in sorted((stock / part).glob("*"))
         if file.is_file()
     }
-    lean = {name: without_table(text) for name, text in found.items()}
-    if lean == found or any(_TABLE in text for text in lean.values()):
+    lean = {name: without_table(text) for name, text in shaders.items()}
+    if lean == shaders or any(_TABLE in text for text in lean.values()):
         logging.getLogger(__name__).debug("these shaders are not known here, and are used as they are: %s", stock)
         return None
     key = hashlib.sha256(repr(sorted(lean.items())).encode()).hexdigest()[:16]
@@ -167,8 +167,8 @@ def render_backend() -> str:
 
 def devices(summary: str) -> list[tuple[str, bool]]:
     """Name of each device in SAPIEN's summary, and whether SAPIEN supports it."""
-    found = re.findall(r"GPU:\s*(.+?)\s*\n\s*Supported:\s*(\d)", summary)
-    return [(name, flag == "1") for name, flag in found]
+    matches = re.findall(r"GPU:\s*(.+?)\s*\n\s*Supported:\s*(\d)", summary)
+    return [(name, flag == "1") for name, flag in matches]
 
 
 def mesa_version() -> int | None:
@@ -176,14 +176,14 @@ def mesa_version() -> int | None:
     if shutil.which("dpkg-query") is None:
         return None
     command = ["dpkg-query", "-W", "-f=${Version}", "mesa-vulkan-drivers"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False).stdout
-    major = re.match(r"(?:\d+:)?(\d+)\.", answer)
+    output = subprocess.run(command, capture_output=True, text=True, check=False).stdout
+    major = re.match(r"(?:\d+:)?(\d+)\.", output)
     return int(major.group(1)) if major else None
 
 
 _CHECK_SIZE = 8
 
-_kept: dict[str, "sapien.render.RenderSystem"] = {}
+_systems: dict[str, "sapien.render.RenderSystem"] = {}
 
 
 def keep_renderer(device: "sapien.Device") -> None:
@@ -191,8 +191,8 @@ def keep_renderer(device: "sapien.Device") -> None:
     import sapien
 
     name = str(device.name)
-    if name not in _kept:
-        _kept[name] = sapien.render.RenderSystem(device)
+    if name not in _systems:
+        _systems[name] = sapien.render.RenderSystem(device)
 
 
 def renderer_works() -> bool:
@@ -202,15 +202,15 @@ def renderer_works() -> bool:
     another process helps.
     """
     try:
-        for system in _kept.values():
-            _take_picture(system.device)
+        for system in _systems.values():
+            _render_once(system.device)
     except RuntimeError as error:  # all that Vulkan's errors become
         logging.getLogger(__name__).warning("the renderer has failed: %s", error)
         return False
     return True
 
 
-def _take_picture(device: "sapien.Device") -> None:
+def _render_once(device: "sapien.Device") -> None:
     import sapien
 
     lean = lean_shaders() if device.is_cpu() else None

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
-from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.render_request import RenderRequest
 from mme_vla.errors import UserError
 
 
@@ -42,15 +42,17 @@ class EpisodeState:
         places = [field.name for field in fields(self) if field.name not in ("options", "actions")]
         differ = [name for name in places if getattr(self, name) != getattr(other, name)]
         if differ:
-            told = ", ".join(f"{name} {getattr(self, name)!r} (here {getattr(other, name)!r})" for name in differ)
-            raise UserError(f"This state is of another environment: {told}. Make one of the same episode.")
+            differences = ", ".join(
+                f"{name} {getattr(self, name)!r} (here {getattr(other, name)!r})" for name in differ
+            )
+            raise UserError(f"This state is of another environment: {differences}. Make one of the same episode.")
 
 
 class Played(Protocol):
     """What of `RoboMMEEnv` an episode is played again on."""
 
     on_frame: Any
-    drawing: Drawing | None
+    render_request: RenderRequest | None
 
     def state_of(self, options: dict[str, Any], actions: Sequence[Any]) -> EpisodeState: ...
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, Any]: ...
@@ -60,16 +62,16 @@ class Played(Protocol):
 def play_again(env: Played, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
     """See `RoboMMEEnv.restore_state`."""
     state.check(env.state_of({}, ()))
-    hook, drawing = env.on_frame, env.drawing
-    grounded = drawing is None or drawing.grounded
-    unseen, present = Drawing({}, now=(), grounded=grounded), Drawing({}, grounded=grounded)
+    hook, request = env.on_frame, env.render_request
+    grounded = request is None or request.grounded
+    unseen, present = RenderRequest({}, now=(), grounded=grounded), RenderRequest({}, grounded=grounded)
     env.on_frame = None
     try:
-        env.drawing = unseen if state.actions else present
+        env.render_request = unseen if state.actions else present
         observation, info = env.reset(options=state.options)
         for number, action in enumerate(state.actions, 1):
-            env.drawing = unseen if number < len(state.actions) else present
+            env.render_request = unseen if number < len(state.actions) else present
             observation, _, _, _, info = env.step(action)
     finally:
-        env.on_frame, env.drawing = hook, drawing
+        env.on_frame, env.render_request = hook, request
     return observation, info

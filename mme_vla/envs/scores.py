@@ -75,19 +75,19 @@ class ProcessScore:
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, given: Any) -> "ProcessScore":
+    def from_dict(cls, value: Any) -> "ProcessScore":
         """Read what `to_dict` made.
 
         Raises:
             UserError: it is something else.
         """
         try:
-            score = cls(**given)
+            score = cls(**value)
         except TypeError:
             score = None
         known = (MOTION, "", *OPERATIONS)
         if score is None or score.operation not in known or score.broke not in (*BROKEN, ""):
-            raise UserError(f"process={brief(given)} of a record is no process score.")
+            raise UserError(f"process={brief(value)} of a record is no process score.")
         return score
 
 
@@ -97,7 +97,7 @@ def process_score(progress: Progress, status: str) -> ProcessScore:
     done = max(progress.index - (len(progress.subtasks) - len(execution)), 0)
     if status == "success":
         return ProcessScore(len(execution), len(execution))
-    text = progress.shown.text
+    text = progress.displayed.text
     if status == "fail":
         return ProcessScore(done, len(execution), "wrong", progress.mistaken or MOTION, text)
     return ProcessScore(done, len(execution), "stuck", "", text)

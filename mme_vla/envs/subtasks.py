@@ -104,7 +104,7 @@ class Progress:
         return self.subtasks[self.index :]
 
     @property
-    def shown(self) -> SubTask:
+    def displayed(self) -> SubTask:
         """The sub-task whose text is reported online: the current one, and at the end the last one."""
         return self.subtasks[min(self.index, len(self.subtasks) - 1)]
 

@@ -40,7 +40,7 @@ class Task(Stage):
     """`plan`, `build` and `start_episode` draw from one generator; otherwise `plan` has one of its own."""
     latch_failure: ClassVar[bool] = False
     """A failure lasts; otherwise it is judged anew at each step."""
-    recovery_drawn_per_episode: ClassVar[bool] = False
+    recovery_sampled_per_episode: ClassVar[bool] = False
     """The failed pick is drawn in every initialisation (there are two), not once after the scene."""
 
     dials: ClassVar[frozenset[str]] = frozenset()
@@ -144,20 +144,20 @@ class Task(Stage):
         if not self.shared_draws:
             draws = Draws(self.seed)
         self.build(draws)
-        self.draws, self._drawn = draws, draws.state()
+        self.draws, self._draws_state = draws, draws.state()
         cues = self.cues() if self.in_view else ()
         self._cues = [(build_cue(self, f"cue_{i}", cue), cue) for i, cue in enumerate(cues)]
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
         self.tidy(env_idx)
-        self.draws.restore(self._drawn)
+        self.draws.restore(self._draws_state)
         # The official construction initialises an episode twice, and what the second one draws counts.
         for attempt in range(2):
             for thing in self.things:
                 thing.restore()
             self.start_episode(self.draws)
             subtasks = self.subtasks()
-            if self.recovery and (attempt == 0 or self.recovery_drawn_per_episode):
+            if self.recovery and (attempt == 0 or self.recovery_sampled_per_episode):
                 self.failed_pick = self.draw_failed_pick(self.draws, sum(s.pick and not s.video for s in subtasks))
         self.progress = Progress(subtasks, self.latch_failure)
         self._show_cues()

@@ -34,7 +34,7 @@ def evaluate(
     subgoal: str | SubgoalPredictor | None = None,
     name: str | None = None,
     base: Callable[..., Any] = make_env,
-    shown: bool = True,
+    show_progress: bool = True,
     recordings: Any = None,
     **settings: Any,
 ) -> Evaluation:
@@ -53,7 +53,8 @@ def evaluate(
         name: what records call the policy; its own name by default.
         base: makes an environment with the benchmark's interface, importable by name.
         recordings: datasets whose first episodes `split="stress:sessions=2"` shows before each.
-        shown: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=4` or `render=False`.
+        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=4` or
+        `render=False`.
 
     Returns:
         The records of these episodes, and `success_rate`.
@@ -68,22 +69,30 @@ def evaluate(
     known = [field.name for field in fields(RolloutSettings) if field.name != "seed"]
     if unknown := [key for key in settings if key not in known]:
         raise UserError(f"evaluate() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
-    chosen = RolloutSettings(seed=seed, **settings)
-    jobs = choose_episodes(tasks, episodes, chosen.split)
-    if base is make_env and chosen.env == "mme_vla":
+    run_settings = RolloutSettings(seed=seed, **settings)
+    jobs = choose_episodes(tasks, episodes, run_settings.split)
+    if base is make_env and run_settings.env == "mme_vla":
         require_simulator()
     loaded, source = load(policy)
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
-    said = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
+    subgoal_label = subgoal if isinstance(subgoal, str) else None if subgoal is None else type(subgoal).__name__
     facts = RunFacts(
-        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, chosen.split,
-        chosen.max_steps, said, memory_budget(loaded),
+        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, run_settings.split,
+        run_settings.max_steps, subgoal_label, memory_budget(loaded),
     )  # fmt: skip
     folder = default_output(facts) if output is None else Path(output).expanduser()
-    lent = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
-    shown_first = with_sessions(loaded.eval(), chosen.split, lent)
+    donor_episodes = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
+    wrapped = with_sessions(loaded.eval(), run_settings.split, donor_episodes)
     return evaluate_run(
-        shown_first, jobs, folder, facts, chosen, subgoals=predictor, source=source, base=base, shown=shown
+        wrapped,
+        jobs,
+        folder,
+        facts,
+        run_settings,
+        subgoals=predictor,
+        source=source,
+        base=base,
+        show_progress=show_progress,
     )
 
 

@@ -19,14 +19,14 @@ def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
         UserError: the place was named, and holds none.
     """
     if named is not None:
-        found = [record for path in find_records([named]) for record in read_records(path)]
+        records = [record for path in find_records([named]) for record in read_records(path)]
     else:
-        found = []
+        records = []
         for path in sorted(output.parent.glob("*/episodes*.jsonl")):
             # What is damaged, or being written, is another run's: its own command will say so.
             with suppress(UserError), warnings.catch_warnings(action="ignore"):
-                found += read_records(path)
-    return [record for record in found if record.outcome != "error"]
+                records += read_records(path)
+    return [record for record in records if record.outcome != "error"]
 
 
 _Place = tuple[str | None, int | None]

@@ -8,7 +8,7 @@ from types import NoneType
 from typing import Any, NamedTuple, Self
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.utils import parse_json, sealed, unsealed
+from mme_vla.utils import parse_json, verified, with_checksum
 
 _LARGEST = 2**63  # numbers from there on are damage
 OUTCOMES = ("success", "fail", "timeout", "error")
@@ -100,8 +100,8 @@ class EpisodeRecord:
         for name, kind in _KINDS.items():
             value = getattr(self, name)
             if not isinstance(value, kind) or isinstance(value, bool):
-                wanted = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
-                raise UserError(f"{name}={brief(value)} of a record must be {wanted}, not {type(value).__name__}.")
+                expected = " or ".join(k.__name__ for k in (kind if isinstance(kind, tuple) else (kind,)))
+                raise UserError(f"{name}={brief(value)} of a record must be {expected}, not {type(value).__name__}.")
             if isinstance(value, int) and abs(value) >= _LARGEST:
                 raise UserError(f"{name}={brief(value)} of a record is out of range.")
         if self.composition is not None and not isinstance(self.composition, str):
@@ -124,7 +124,7 @@ class EpisodeRecord:
 
     def to_json(self) -> str:
         """One line, without its end; a checksum in it tells damage."""
-        return json.dumps(sealed(asdict(self)), ensure_ascii=False, separators=(",", ":"))
+        return json.dumps(with_checksum(asdict(self)), ensure_ascii=False, separators=(",", ":"))
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:
@@ -134,7 +134,7 @@ class EpisodeRecord:
             UserError: it is not JSON, not a record (fields are missing, unknown or wrong), or not what was written.
         """
         # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
-        values = unsealed(parse_json(line, "an episode record", finite=False), "an episode record")
+        values = verified(parse_json(line, "an episode record", finite=False), "an episode record")
         known = {member.name for member in fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:
@@ -175,12 +175,12 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
     """
     if conflicts not in ("refuse", "first", "last"):
         raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
-    kept: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
+    merged: dict[tuple[RunKey, EpisodeKey], EpisodeRecord] = {}
     for new in records:
         at = (new.run, new.key)
-        old = kept.get(at)
+        old = merged.get(at)
         if old is None or (old.outcome == "error" and new.outcome != "error"):
-            kept[at] = new
+            merged[at] = new
             continue
         if new.seed != old.seed:
             raise UserError(
@@ -195,8 +195,8 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
                 f"{old.when}, {new.outcome} at {new.when}. Name one of the runs, or choose conflicts first or last."
             )
         if (conflicts == "last") == (new.when > old.when):
-            kept[at] = new
-    return list(kept.values())
+            merged[at] = new
+    return list(merged.values())
 
 
 def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecord]:
@@ -209,7 +209,7 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
     for record in records:
         if record.composition is not None:
             digests.setdefault(record.run._replace(composition=None), set()).add(record.composition)
-    only = {run: next(iter(found)) for run, found in digests.items() if len(found) == 1}
+    only = {run: next(iter(run_digests)) for run, run_digests in digests.items() if len(run_digests) == 1}
     return [
         replace(record, composition=only[record.run]) if record.composition is None and record.run in only else record
         for record in records

@@ -27,12 +27,12 @@ from mme_vla.utils import (
     draft_of,
     name_place,
     parse_json,
-    plain,
     read_bytes,
     read_json,
     remove_drafts,
-    sealed,
-    unsealed,
+    to_json,
+    verified,
+    with_checksum,
 )
 
 RUN_FILE = "run.json"
@@ -59,7 +59,7 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
     Raises:
         UserError: the folder holds a run with other settings; each difference is named.
     """
-    settings = plain(settings)  # as they will be read back
+    settings = to_json(settings)  # as they will be read back
     content = {
         "settings": settings,
         "fingerprint": fingerprint(settings),
@@ -68,7 +68,7 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
     }
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        _write_new(folder / RUN_FILE, json.dumps(sealed(content), indent=2, sort_keys=True) + "\n")
+        _write_new(folder / RUN_FILE, json.dumps(with_checksum(content), indent=2, sort_keys=True) + "\n")
         return content
     except FileExistsError:
         _await_content(folder / RUN_FILE)
@@ -96,7 +96,7 @@ def read_run(folder: Path) -> dict[str, Any]:
         )
     if content["fingerprint"] != fingerprint(content["settings"]):
         raise UserError(f"{path} was changed by hand: its settings do not have its fingerprint.")
-    return unsealed(content, str(path))
+    return verified(content, str(path))
 
 
 def _write_new(target: Path, text: str) -> None:
@@ -129,8 +129,10 @@ def _await_content(path: Path, patience: float = 2) -> None:
 def _differences(there: Mapping[str, Any], now: Mapping[str, Any]) -> str:
     before, after = _flat(there), _flat(now)
     changed = [key for key in sorted({*before, *after}) if before.get(key, _NOTHING) != after.get(key, _NOTHING)]
-    told = (f"{key} was {brief(before.get(key, 'not set'))}, is {brief(after.get(key, 'not set'))}" for key in changed)
-    return "; ".join(told)
+    changes = (
+        f"{key} was {brief(before.get(key, 'not set'))}, is {brief(after.get(key, 'not set'))}" for key in changed
+    )
+    return "; ".join(changes)
 
 
 _NOTHING = object()
@@ -196,14 +198,14 @@ class RecordLog:
     def _repair(self) -> None:
         self._file.seek(0)
         content = self._file.read()
-        rest = content.rpartition(b"\n")[2]
-        if not rest:
+        last_line = content.rpartition(b"\n")[2]
+        if not last_line:
             return
         try:
-            EpisodeRecord.from_json(rest)
+            EpisodeRecord.from_json(last_line)
         except UserError:
-            warnings.warn(f"{self.path}: removed a half-written last line ({len(rest)} bytes).", stacklevel=3)
-            self._file.truncate(len(content) - len(rest))
+            warnings.warn(f"{self.path}: removed a half-written last line ({len(last_line)} bytes).", stacklevel=3)
+            self._file.truncate(len(content) - len(last_line))
         else:  # only the line's end is missing
             self._file.write(b"\n")
 
@@ -215,9 +217,9 @@ def read_records(path: Path) -> list[EpisodeRecord]:
         UserError: the file is not there, or another line is not a record.
     """
     content = read_bytes(path, "episode records", LOG_LIMIT)
-    *lines, rest = content.split(b"\n")
+    *lines, last_line = content.split(b"\n")
     records = []
-    for number, line in enumerate([*lines, rest], 1):
+    for number, line in enumerate([*lines, last_line], 1):
         if not line.strip():
             continue
         try:
@@ -248,18 +250,18 @@ def find_records(paths: Iterable[Path]) -> list[Path]:
     Raises:
         UserError: a path is not there, or a folder holds no records.
     """
-    found: list[Path] = []
+    files: list[Path] = []
     for path in paths:
         if path.is_dir():
             inside = sorted(path.rglob("episodes*.jsonl"))
             if not inside:
                 raise UserError(f"{path} holds no results: no {RECORDS} or episodes-<shard>.jsonl in it or below.")
-            found += inside
+            files += inside
         elif path.is_file():
-            found.append(path)
+            files.append(path)
         else:
             raise UserError(f"{path} does not exist: name files of episode records, or folders with {RECORDS}.")
-    return list({path.resolve(): path for path in found}.values())
+    return list({path.resolve(): path for path in files}.values())
 
 
 def _lock(file: IO[bytes], path: Path) -> None:
@@ -319,7 +321,7 @@ class Claims:
         records = self._files[session]
         if self._newest[records] != session:
             return False
-        return session == self.session or _is_held(self.folder / records)
+        return session == self.session or _is_locked(self.folder / records)
 
     def _done_by(self, session: str) -> set[EpisodeKey]:
         """What a session that has ended finished; its file may have gone on under another session."""
@@ -335,12 +337,12 @@ class Claims:
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
             new = os.pread(file, os.fstat(file).st_size - self._read, self._read)
-            whole, _, rest = new.rpartition(b"\n")
-            if rest:  # a process was killed while it wrote
-                os.ftruncate(file, self._read + len(new) - len(rest))
-            for line in whole.split(b"\n") if whole else ():
+            complete, _, incomplete = new.rpartition(b"\n")
+            if incomplete:  # a process was killed while it wrote
+                os.ftruncate(file, self._read + len(new) - len(incomplete))
+            for line in complete.split(b"\n") if complete else ():
                 self._note(line)
-            self._read += len(new) - len(rest)
+            self._read += len(new) - len(incomplete)
             yield file
         finally:
             os.close(file)
@@ -365,7 +367,7 @@ class Claims:
         self._read += len(line)
 
 
-def _is_held(path: Path) -> bool:
+def _is_locked(path: Path) -> bool:
     """Whether a process writes to a records file. Where the disk knows no locks, whoever began is taken to go on."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)

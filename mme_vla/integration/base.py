@@ -58,7 +58,7 @@ class Integration(nn.Module):
 
     memory_width: int = 0
     visibility: Visibility = PI05_VISIBILITY
-    brings: ClassVar[frozenset[str]] = frozenset()
+    required_features: ClassVar[frozenset[str]] = frozenset()
     memory_position: str = "slot"
 
     def __init__(self, backbone: BackboneConfig) -> None:
@@ -87,7 +87,7 @@ class Integration(nn.Module):
         )  # fmt: skip
 
 
-def own_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
+def explicit_positions(memory: MemoryTokens, memory_position: str) -> Tensor | None:
     """Where a memory block stands whose tokens are placed in time, [b, budget] float32; None numbers it by slots.
 
     The current frame is the last place before the blocks that follow, and every frame before it is a place further
@@ -105,14 +105,16 @@ def ages_of(memory: MemoryTokens) -> Tensor:
     return memory.ages
 
 
-DOORS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
+EXTENSION_POINTS = {name: name for name in ("blocks", "hook", "condition", "beside")} | {"extra_experts": "expert"}
 """Methods of an integration that go through one of a backbone's doors (`Backbone.hosts`)."""
 
 
-def doors_of(kind: type[Integration]) -> frozenset[str]:
+def extension_points(kind: type[Integration]) -> frozenset[str]:
     """The doors an integration goes through: those it overrides. Asked before it is built to a backbone's sizes."""
-    overridden = {door for name, door in DOORS.items() if getattr(kind, name) is not getattr(Integration, name)}
-    return kind.brings | overridden
+    overridden = {
+        point for name, point in EXTENSION_POINTS.items() if getattr(kind, name) is not getattr(Integration, name)
+    }
+    return kind.required_features | overridden
 
 
 def required(memory: MemoryTokens | None) -> MemoryTokens:

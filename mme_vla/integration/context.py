@@ -9,8 +9,8 @@ from mme_vla.integration.base import (
     MEMORY_VISIBILITY,
     Integration,
     checked_position,
+    explicit_positions,
     memory_visibility,
-    own_positions,
     required,
 )
 from mme_vla.registry import INTEGRATIONS
@@ -63,7 +63,7 @@ class Context(Integration):
 
     def blocks(self, observation: Sequence[Block], memory: MemoryTokens | None) -> list[Block]:
         memory = required(memory)
-        positions = own_positions(memory, self.memory_position)
+        positions = explicit_positions(memory, self.memory_position)
         block = Block("memory", memory.tokens, memory.mask, "vlm", positions)
-        before = 1 + [seen.name for seen in observation].index("images") if self.mutual else 0
+        before = 1 + [block.name for block in observation].index("images") if self.mutual else 0
         return [*observation[:before], block, *observation[before:]]

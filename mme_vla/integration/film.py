@@ -13,7 +13,7 @@ from mme_vla.types import MemoryTokens
 class PooledIntegration(Integration):
     """Hands memory over as one vector of `feature_width` numbers; a backbone that reads one says it hosts `vector`."""
 
-    brings = frozenset({"vector"})
+    required_features = frozenset({"vector"})
     feature_width: int
 
     def feature(self, memory: MemoryTokens | None) -> Tensor:
@@ -22,7 +22,7 @@ class PooledIntegration(Integration):
 
 
 @INTEGRATIONS.register("film")
-class Film(PooledIntegration):
+class FiLM(PooledIntegration):
     """The mean of the memory's tokens, normed and projected."""
 
     def __init__(self, backbone: Any, width: int = 64) -> None:
@@ -41,8 +41,8 @@ class Film(PooledIntegration):
         self.norm, self.out = nn.LayerNorm(width), nn.Linear(width, width)
 
     def feature(self, memory: MemoryTokens | None) -> Tensor:
-        found = required(memory)
-        counted = found.mask[..., None].to(found.tokens.dtype)
+        features = required(memory)
+        counted = features.mask[..., None].to(features.tokens.dtype)
         # Tokens where the mask is False are undefined: zero them before they are weighed.
-        tokens = found.tokens.masked_fill(~found.mask[..., None], 0)
+        tokens = features.tokens.masked_fill(~features.mask[..., None], 0)
         return self.out(self.norm(tokens.sum(1) / counted.sum(1).clamp(min=1)))

@@ -39,14 +39,14 @@ class ModulatorLayer(nn.Module):
         k, v = kv.chunk(2, dim=-2)
         return rotate(k, rotation(_positions(0, memory) if positions is None else positions, self.head_dim)), v
 
-    def recall(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
+    def read_memory(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """r: what actions [b, h, d] read from memory; queries stand after all memory slots, padding included."""
         q = self.q(self.norm(x)[0]).unflatten(-1, (-1, self.head_dim))
         return self.out(attend(rotate(q, rotation(_positions(k.shape[1], x), self.head_dim)), k, v, mask))
 
     def forward(self, x: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
         """x̂ = rms(x)·(1 + a) + β with (a, β) = W r + b."""
-        a, beta = self.modulation(self.recall(x, k, v, mask)).float().chunk(2, dim=-1)
+        a, beta = self.modulation(self.read_memory(x, k, v, mask)).float().chunk(2, dim=-1)
         if self.exact_identity:
             # The same direction at x's own size: the norm that follows removes it, and a = β = 0 gives x to the bit.
             size = (x.float().square().mean(-1, keepdim=True) + EPS).sqrt()

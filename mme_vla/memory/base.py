@@ -17,7 +17,7 @@ LINES = 16
 
 
 @dataclass(frozen=True)
-class LooksBack:
+class PastViewSpec:
     """Past views that a memory gives the backbone along with the current ones, of every camera.
 
     frames: how many, the current one among them. stride: frames between two of them.
@@ -68,7 +68,7 @@ class Memory(nn.Module):
     pad_left: bool = False
     timed: bool = False
     reads_motion: bool = False
-    looks_back: LooksBack | None = None
+    past_view_spec: PastViewSpec | None = None
     lazy: bool = False
     reporting: bool = False
     float32_products: str = "ieee"
@@ -127,13 +127,13 @@ class Memory(nn.Module):
             int64 [n], ascending, each once.
         """
         length = int(max(steps, default=-1)) + 1
-        return every_one([self.storage.kept_frames(length), self.frames_scored(length)])
+        return union_frames([self.storage.stored_frames(length), self.frames_scored(length)])
 
     def frames_scored(self, length: int) -> np.ndarray:
         """Say which of the first `length` frames the scorer has to be shown: by default all, where there is one."""
         return np.arange(0 if self.make_scorer() is None else length)
 
-    def marked(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
+    def condition_on_prompt(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
         """A selection as the backbone reads it beside a prompt: `mark` [b, n, d_vision] on what are vision tokens."""
         return history if self.reads_motion else replace(history, features=mark(history.features))
 
@@ -220,12 +220,12 @@ class Memory(nn.Module):
         return False
 
 
-def every_one(lists: Sequence[np.ndarray]) -> np.ndarray:
+def union_frames(lists: Sequence[np.ndarray]) -> np.ndarray:
     """All frames of some lists, ascending, each once; int64 [n]."""
     return np.unique(np.concatenate(lists)) if lists else np.zeros(0, np.int64)
 
 
-def whole_frames(frames: np.ndarray, grid: int) -> np.ndarray:
+def all_patches(frames: np.ndarray, grid: int) -> np.ndarray:
     """All patches of some frames as (frame, patch) [n·grid², 2], frame by frame."""
     return np.stack(np.meshgrid(frames, np.arange(grid**2), indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -287,7 +287,7 @@ def video_frames(length: int, max_video: int, stride: int) -> np.ndarray:
 def jittered(frames: np.ndarray, exec_start: int, jitter: int, rng: np.random.Generator) -> np.ndarray:
     """Move every frame but the last by up to `jitter` frames, video and execution each within its own part."""
     past, step = frames[:-1], frames[-1]
-    moved = past + rng.integers(-jitter, jitter + 1, len(past))
+    shifted = past + rng.integers(-jitter, jitter + 1, len(past))
     video = past < exec_start
     low, high = np.where(video, 0, exec_start), np.where(video, min(exec_start, step) - 1, step - 1)
-    return np.append(np.unique(np.clip(moved, low, high)), step)
+    return np.append(np.unique(np.clip(shifted, low, high)), step)

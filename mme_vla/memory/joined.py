@@ -10,12 +10,12 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import LooksBack, Memory, every_one
+from mme_vla.memory.base import Memory, PastViewSpec, union_frames
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
-WHOLE = 16  # shares are multiples of it, so that they hold whole frames of the smaller grids
+SHARE_UNIT = 16  # shares are multiples of it, so that they hold whole frames of the smaller grids
 
 
 @MEMORIES.register("joined")
@@ -52,7 +52,9 @@ class JoinedMemory(Memory):
         self.timed = all(member.timed for member in built)
         self.reads_motion = any(member.reads_motion for member in built)
         self.lazy = all(member.lazy for member in built)
-        self.looks_back = one_look_back({n: m.looks_back for n, m in zip(self.names, built, strict=True)})
+        self.past_view_spec = single_past_view_spec(
+            {n: m.past_view_spec for n, m in zip(self.names, built, strict=True)}
+        )
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
@@ -62,23 +64,23 @@ class JoinedMemory(Memory):
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """What any member remembers, as the stored tokens it is made of."""
-        chosen = [
-            finer(member.select(seen, step, rng), member.storage.grid, self.storage.grid)
-            for member, seen in zip(self.memories, self._views(history), strict=True)
+        indices = [
+            finer(member.select(view, step, rng), member.storage.grid, self.storage.grid)
+            for member, view in zip(self.memories, self._views(history), strict=True)
         ]
-        return np.unique(np.concatenate(chosen), axis=0)
+        return np.unique(np.concatenate(indices), axis=0)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([member.frames_read(steps, exec_start) for member in self.memories])
+        return union_frames([member.frames_read(steps, exec_start) for member in self.memories])
 
     def frames_scored(self, length: int) -> np.ndarray:
-        return every_one([member.frames_scored(length) for member in self.memories])
+        return union_frames([member.frames_scored(length) for member in self.memories])
 
     def make_scorer(self) -> FrameScorer | None:
         for member in self.memories:
             scorer = member.make_scorer()
             if scorer is not None:
-                return _Spread(scorer, member.storage.grid, self.storage.grid)
+                return _Upsampled(scorer, member.storage.grid, self.storage.grid)
         return None
 
     def padded_length(self, count: int) -> int:
@@ -94,17 +96,17 @@ class JoinedMemory(Memory):
         features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
         return HistoryTokens(features, positions, mask, parts[0].step)
 
-    def marked(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
-        parts = [self.memories[i].marked(piece, mark) for i, piece in self._pieces(history)]
+    def condition_on_prompt(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        parts = [self.memories[i].condition_on_prompt(piece, mark) for i, piece in self._pieces(history)]
         return replace(history, features=torch.cat([part.features for part in parts], 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         memories = self.memories
-        found: dict[int, MemoryTokens] = {}
+        outputs: dict[int, MemoryTokens] = {}
         for i, piece in self._pieces(history):
             memories[i].reporting = self.reporting
-            found[i] = memories[i](piece)
-        return self._joined([found[i] for i in range(len(memories))])
+            outputs[i] = memories[i](piece)
+        return self._joined([outputs[i] for i in range(len(memories))])
 
     def _pieces(self, history: HistoryTokens) -> list[tuple[int, HistoryTokens]]:
         """Each member's number and selection, in the order in which they lie."""
@@ -125,7 +127,7 @@ class JoinedMemory(Memory):
 
     def prepare(self, history: History, stream: Any) -> bool:
         members = zip(self.memories, self._views(history), stream, strict=True)
-        return sum(member.prepare(view, own) for member, view, own in members) > 0  # a piece of each
+        return sum(member.prepare(view, piece) for member, view, piece in members) > 0  # a piece of each
 
     @property
     def memories(self) -> list[Memory]:
@@ -135,15 +137,15 @@ class JoinedMemory(Memory):
     def _views(self, history: History) -> list[History]:
         return [CoarserHistory(history, member.storage) for member in self.memories]
 
-    def _joined(self, found: Sequence[MemoryTokens]) -> MemoryTokens:
+    def _joined(self, outputs: Sequence[MemoryTokens]) -> MemoryTokens:
         metrics = {
             f"{name}/{key}": value
-            for name, tokens in zip(self.names, found, strict=True)
+            for name, tokens in zip(self.names, outputs, strict=True)
             for key, value in tokens.metrics.items()
         }
-        told = [f.ages for f in found if f.ages is not None]
-        ages = torch.cat(told, 1) if len(told) == len(found) else None
-        tokens, mask = torch.cat([f.tokens for f in found], 1), torch.cat([f.mask for f in found], 1)
+        member_ages = [f.ages for f in outputs if f.ages is not None]
+        ages = torch.cat(member_ages, 1) if len(member_ages) == len(outputs) else None
+        tokens, mask = torch.cat([f.tokens for f in outputs], 1), torch.cat([f.mask for f in outputs], 1)
         return MemoryTokens(tokens, mask, metrics, ages)
 
 
@@ -174,14 +176,14 @@ class CoarserHistory(History):
 
     def _pooled(self, indices: np.ndarray, gather: Callable[[np.ndarray], Tensor]) -> Tensor:
         parts = (self._stored.spec.grid // self.spec.grid) ** 2
-        found = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
+        pooled = gather(finer(indices, self.spec.grid, self._stored.spec.grid))
         if parts == 1:
-            return found
-        cells = found.unflatten(0, (-1, parts)).float()
-        return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(found.dtype)
+            return pooled
+        cells = pooled.unflatten(0, (-1, parts)).float()
+        return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(pooled.dtype)
 
 
-class _Spread:
+class _Upsampled:
     """A member's scorer, its rows spread over the finer grid that is stored."""
 
     def __init__(self, scorer: FrameScorer, grid: int, fine: int) -> None:
@@ -219,11 +221,11 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
     taken = sum(section.get("budget") or 0 for section in sections)
     open_ones = [section for section in sections if section.get("budget") is None]
     share = (budget - taken) // max(len(open_ones), 1)
-    share -= share % WHOLE if share >= WHOLE else 0
+    share -= share % SHARE_UNIT if share >= SHARE_UNIT else 0
     if taken > budget or (open_ones and share < 1):
-        asked = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
+        requested = ", ".join(f"{s['name']} {s.get('budget') or 'an even share'}" for s in sections)
         raise UserError(
-            f"memory.budget={budget} is less than what its members ask for ({asked}): lower their budgets, or raise it."
+            f"memory.budget={budget} is less than its members use ({requested}): lower their budgets, or raise it."
         )
     return [{**section, "budget": share} if section in open_ones else section for section in sections]
 
@@ -252,16 +254,16 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
     return StorageSpec(grid, one.pooling, every, next(iter(scorers.values()), ""))
 
 
-def one_look_back(looks: Mapping[str, LooksBack | None]) -> LooksBack | None:
+def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
     """What the one member gives that looks back; None where none does.
 
     Raises:
         UserError: several do, and a tower looks back in one way.
     """
-    found = {name: look for name, look in looks.items() if look is not None}
-    if len(found) > 1:
-        raise UserError(f"{' and '.join(found)} each give the vision tower past views: join only one of them.")
-    return next(iter(found.values()), None)
+    defined = {name: spec for name, spec in specs.items() if spec is not None}
+    if len(defined) > 1:
+        raise UserError(f"{' and '.join(defined)} each give the vision tower past views: join only one of them.")
+    return next(iter(defined.values()), None)
 
 
 def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:

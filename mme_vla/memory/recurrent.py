@@ -17,7 +17,7 @@ from torch.utils.checkpoint import checkpoint
 
 from mme_vla.config.devices import float32_products
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, every_one, jittered, recurrent_frames, token_positions, whole_frames
+from mme_vla.memory.base import Memory, all_patches, jittered, recurrent_frames, token_positions, union_frames
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -25,7 +25,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 State = tuple[Tensor, ...]
 """What is carried from frame to frame; each tensor [b, …]."""
 
-KEPT = 4
+MAX_SNAPSHOTS = 4
 """States kept of an episode: replans every quarter, half, three quarters or whole of a stride all continue one."""
 
 
@@ -45,22 +45,22 @@ class RecurrentStream:
     asked: the step of the last decision. pace: frames from the decision before it to that one.
     """
 
-    kept: list[Taken] = field(default_factory=list)
+    snapshots: list[Taken] = field(default_factory=list)
     updates: int = 0
-    asked: int | None = None
+    last_step: int | None = None
     pace: int | None = None
 
     def decides(self, step: int) -> None:
         """Note that a decision is made at `step`."""
-        if self.asked is not None and step > self.asked:
-            self.pace = step - self.asked
-        self.asked = step
+        if self.last_step is not None and step > self.last_step:
+            self.pace = step - self.last_step
+        self.last_step = step
 
     def continued(self, frames: np.ndarray) -> Taken:
         """The state that has taken the longest beginning of these frames; a fresh one where none has."""
-        fitting = [taken for taken in self.kept if np.array_equal(frames[: len(taken.frames)], taken.frames)]
+        fitting = [taken for taken in self.snapshots if np.array_equal(frames[: len(taken.frames)], taken.frames)]
         best = max(fitting, key=lambda taken: len(taken.frames), default=Taken(frames[:0]))
-        self.kept = [*(taken for taken in self.kept if taken is not best), best][-KEPT:]
+        self.snapshots = [*(taken for taken in self.snapshots if taken is not best), best][-MAX_SNAPSHOTS:]
         return best
 
 
@@ -182,10 +182,10 @@ class RecurrentMemory(Memory):
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         limits = (self.max_steps, self.max_video, self.stride)
-        return every_one([recurrent_frames(int(step), exec_start, *limits) for step in steps])
+        return union_frames([recurrent_frames(int(step), exec_start, *limits) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.frames(history, step, rng), self.storage.grid)
+        return all_patches(self.frames(history, step, rng), self.storage.grid)
 
     def padded_length(self, count: int) -> int:
         """Whole chunks: the steps of a short episode are few, and nothing changes but the time they take."""
@@ -290,9 +290,9 @@ class RecurrentMemory(Memory):
         to do where its list does not extend one that was taken: once a list is full its first frames go, and the
         released computation begins anew behind them at every decision.
         """
-        if stream.asked is None:
+        if stream.last_step is None:
             return False
-        expected = self.frames(history, stream.asked + (stream.pace or self.stride))[:-1]
+        expected = self.frames(history, stream.last_step + (stream.pace or self.stride))[:-1]
         expected = expected[expected < len(history)]
         if not len(expected):
             return False
@@ -306,7 +306,7 @@ class RecurrentMemory(Memory):
     def _enter(self, group: Sequence[tuple[History, Taken, np.ndarray]]) -> None:
         """Let equally many new frames enter each of these states."""
         state = _stack([taken.state or self.init_state(1) for _, taken, _ in group])
-        indices = [whole_frames(new, self.storage.grid) for _, _, new in group]
+        indices = [all_patches(new, self.storage.grid) for _, _, new in group]
         features = torch.stack([history.gather(at) for (history, _, _), at in zip(group, indices, strict=True)])
         positions = np.stack([token_positions(at, self.storage.grid) for at in indices])
         everywhere = torch.ones(features.shape[:2], dtype=torch.bool, device=features.device)

@@ -86,7 +86,7 @@ class TokenDrop(PerceptualMemory):
         return ChangeScorer(self.storage.grid, self.stride)
 
     def frames_scored(self, length: int) -> np.ndarray:
-        return self.storage.kept_frames(length)
+        return self.storage.stored_frames(length)
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         patches = self.storage.grid**2
@@ -115,5 +115,5 @@ def ranked_patches(scores: FrameScores, patches: int, limit: int) -> np.ndarray:
 
 def most_changed(ranked: np.ndarray, step: int, budget: int) -> np.ndarray:
     """The last `budget` of the ranked patches that lie no later than `step`, in time order."""
-    chosen = ranked[ranked[:, 0] <= step][-budget:]
-    return chosen[np.lexsort((chosen[:, 1], chosen[:, 0]))]
+    selected = ranked[ranked[:, 0] <= step][-budget:]
+    return selected[np.lexsort((selected[:, 1], selected[:, 0]))]

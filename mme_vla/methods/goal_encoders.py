@@ -70,13 +70,13 @@ def load_with_goal_encoder[P: PolicyProcessor](
             f"you trust it: from_pretrained(…, tokenizer={brief(text, 200)})."
         )
     try:
-        given: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
+        options: dict[str, Any] = {"embodiment": Embodiment.from_dict(settings.pop("embodiment", {}))}
         if stats is not None:
             if not isinstance(stats, str):
                 raise UserError(f"stats={brief(stats)} must be the name of a file.")
             path = inside(folder, stats, "statistics")
             check_sums(folder, [stats])
-            given["stats"] = NormStats.load(path)
-        return kind(**given, **settings)
+            options["stats"] = NormStats.load(path)
+        return kind(**options, **settings)
     except (TypeError, ValueError, KeyError, IndexError) as error:
         raise UserError(f"{folder}: its processor cannot be built ({error}).") from None

@@ -137,19 +137,19 @@ class Prismatic(nn.Module):
         Returns:
             Hidden states [b, n, d] after the final norm; with `every_layer` a tuple, the embeddings first.
         """
-        answer = self.language.model(
+        output = self.language.model(
             inputs_embeds=tokens,
             attention_mask=mask,
             position_ids=positions,
             use_cache=False,
             output_hidden_states=every_layer,
         )
-        return answer.hidden_states if every_layer else answer.last_hidden_state
+        return output.hidden_states if every_layer else output.last_hidden_state
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Recompute the Llama's layers in the backward pass, through transformers' own switch."""
-        if wanted:
-            self.language.gradient_checkpointing_enable(checkpoint_options(wanted))
+        if mode:
+            self.language.gradient_checkpointing_enable(checkpoint_options(mode))
         else:
             self.language.gradient_checkpointing_disable()
 
@@ -163,8 +163,8 @@ class Angles(nn.Module):
 
     def forward(self, x: Tensor, position_ids: Tensor) -> tuple[Tensor, Tensor]:
         """Angles' cos and sin [b, n, h] at positions [b, n], in x's dtype: what transformers' layers ask for."""
-        turn = rotation(position_ids, self.head_dim)
-        return turn.cos.squeeze(2).to(x.dtype), turn.sin.squeeze(2).to(x.dtype)
+        rope = rotation(position_ids, self.head_dim)
+        return rope.cos.squeeze(2).to(x.dtype), rope.sin.squeeze(2).to(x.dtype)
 
 
 def _llama(config: LlamaConfig, vocab_size: int) -> Any:

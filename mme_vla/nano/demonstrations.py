@@ -87,7 +87,7 @@ class Demonstration:
     exec_start: int
     states: np.ndarray
     motions: Motions
-    pictures: dict[str, dict[int, np.ndarray]]
+    images: dict[str, dict[int, np.ndarray]]
     subgoals: dict[str, list[str]] = field(default_factory=dict)
 
     def save(self, path: Path) -> None:
@@ -95,24 +95,24 @@ class Demonstration:
         names = ("task", "seed", "difficulty", "goal", "length", "exec_start", "subgoals")
         about = {name: getattr(self, name) for name in names}
         arrays = {"states": self.states, "decisions": self.motions.decisions, "targets": self.motions.targets}
-        for camera, taken in self.pictures.items():
+        for camera, taken in self.images.items():
             arrays[f"{camera}_frames"] = np.array(list(taken), np.int64)
             arrays[f"{camera}_pictures"] = np.stack(list(taken.values()))
         with write_atomically(path) as draft, draft.open("wb") as file:
             np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)  # type: ignore[arg-type]
 
     @classmethod
-    def load(cls, path: Path, pictures: bool = True) -> "Demonstration":
+    def load(cls, path: Path, images: bool = True) -> "Demonstration":
         """Read what `save` wrote, or what of it is no picture."""
         with np.load(path) as file:
-            drawn = {
+            loaded_images = {
                 camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
                 for camera in CAMERAS
-                if pictures and f"{camera}_frames" in file
+                if images and f"{camera}_frames" in file
             }
             motions = Motions(file["decisions"], file["targets"])
             about = parse_json(str(file["about"]), str(path))
-            return cls(**about, states=file["states"], motions=motions, pictures=drawn)
+            return cls(**about, states=file["states"], motions=motions, images=loaded_images)
 
 
 @dataclass(frozen=True)
@@ -199,15 +199,17 @@ def record(
             motions = _carry_out(taken, motions.targets, chooser)
         if motions is None:
             return None
-        asked = [motions.decisions[:: choice.every] for choice in choices] or [motions.decisions]
-        at = {frame for frames in asked for frame in frames.tolist()}
-        read = at.union(*(choice.read(frames, taken.video) for choice, frames in zip(choices, asked, strict=False)))
-        wanted = {camera: read if camera == "front" else at for camera in cameras}
-        pictures: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
-        for frame in sorted(set().union(*wanted.values())):
+        frame_lists = [motions.decisions[:: choice.every] for choice in choices] or [motions.decisions]
+        at = {frame for frames in frame_lists for frame in frames.tolist()}
+        read = at.union(
+            *(choice.read(frames, taken.video) for choice, frames in zip(choices, frame_lists, strict=False))
+        )
+        required = {camera: read if camera == "front" else at for camera in cameras}
+        images: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
+        for frame in sorted(set().union(*required.values())):
             taken.put_back(frame)
-            for camera, picture in draw(env, [camera for camera in cameras if frame in wanted[camera]]):
-                pictures[camera][frame] = picture
+            for camera, image in draw(env, [camera for camera in cameras if frame in required[camera]]):
+                images[camera][frame] = image
         goal = (
             env.goals()[0].lower()
             if chooser is None
@@ -216,7 +218,7 @@ def record(
         texts = [taken.texts[frame] for frame in motions.decisions]
         return Demonstration(
             type(env).__name__, seed, difficulty, goal, len(taken.states), taken.video,
-            np.stack(taken.states), motions, pictures, {kind: _shown(texts, kind) for kind in SUBGOALS},
+            np.stack(taken.states), motions, images, {kind: _subgoal_texts(texts, kind) for kind in SUBGOALS},
         )  # fmt: skip
     finally:
         env.close()
@@ -247,15 +249,15 @@ class _Taken:
 
 def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
     """What a task offers to choose from."""
-    given = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
-    return read_options(given, len(chooser.choice))
+    options = [Option(choice.label, choice.action, choice.needs_point).to_dict() for choice in env.choices()]
+    return read_options(options, len(chooser.choice))
 
 
 def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     """The motions of a demonstration, or its choices, if it succeeds."""
     from mme_vla.envs.recording.frames import choices_of, motions_of
     from mme_vla.envs.recording.recorder import Recorder
-    from mme_vla.envs.render_request import Drawing
+    from mme_vla.envs.render_request import RenderRequest
 
     steps: list[RecordedStep] = []
 
@@ -263,7 +265,7 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
         steps.append(step)
         taken.add(step.obs, step.info, step.info["is_video_demo"])
 
-    result = Recorder(taken.env, on_step=take, drawing=Drawing(now=())).record()
+    result = Recorder(taken.env, on_step=take, render_request=RenderRequest(now=())).record()
     if not result.success:
         return None
     return choices_of(steps) if choosing else motions_of(steps)
@@ -272,10 +274,10 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
 def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
     """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.render_request import Drawing
+    from mme_vla.envs.render_request import RenderRequest
 
     env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
-    env.drawing = Drawing(now=())
+    env.render_request = RenderRequest(now=())
     env.on_frame = taken.add
     env.reset()
     decisions = []
@@ -288,12 +290,12 @@ def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None"
     return None
 
 
-def _shown(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
+def _subgoal_texts(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
     """The subgoal at each decision; where the simulator names none, the last one stays."""
-    found: list[str] = []
+    result: list[str] = []
     for text in texts:
-        found.append(online_subgoal(text, kind) or (found[-1] if found else ""))
-    return found
+        result.append(online_subgoal(text, kind) or (result[-1] if result else ""))
+    return result
 
 
 def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:

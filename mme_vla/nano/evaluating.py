@@ -111,7 +111,7 @@ def run_episodes(
     return records
 
 
-def film(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord]) -> list[Path]:
+def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord]) -> list[Path]:
     """Films of the first success and the first failure of these records, run once more with every frame drawn.
 
     Args:

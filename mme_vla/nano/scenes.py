@@ -44,13 +44,13 @@ def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> 
         env.reset()
         arm, rng = Arm(env.agent), np.random.default_rng(seed)
         owners = _owners(env)
-        pictures, labels = [], []
+        images, labels = [], []
         for _ in range(count):
             _arrange(env, arm, rng)
-            for picture, segments in _take(env):
-                pictures.append(resize_with_pad_uint8(picture, size))
-                labels.append(_label(picture, segments, owners))
-        return np.stack(pictures), np.stack(labels)
+            for image, segments in _take(env):
+                images.append(resize_with_pad_uint8(image, size))
+                labels.append(_label(image, segments, owners))
+        return np.stack(images), np.stack(labels)
     finally:
         env.close()
 
@@ -59,10 +59,10 @@ def record_scenes(folder: Path, task: str, seed: int, difficulty: str, count: in
     """Draw a scene into `folder`, unless it is there already; the path of its file."""
     path = folder / f"{task}-{difficulty}-{seed}.npz"
     if not path.is_file():
-        pictures, labels = draw_scene(task, seed, difficulty, count, size)
+        images, labels = draw_scene(task, seed, difficulty, count, size)
         folder.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, pictures=pictures, labels=labels)
+            np.savez_compressed(file, pictures=images, labels=labels)
     return path
 
 
@@ -93,28 +93,28 @@ def _arrange(env: "Task", arm: Any, rng: np.random.Generator) -> None:
             continue
         lifted = rng.uniform(0, 0.15) if rng.random() < 0.2 else 0.0
         place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), home.p[2] + lifted])
-        thing.move_to(sapien.Pose(place, (_turn(rng.uniform(-np.pi, np.pi)) * sapien.Pose(q=home.q)).q))
+        thing.move_to(sapien.Pose(place, (_yaw_pose(rng.uniform(-np.pi, np.pi)) * sapien.Pose(q=home.q)).q))
     if rng.random() < 0.2:
-        env.agent.robot.set_qpos(torch.as_tensor(_rest(env), dtype=torch.float32)[None])
+        env.agent.robot.set_qpos(torch.as_tensor(_home_qpos(env), dtype=torch.float32)[None])
         return
     near = [thing.position for thing in env.things if abs(thing.position[0]) < 0.5 and thing.position[2] > -0.05]
     place = np.array([rng.uniform(-0.25, 0.2), rng.uniform(-0.28, 0.28), rng.uniform(0.03, 0.35)])
     if near and rng.random() < 0.6:
         place = near[rng.integers(len(near))] + [0, 0, rng.uniform(0.01, 0.2)]
     down = sapien.Pose(q=[0, 1, 0, 0])
-    joints = arm.ik(sapien.Pose(place) * _turn(rng.uniform(-0.8, 0.8)) * down, env.qpos)
+    joints = arm.ik(sapien.Pose(place) * _yaw_pose(rng.uniform(-0.8, 0.8)) * down, env.qpos)
     if joints is not None:
         fingers = [] if env.stick else [rng.uniform(0.0, 0.04)] * 2
         env.agent.robot.set_qpos(torch.as_tensor(np.append(joints, fingers), dtype=torch.float32)[None])
 
 
-def _turn(yaw: float) -> Any:
+def _yaw_pose(yaw: float) -> Any:
     import sapien
 
     return sapien.Pose(q=[np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)])
 
 
-def _rest(env: "Task") -> np.ndarray:
+def _home_qpos(env: "Task") -> np.ndarray:
     return env.reset_action if env.stick else np.append(env.reset_action[:7], [0.04, 0.04])
 
 
@@ -130,13 +130,13 @@ def _take(env: "Task") -> list[tuple[np.ndarray, np.ndarray]]:
     return taken
 
 
-def _label(picture: np.ndarray, segments: np.ndarray, owners: dict[int, str]) -> np.ndarray:
+def _label(image: np.ndarray, segments: np.ndarray, owners: dict[int, str]) -> np.ndarray:
     label = np.zeros(segments.shape, np.uint8)
     for number in np.unique(segments):
         name = owners.get(int(number))
         if name is not None:
-            shown = segments == number
-            label[shown] = CLASSES.index(_class_of(name, picture[shown]))
+            mask = segments == number
+            label[mask] = CLASSES.index(_class_of(name, image[mask]))
     step = len(label) // LABEL_SIDE
     return label[step // 2 :: step, step // 2 :: step]
 

@@ -88,21 +88,21 @@ class ChoiceSession:
         env: Any,
         episode: EpisodeId,
         max_choices: int = MAX_CHOICES,
-        pictures: bool = True,
+        images: bool = True,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         if isinstance(max_choices, bool) or not isinstance(max_choices, int) or max_choices < 1:
             raise UserError(f"max_choices is {max_choices!r}; expected a positive integer.")
-        self.env, self.episode, self.max_choices, self.pictures = env, episode, max_choices, pictures
+        self.env, self.episode, self.max_choices, self.images = env, episode, max_choices, images
         self.goal, self.status, self.error = "", "not started", ""
         self.ended_by = ""
         """What ended the episode where it was not the environment: `max_choices`, or a player's reason."""
         self.options: tuple[Option, ...] = ()
         self.reveals: list[Reveal] = []
         self.decisions: list[Decision] = []
-        self._clock, self._shown_at = clock, 0.0
+        self._clock, self._displayed_at = clock, 0.0
         self._begun = clock()
-        self._simulated = self._thought = 0.0
+        self._simulated = self._policy_seconds = 0.0
 
     # Playing ------------------------------------------------------------------------------------------------------
 
@@ -141,18 +141,18 @@ class ChoiceSession:
                 Nothing has happened then, and another choice can be made.
         """
         option, point = self.check(action)
-        self._thought += (thought := self._clock() - self._shown_at)
+        self._policy_seconds += (seconds := self._clock() - self._displayed_at)
         started = self._clock()
-        wanted = {"choice": option.label, "point": [] if point is None else list(point)}
-        observation, _, _, _, info = self.env.step(wanted)
+        env_action = {"choice": option.label, "point": [] if point is None else list(point)}
+        observation, _, _, _, info = self.env.step(env_action)
         self._simulated += self._clock() - started
         frames = self._frames(observation or {})
-        first = self.frames_shown
+        first = self.n_displayed_frames
         self.error = str(info.get("error_message", ""))
         self._take(frames, info, option.action)
         span = (first, first + len(frames))
         self.decisions.append(
-            Decision(option.label, option.action, point, span, self.status, round(thought, 3), dict(note or {}))
+            Decision(option.label, option.action, point, span, self.status, round(seconds, 3), dict(note or {}))
         )
         if not self.over and len(self.decisions) >= self.max_choices:
             self.give_up("timeout", "max_choices")
@@ -201,7 +201,7 @@ class ChoiceSession:
         return self.status in OUTCOMES
 
     @property
-    def frames_shown(self) -> int:
+    def n_displayed_frames(self) -> int:
         """Frames revealed so far."""
         return sum(len(reveal.frames) for reveal in self.reveals)
 
@@ -237,8 +237,8 @@ class ChoiceSession:
             model=model, checkpoint=checkpoint, model_seed=model_seed, max_steps=max_steps, action_space="multi_choice",
             task=which.task, episode=which.episode, seed=which.seed, difficulty=which.difficulty, split=which.split,
             outcome=self.status, steps=self.steps, error=self.error or None,
-            seconds=Seconds(round(self._simulated, 3), round(self._thought, 3), round(self._clock() - self._begun, 3)),
-            extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},
+            seconds=Seconds(round(self._simulated, 3), round(self._policy_seconds, 3), round(self._clock() -
+            self._begun, 3)), extra={"decisions": [asdict(decision) for decision in self.decisions], **ended, **extra},
         )  # fmt: skip
 
     def close(self) -> None:
@@ -246,12 +246,12 @@ class ChoiceSession:
         self.env.close()
 
     def _frames(self, observation: Mapping[str, Any]) -> list[np.ndarray]:
-        if self.pictures:
+        if self.images:
             return list(observation.get("front_rgb_list", ()))
         return [UNSEEN] * max((len(values) for values in observation.values()), default=0)
 
     def _take(self, frames: list[np.ndarray], info: Mapping[str, Any], title: str) -> None:
-        self.reveals.append(Reveal(title, frames, self.frames_shown))
+        self.reveals.append(Reveal(title, frames, self.n_displayed_frames))
         self.status = str(info["status"])
         if info.get("task_goal"):
             goal = info["task_goal"]
@@ -261,7 +261,7 @@ class ChoiceSession:
                 Option(str(option["label"]).lower(), str(option["action"]), bool(option["need_parameter"]))
                 for option in info["available_multi_choices"]
             )
-        self._shown_at = self._clock()
+        self._displayed_at = self._clock()
 
 
 def checked_point(point: Any, option: Option) -> tuple[float, float]:

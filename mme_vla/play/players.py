@@ -29,7 +29,7 @@ class Player:
     """
 
     model = "player"
-    looks = True
+    needs_images = True
 
     def start(self, session: ChoiceSession) -> None:
         """Take note of a new episode, which has been started."""
@@ -73,7 +73,7 @@ class RandomPlayer(Player):
     """
 
     model = "random"
-    looks = False
+    needs_images = False
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed
@@ -99,7 +99,7 @@ class OraclePlayer(Player):
     """
 
     model = "oracle"
-    looks = False
+    needs_images = False
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
         """See `Player`.

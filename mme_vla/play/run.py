@@ -14,25 +14,23 @@ from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records
 from mme_vla.play.game import ChoiceSession, EpisodeId
 
 
-def make_session(
-    episode: EpisodeId, env: str, max_steps: int, max_choices: int, pictures: bool = True
-) -> ChoiceSession:
+def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int, images: bool = True) -> ChoiceSession:
     """The simulator for one episode.
 
     Args:
         episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out.
-        pictures: whether the player looks at them; the official environment renders in any case.
+        images: whether the player looks at them; the official environment renders in any case.
 
     Raises:
         UserError: as `make_env`.
     """
     from mme_vla.envs import make_env
 
-    render = pictures or env == "official"
+    render = images or env == "official"
     which = (episode.task, episode.split, episode.episode)
     made = make_env(*which, "multi_choice", max_steps=max_steps, env=env, render=render)
     try:
-        return ChoiceSession(made, episode, max_choices, pictures)
+        return ChoiceSession(made, episode, max_choices, images)
     except BaseException:
         made.close()
         raise
@@ -65,7 +63,7 @@ class PlayRun:
     def __init__(
         self,
         folder: Path,
-        wanted: Sequence[EpisodeId],
+        episodes: Sequence[EpisodeId],
         identity: Identity,
         make: Callable[[EpisodeId], ChoiceSession],
         retry_errors: bool = False,
@@ -73,19 +71,20 @@ class PlayRun:
         self.folder, self.identity, self.make = folder, identity, make
         claim_run(folder, identity.settings)
         self._log = RecordLog(folder / RECORDS)
-        self.wanted = list(wanted)
-        keys = {(which.task, which.episode) for which in self.wanted}
+        self.episodes = list(episodes)
+        keys = {(which.task, which.episode) for which in self.episodes}
         # Folders below hold runs of their own.
         there = [record for path in sorted(folder.glob("episodes*.jsonl")) for record in read_records(path)]
         self.records = [record for record in merge(there, "last") if (record.task, record.episode) in keys]
         done = finished(self.records, retry_errors)
-        self.todo = [which for which in self.wanted if (which.task, which.episode) not in done]
+        self.todo = [which for which in self.episodes if (which.task, which.episode) not in done]
 
     def save(self, session: ChoiceSession, **extra: Any) -> EpisodeRecord:
         """Write the record of a session that is over."""
-        own = self.identity
+        identity = self.identity
         return self._keep(
-            session.episode, session.record(own.model, own.checkpoint, own.model_seed, own.max_steps, **extra)
+            session.episode,
+            session.record(identity.model, identity.checkpoint, identity.model_seed, identity.max_steps, **extra),
         )
 
     def save_error(
@@ -102,11 +101,11 @@ class PlayRun:
             if not session.over:
                 session.give_up("error", reason)
             return self.save(session, **extra)
-        own = self.identity
+        identity = self.identity
         record = EpisodeRecord(
-            model=own.model, checkpoint=own.checkpoint, model_seed=own.model_seed, max_steps=own.max_steps,
-            action_space="multi_choice", task=which.task, episode=which.episode, seed=which.seed,
-            difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
+            model=identity.model, checkpoint=identity.checkpoint, model_seed=identity.model_seed,
+            max_steps=identity.max_steps, action_space="multi_choice", task=which.task, episode=which.episode,
+            seed=which.seed, difficulty=which.difficulty, split=which.split, outcome="error", steps=0, error=reason,
             extra={"decisions": [], "ended_by": reason, **extra},
         )  # fmt: skip
         return self._keep(which, record)

@@ -18,7 +18,7 @@ from mme_vla.subgoal.base import Usage
 from mme_vla.subgoal.clips import Clip, sample_video
 from mme_vla.subgoal.models.api import ApiFailure, make_api
 from mme_vla.subgoal.models.qwen3vl import TOKEN_SIDE, VIDEO_TOKENS, VLM, Question
-from mme_vla.subgoal.text import IMAGE, THOUSAND, VIDEO, MalformedAnswer, to_pixels, to_thousandths
+from mme_vla.subgoal.text import IMAGE, THOUSAND, VIDEO, MalformedReply, to_pixels, to_thousandths
 from mme_vla.utils import parse_json
 
 _OBJECT = re.compile(r"\{[^{}]*\}")
@@ -40,14 +40,14 @@ def option_list(options: Sequence[Option]) -> str:
     return "\n".join(f"{option.label}: {option.action}{' [point]' if option.needs_point else ''}" for option in options)
 
 
-def said(decision: Decision) -> str:
+def choice_text(decision: Decision) -> str:
     """A past decision in words: `a: pick up the cube at [442, 617]`."""
     point = decision.point
     place = "" if point is None else " at [{}, {}]".format(*(to_thousandths(int(value), SIDE) for value in point))
     return f"{decision.choice}: {decision.action}{place}"
 
 
-def whole_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = "") -> str:
+def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = "") -> str:
     """One question that tells the whole episode, `<video>` and `<image>` where pictures go.
 
     Args:
@@ -66,18 +66,20 @@ def whole_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[s
 
 def opening(goal: str, options: Sequence[Option], video: bool) -> str:
     """The first question of a conversation."""
-    shown = (
+    introduction = (
         "The video comes before you act; the picture is the present one." if video else "This is the present picture."
     )
-    return f"The task: {goal}\n{shown}\nOptions:\n{option_list(options)}\nWhat next?"
+    return f"The task: {goal}\n{introduction}\nOptions:\n{option_list(options)}\nWhat next?"
 
 
-def following(decision: Decision, options: Sequence[Option], moved: bool) -> str:
+def following(decision: Decision, options: Sequence[Option], changed: bool) -> str:
     """A later question of a conversation."""
-    shown = (
-        "the video shows it, the picture is the present one" if moved else "nothing moved; this is the present picture"
+    description = (
+        "the video shows it, the picture is the present one"
+        if changed
+        else "nothing moved; this is the present picture"
     )
-    return f"You chose {said(decision)}; {shown}.\nOptions:\n{option_list(options)}\nWhat next?"
+    return f"You chose {choice_text(decision)}; {description}.\nOptions:\n{option_list(options)}\nWhat next?"
 
 
 def retry_message(reason: str) -> str:
@@ -88,8 +90,8 @@ def retry_message(reason: str) -> str:
     )
 
 
-def parse_choice(answer: str, options: Sequence[Option]) -> dict[str, Any]:
-    """Read an answer: the last JSON object in it, whatever stands before.
+def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
+    """Read a reply: the last JSON object in it, whatever stands before.
 
     Returns:
         {"choice": letter, "point": [y, x] in pixels or None}.
@@ -97,42 +99,42 @@ def parse_choice(answer: str, options: Sequence[Option]) -> dict[str, Any]:
     Raises:
         MalformedAnswer: no object, an unknown option, or a point that is missing or none.
     """
-    if not answer.strip():
-        raise MalformedAnswer("the answer is empty")
-    found = _last_object(answer)
-    letter = found.get("choice")
+    if not reply.strip():
+        raise MalformedReply("the answer is empty")
+    fields = _last_object(reply)
+    letter = fields.get("choice")
     if not isinstance(letter, str):
-        raise MalformedAnswer('the answer has no "choice"')
+        raise MalformedReply('the answer has no "choice"')
     label = letter.strip().strip("().:[]").lower()
     option = next((option for option in options if option.label == label), None)
     if option is None:
-        raise MalformedAnswer(
+        raise MalformedReply(
             f"there is no option {brief(letter)}; the options are {', '.join(o.label for o in options)}"
         )
-    return {"choice": label, "point": _pixel(found.get("point"), option) if option.needs_point else None}
+    return {"choice": label, "point": _pixel(fields.get("point"), option) if option.needs_point else None}
 
 
 def _pixel(point: Any, option: Option) -> list[int]:
     if not isinstance(point, list) or len(point) != 2:
-        raise MalformedAnswer(f'option {option.label} needs "point": [row, column]')
+        raise MalformedReply(f'option {option.label} needs "point": [row, column]')
     for value in point:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise MalformedAnswer("a point is made of two numbers")
+            raise MalformedReply("a point is made of two numbers")
         if isinstance(value, float) and not math.isfinite(value):  # of a whole number too long, isfinite raises
-            raise MalformedAnswer("a point is made of two numbers")
+            raise MalformedReply("a point is made of two numbers")
         if not 0 <= value <= THOUSAND:
-            raise MalformedAnswer(f"a point lies within 0 and {THOUSAND}")
+            raise MalformedReply(f"a point lies within 0 and {THOUSAND}")
     return [min(to_pixels(value, SIDE), SIDE - 1) for value in point]
 
 
-def _last_object(answer: str) -> dict[str, Any]:
-    for text in reversed(_OBJECT.findall(answer)):
+def _last_object(reply: str) -> dict[str, Any]:
+    for text in reversed(_OBJECT.findall(reply)):
         try:
-            found: dict[str, Any] = parse_json(text, "the answer", finite=False)
-            return found
+            fields: dict[str, Any] = parse_json(text, "the answer", finite=False)
+            return fields
         except UserError:
             continue
-    raise MalformedAnswer("the answer holds no JSON object")
+    raise MalformedReply("the answer holds no JSON object")
 
 
 class ModelPlayer(Player):
@@ -159,12 +161,12 @@ class ModelPlayer(Player):
         answers: list[str] = []
         complaint = ""
         for _ in range(self.tries):
-            answer = self.ask(session, complaint)
-            answers.append(answer)
+            reply = self.ask(session, complaint)
+            answers.append(reply)
             try:
-                action = parse_choice(answer, session.options)
-            except MalformedAnswer as error:
-                self.usage.problems["malformed" if answer.strip() else "empty"] += 1
+                action = parse_choice(reply, session.options)
+            except MalformedReply as error:
+                self.usage.problems["malformed" if reply.strip() else "empty"] += 1
                 complaint = retry_message(str(error))
             else:
                 return action, {"answers": answers}
@@ -224,24 +226,24 @@ class QwenPlayer(ModelPlayer):
     def ask(self, session: ChoiceSession, complaint: str) -> str:
         """See `ModelPlayer`."""
         started = time.perf_counter()
-        (answer,) = self.vlm.generate([self.question(session, complaint)], self.max_new_tokens)
+        (completion,) = self.vlm.generate([self.question(session, complaint)], self.max_new_tokens)
         self.usage.seconds += time.perf_counter() - started
         self.usage.calls += 1
-        self.usage.input_tokens += answer.input_tokens
-        self.usage.output_tokens += answer.output_tokens
-        return answer.text
+        self.usage.input_tokens += completion.input_tokens
+        self.usage.output_tokens += completion.output_tokens
+        return completion.text
 
     def question(self, session: ChoiceSession, complaint: str = "") -> Question:
         """What is asked now."""
         first, *motions = session.reveals
-        shown: list[tuple[str, list[np.ndarray]]] = []
+        titled_clips: list[tuple[str, list[np.ndarray]]] = []
         if len(first.frames) > 1:
-            shown.append(("The video that comes before you act", list(first.frames[:-1])))
+            titled_clips.append(("The video that comes before you act", list(first.frames[:-1])))
         for reveal, decision in zip(motions, session.decisions, strict=True):
-            shown.append((f"You chose {said(decision)}", list(reveal.frames)))
-        clips = [(title, bool(frames)) for title, frames in shown]
-        user = whole_question(session.goal, session.options, clips, complaint)
-        return Question(SYSTEM, user, [session.frame], [self._clip(frames) for _, frames in shown if frames])
+            titled_clips.append((f"You chose {choice_text(decision)}", list(reveal.frames)))
+        clips = [(title, bool(frames)) for title, frames in titled_clips]
+        user = full_question(session.goal, session.options, clips, complaint)
+        return Question(SYSTEM, user, [session.frame], [self._clip(frames) for _, frames in titled_clips if frames])
 
     def _clip(self, frames: list[np.ndarray]) -> Clip:
         indices = sample_video(len(frames), most=self.clip_frames)
@@ -264,24 +266,24 @@ class GeminiPlayer(ModelPlayer):
         super().__init__("", tries)
         self.api = make_api(self.speaks, settings, "player", self.usage, client)
         self.model = self.api.settings.model
-        self._turns: list[tuple[str, list[Any]]] = []
+        self._conversation: list[tuple[str, list[Any]]] = []
 
     def start(self, session: ChoiceSession) -> None:
         """See `Player`."""
         super().start(session)
-        self._turns = []
+        self._conversation = []
 
     def ask(self, session: ChoiceSession, complaint: str) -> str:
         """See `ModelPlayer`."""
-        turn = ("user", [complaint] if complaint else self._news(session))
+        message = ("user", [complaint] if complaint else self._news(session))
         try:
-            reply = self.api.ask(SYSTEM, [*self._turns, turn])
+            reply = self.api.ask(SYSTEM, [*self._conversation, message])
         except ApiFailure as failure:
             self.usage.problems[failure.problem] += 1
             # A refusal is the model's answer, and counts; a network that fails is nobody's (`retry_errors` repeats it).
             outcome = "error" if failure.problem == "failed" else "fail"
             raise NoChoiceError(outcome, f"no answer ({failure.problem}): {failure}") from None
-        self._turns += [turn, ("model", [reply.text])]
+        self._conversation += [message, ("model", [reply.text])]
         return reply.text
 
     def _news(self, session: ChoiceSession) -> list[Any]:

@@ -67,9 +67,9 @@ def make_app(desk: Desk, local: bool = True) -> Any:
         return JSONResponse(desk.state())
 
     async def frames(request: Request) -> Response:
-        wanted = request.path_params
+        path_params = request.path_params
         try:
-            packed = await asyncio.to_thread(desk.frames, wanted["session"], wanted["number"])
+            packed = await asyncio.to_thread(desk.frames, path_params["session"], path_params["number"])
         except StaleError as error:
             return refuse(404, str(error))
         return Response(packed, media_type="application/octet-stream")
@@ -139,16 +139,20 @@ def _guarded(app: Any, local: bool) -> Any:
             unread = unread and bool(message.get("more_body", False))
             return message
 
-        async def sealed(message: Any) -> None:
+        async def send_with_headers(message: Any) -> None:
             if message["type"] == "http.response.start":
                 close = [(b"connection", b"close")] if unread else []
                 message = {**message, "headers": [*message["headers"], *HEADERS, *close]}
             await send(message)
 
         if local and not is_local(_host_of(scope)):
-            await sealed({"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]})
-            return await sealed({"type": "http.response.body", "body": b"This page is for this machine only.\n"})
-        return await app(scope, reading, sealed)
+            await send_with_headers(
+                {"type": "http.response.start", "status": 421, "headers": [(b"content-type", b"text/plain")]}
+            )
+            return await send_with_headers(
+                {"type": "http.response.body", "body": b"This page is for this machine only.\n"}
+            )
+        return await app(scope, reading, send_with_headers)
 
     return guarded
 
@@ -203,10 +207,10 @@ def serve(desk: Desk, host: str, port: int) -> None:
     """
     server = make_server(desk, is_local(host))
     with listen(host, port) as bound:
-        shown = f"[{host}]" if ":" in host else host
+        display_host = f"[{host}]" if ":" in host else host
         if not is_local(host):
             log.warning("host=%s: whoever reaches this port can play", host)
-        desk.address = f"http://{shown}:{bound.getsockname()[1]}"
+        desk.address = f"http://{display_host}:{bound.getsockname()[1]}"
         log.info("open %s in a browser; Ctrl-C ends", desk.address)
         with suppress(KeyboardInterrupt):  # uvicorn raises it again when all is closed
             server.run(sockets=[bound])

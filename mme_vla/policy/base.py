@@ -41,15 +41,15 @@ class Policy(Saved):
     """Of stored vision tokens."""
     horizon: int
     """Steps of a chunk."""
-    skipped: int = 0
+    n_past_steps: int = 0
     """Steps at a chunk's beginning that lie in the past and are never executed."""
-    sessions_before: int = 0
+    n_distractor_episodes: int = 0
     """Unrelated episodes that it is shown before each of its own, as a stress split asks for them."""
     sample_steps: int = 1
     """Steps of its sampler unless told otherwise."""
-    agrees: bool = False
+    supports_rtc: bool = False
     """Whether its chunks can agree with actions that are already promised (`Episode.promise`)."""
-    most_actions: int | None = None
+    max_actions: int | None = None
     """Actions after which a rollout ends an episode as timed out, beside its limit of frames; None: that one alone."""
     action_dim: int
     """Width of a chunk inside the network; the embodiment's own actions are its first columns."""
@@ -69,7 +69,7 @@ class Policy(Saved):
         """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
         return {}
 
-    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
         """The random numbers that change the pictures of `count` training samples, if any; beside `loss_draws`'s."""
         return {}
 
@@ -81,7 +81,7 @@ class Policy(Saved):
         """
         raise NotImplementedError
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Compute activations again in the backward pass instead of keeping them (all, or `selective`), or not."""
         raise NotImplementedError
 
@@ -134,13 +134,13 @@ class Policy(Saved):
             alone: np.ndarray = self.act([episodes], steps)[0]
             return alone
         if not episodes:
-            return np.zeros((0, self.horizon - self.skipped, self.embodiment.action.width), np.float32)
+            return np.zeros((0, self.horizon - self.n_past_steps, self.embodiment.action.width), np.float32)
         processor = self.require_processor()
-        if not self.agrees and any(e.promised is not None for e in episodes):
+        if not self.supports_rtc and any(e.action_prefix is not None for e in episodes):
             name = self.config.get("name", type(self).__name__)
             raise UserError(
                 f"{name} answers without regard to what was promised: real-time chunking needs a policy whose actions "
-                "are a flow, such as π0.5's. Leave out promise()."
+                "are a flow, such as π0.5's. Leave out set_action_prefix()."
             )
         processor.require_stats()  # before any episode's noise or memory moves on
         batch = self.observation(episodes)
@@ -154,9 +154,9 @@ class Policy(Saved):
         states, space = torch.stack([e.state for e in episodes]), self.embodiment.action
         absolute = processor.absolute_actions(chunk, states)
         decided = [space.decide(rows, e.options) for rows, e in zip(absolute, episodes, strict=True)]
-        actions = torch.stack(decided).numpy()[:, self.skipped :]
-        for episode, chosen in zip(episodes, actions, strict=True):
-            episode.acted(chosen)
+        actions = torch.stack(decided).numpy()[:, self.n_past_steps :]
+        for episode, actions_of in zip(episodes, actions, strict=True):
+            episode.acted(actions_of)
         return actions
 
     def prepare(self, episode: Episode) -> bool:
@@ -221,7 +221,7 @@ class Policy(Saved):
         """A batch of one without content, at its fullest: every view and word, a full memory, actions to learn from."""
         raise NotImplementedError
 
-    def see_empty_frame(self) -> None:
+    def warm_up_vision(self) -> None:
         """Run the vision tower on one black memory frame."""
         raise NotImplementedError
 
@@ -231,11 +231,11 @@ class Policy(Saved):
     """Pattern of the parameters that never learn, whatever fine-tuning asks for."""
     keyframes: int = 1
     """Keyframes of a training sample, where samples are such."""
-    adapted: Sequence[str] = ()
+    lora_targets: Sequence[str] = ()
     """Linear layers that LoRA wraps unless told otherwise, by the end of their name."""
     heads: Sequence[str] = ()
     """Modules that learn in full beside the adapters, by the end of their name."""
-    unadaptable: str | None = None
+    lora_exclude: str | None = None
     """Pattern of linear layers whose weight is read past any adapter that wraps them."""
 
     def parts(self) -> Mapping[str, str]:
@@ -245,7 +245,7 @@ class Policy(Saved):
         """
         raise NotImplementedError
 
-    def part_of(self, name: str) -> str:
+    def component_of(self, name: str) -> str:
         """The part that a parameter belongs to."""
         for part, pattern in self.parts().items():
             if re.match(pattern, name):

@@ -11,7 +11,7 @@ from mme_vla.backbone.config import shapes_only
 from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.naming import words
 from mme_vla.errors import UserError
-from mme_vla.integration.base import Integration, doors_of
+from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import policy_class
@@ -36,7 +36,7 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
 
 
 def check_integrated(
-    config: Mapping[str, Any], integration: Integration, memory: Memory | None, hosts: Set[str]
+    config: Mapping[str, Any], integration: Integration, memory: Memory | None, supports: Set[str]
 ) -> None:
     """Make sure that memory and integration go together, and that the backbone has a place for what they bring.
 
@@ -51,21 +51,21 @@ def check_integrated(
                 f"The memory {config['memory']['name']!r} hands over no tokens as it is set, for an integration to "
                 "bring to the backbone: choose integration=none, or let it have some (memory.states=true)."
             )
-        given = "an integration without a memory" if memory is None else "a memory without an integration"
-        raise UserError(f"This configuration names {given}; name both, or neither for the memoryless policy.")
+        mismatch = "an integration without a memory" if memory is None else "a memory without an integration"
+        raise UserError(f"This configuration names {mismatch}; name both, or neither for the memoryless policy.")
     if memory is None:
         return
-    check_past(config, memory, hosts)
-    check_positions(config, integration, memory, hosts)
+    check_past(config, memory, supports)
+    check_positions(config, integration, memory, supports)
 
 
-def check_past(config: Mapping[str, Any], memory: Memory, hosts: Set[str]) -> None:
+def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
     """Make sure that a memory that gives past views has a backbone whose vision tower looks at them.
 
     Raises:
         UserError: that of this backbone sees one picture at a time.
     """
-    if memory.looks_back is not None and "past" not in hosts:
+    if memory.past_view_spec is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
             f"and the tower of the backbone {config['backbone']['name']!r} sees one picture at a time. Take another "
@@ -73,7 +73,7 @@ def check_past(config: Mapping[str, Any], memory: Memory, hosts: Set[str]) -> No
         )
 
 
-def check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, hosts: Set[str]) -> None:
+def check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, supports: Set[str]) -> None:
     """Make sure that a memory that shall be placed in time can be: its tokens have one, the backbone a place for it."""
     if integration.memory_position != "time":
         return
@@ -82,7 +82,7 @@ def check_positions(config: Mapping[str, Any], integration: Integration, memory:
             f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} stand for no one "
             "moment each. Take memory_position=slot, or a memory that says `timed`."
         )
-    if "blocks" in doors_of(type(integration)) and "positions" not in hosts:
+    if "blocks" in extension_points(type(integration)) and "positions" not in supports:
         raise UserError(
             f"integration.memory_position=time: the backbone {config['backbone']['name']!r} has no place for blocks at "
             "positions of their own. Take memory_position=slot, or integration=modulator where it hosts that."
@@ -144,15 +144,15 @@ def build_from_config(
         fresh_backbone: False where a checkpoint is loaded next: π0.5's own weights are then not drawn.
     """
     import_plugins(config)
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
-    sections = {key: plain[key] for key in SECTIONS if key in plain}
+    container = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(container, dict)
+    sections = {key: container[key] for key in SECTIONS if key in container}
     check_token_budget(sections)
     # Shapes need no words: on meta the full-size tokenizer is not asked for.
     bare = torch.device(device).type == "meta"
     processor = None if bare else build_processor(sections)
     with torch.random.fork_rng(devices=[]), shapes_only() if bare else torch.device(device):
-        torch.manual_seed(plain.get("seed", 42) if seed is None else seed)
+        torch.manual_seed(container.get("seed", 42) if seed is None else seed)
         policy: Policy = policy_class(sections).from_config(sections, processor, fresh_backbone=fresh_backbone)
     return policy.eval()
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
 from mme_vla.memory.history import History, OnlineHistory
-from mme_vla.policy.promises import Promise, checked_promise
-from mme_vla.processing.images import PastPictures
+from mme_vla.policy.promises import ActionPrefix, checked_prefix
+from mme_vla.processing.images import PastImages
 from mme_vla.processing.normalise import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
 from mme_vla.types import HistoryTokens, PastViews
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Written:
+class MemoryEntries:
     """One store of what was written.
 
     entries: (time, content) in the order they are read. now: the current moment, on the clock of these times.
@@ -35,23 +35,23 @@ class Written:
 
 
 @runtime_checkable
-class Writes(Protocol):
+class WritableMemory(Protocol):
     """What such an episode offers; a probe asks for no more."""
 
     @property
-    def written_clock(self) -> str | None:
+    def memory_clock(self) -> str | None:
         """What the times of entries count (`moments`); None where entries have an order alone."""
         ...
 
-    def written(self) -> tuple[Written, ...]:
+    def writable_memory(self) -> tuple[MemoryEntries, ...]:
         """All stores."""
         ...
 
-    def as_if_written(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+    def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
         """This episode with other entries in its stores, for one chunk; it stays as it is itself."""
         ...
 
-    def go_on_from(self, twin: "Episode") -> None:
+    def resume_from(self, twin: "Episode") -> None:
         """Go on from a chunk that was chosen for an episode of `as_if_written`, with one's own entries."""
         ...
 
@@ -80,7 +80,7 @@ class Episode:
     def __init__(self, policy: Host, goal: str, seed: int = 0) -> None:
         self._policy = policy
         self._generator = torch.Generator().manual_seed(seed)
-        self._seen: list[tuple[Tensor | None, Tensor]] = []  # None: that frame was not drawn
+        self._recent: list[tuple[Tensor | None, Tensor]] = []  # None: that frame was not drawn
         """Pictures and states of the frames that the policy sees at once, the current one last."""
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
@@ -91,18 +91,18 @@ class Episode:
         memory = policy.memory
         self.history = None if memory is None else memory.start_history(policy.encode_frames)
         if self.history is not None and memory is not None and memory.reads_motion:
-            self.history.motion = lambda frames: torch.stack([self._moved[int(frame)] for frame in frames])
+            self.history.motion = lambda frames: torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
             self.history.state_width = policy.embodiment.state.width
         self.stream = None if memory is None else memory.start_stream()
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.read: History | None = None
         """The history as the last `act` read it, where a backbone marks what is stored."""
-        look = None if memory is None else memory.looks_back
-        self._past = None if look is None else PastPictures(look)
-        self.frames_seen = 0
-        self._moved: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
+        spec = None if memory is None else memory.past_view_spec
+        self._past = None if spec is None else PastImages(spec)
+        self.n_observed_frames = 0
+        self._motion_of_frames: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
         self._chunk: np.ndarray | None = None
-        self.promised: Promise | None = None
+        self.action_prefix: ActionPrefix | None = None
         """What the next chunk is to agree with; see `promise`."""
         self._robot = policy.embodiment
         self._executed = self._no_actions
@@ -113,13 +113,13 @@ class Episode:
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
-        drawn: Mapping[str, np.ndarray] | None = None,
+        rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames in order, each once, the current one last; the conditioning video comes first.
 
         Args:
             frames: of every camera by its name (`front` and `wrist`), each [t, H, W, 3] uint8.
-            drawn: of every camera the places, ascending, among the t frames that `frames` shows, where not all were
+            rendered: of every camera the places, ascending, among the t frames that `frames` shows, where not all were
                 drawn. `act` needs the last one of every camera; of the others a memory needs what its `frames_read`
                 names.
             states: [t, s].
@@ -136,7 +136,7 @@ class Episode:
         states = finite_array(states, "states")
         demo = np.asarray(is_demo, bool)
         count, width = len(states) if states.ndim else 0, self._robot.state.width
-        even = all(len(view) == (count if drawn is None else len(drawn[name])) for name, view in views.items())
+        even = all(len(view) == (count if rendered is None else len(rendered[name])) for name, view in views.items())
         if states.shape != (count, width) or not even or demo.shape not in ((), (count,)):
             counts = ", ".join(f"{len(view)} {name}" for name, view in views.items())
             raise UserError(
@@ -150,17 +150,17 @@ class Episode:
         demo, executed = self._checked_course(count, demo, actions)
         # Of the frames that the window has room for, those of the execution; the current one in any case.
         recent = range(max(count - processor.window, 0) if processor.consecutive else count - 1, count)
-        seen = [
-            (self._pictures(views, drawn, i), torch.from_numpy(states[i].copy()))
+        new_frames = [
+            (self._prepared_images(views, rendered, i), torch.from_numpy(states[i].copy()))
             for i in recent
             if i == count - 1 or not demo[i]
         ]
         camera = self._robot.memory_camera
-        seen_at = None if drawn is None else np.asarray(drawn[camera], np.int64)
-        self._take(views[camera], demo, executed, seen_at, states)
+        rendered_at = None if rendered is None else np.asarray(rendered[camera], np.int64)
+        self._take(views[camera], demo, executed, rendered_at, states)
         if self._past is not None:
-            self._past.take(views, count, drawn)
-        self._see(seen)
+            self._past.take(views, count, rendered)
+        self._see(new_frames)
 
     def remember(
         self,
@@ -190,14 +190,14 @@ class Episode:
         if states is not None and np.shape(states) != (len(frames), self._robot.state.width):
             raise UserError(f"states must be [{len(frames)}, {self._robot.state.width}]; got {list(np.shape(states))}.")
         if len(frames):
-            felt = None if states is None else finite_array(states, "states")
-            self._take(frames, *self._checked_course(len(frames), demo, actions), states=felt)
+            proprio = None if states is None else finite_array(states, "states")
+            self._take(frames, *self._checked_course(len(frames), demo, actions), states=proprio)
 
-    def look(self, pictures: Mapping[str, np.ndarray], state: np.ndarray) -> None:
+    def look(self, views: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
 
         Args:
-            pictures: of every camera by its name, [H, W, 3] uint8.
+            views: of every camera by its name, [H, W, 3] uint8.
             state: [s].
 
         Raises:
@@ -208,11 +208,11 @@ class Episode:
         width, names = self._robot.state.width, self._robot.camera_names
         if state.shape != (width,):
             raise UserError(f"look() needs a state of {width} finite numbers, got shape {state.shape}.")
-        if lacking := [name for name in names if name not in pictures]:
-            raise UserError(f"look() needs a picture of {', '.join(lacking)} too; got {', '.join(pictures) or 'none'}.")
+        if lacking := [name for name in names if name not in views]:
+            raise UserError(f"look() needs a picture of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
-        images = processor.images([pictures[name] for name in names])
+        images = processor.images([views[name] for name in names])
         self._see([(images, torch.from_numpy(state.copy()))])
 
     def _check_apart(self) -> None:
@@ -236,22 +236,22 @@ class Episode:
         frames: np.ndarray,
         demo: np.ndarray,
         executed: np.ndarray,
-        drawn: np.ndarray | None = None,
+        rendered: np.ndarray | None = None,
         states: np.ndarray | None = None,
     ) -> None:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
-            moved = self._motion(demo, executed, states)
-            self.history.take(frames, self._policy.encode_frames, drawn, len(demo))
-            self._moved += moved
+            motion = self._motion(demo, executed, states)
+            self.history.take(frames, self._policy.encode_frames, rendered, len(demo))
+            self._motion_of_frames += motion
             if not self._video_over:
-                self.history.exec_start = self.frames_seen + int(demo.sum())
+                self.history.exec_start = self.n_observed_frames + int(demo.sum())
         longest = self._policy.require_processor().past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
-        self.frames_seen += len(demo)
+        self.n_observed_frames += len(demo)
 
     def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
         """Rows of motion of the next frames, for a memory that reads them.
@@ -266,11 +266,11 @@ class Episode:
                 "This policy's memory reads the robot's own states and actions: give past frames with their states "
                 "(`Episode.observe`), not as pictures alone."
             )
-        actions, own = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
+        actions, known = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
         if self._robot.action.frames is not None:
             places = np.flatnonzero(~demo)[: len(executed)]
-            actions[places], own[places] = executed[: len(places)], True
-        return list(self._policy.require_processor().motion(states, actions, own))
+            actions[places], known[places] = executed[: len(places)], True
+        return list(self._policy.require_processor().motion(states, actions, known))
 
     def recall(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
@@ -296,13 +296,13 @@ class Episode:
             UserError: no frame was seen yet, or the current one was not drawn.
         """
         self._require_observation()
-        return self._drawn(self._seen[-1][0])
+        return self._require_rendered(self._recent[-1][0])
 
     @property
     def state(self) -> Tensor:
         """The current state [s]."""
         self._require_observation()
-        return self._seen[-1][1]
+        return self._recent[-1][1]
 
     @property
     def window(self) -> tuple[Tensor, Tensor]:
@@ -314,9 +314,11 @@ class Episode:
             UserError: no frame was seen yet, or one of these was not drawn.
         """
         self._require_observation()
-        missing = self._policy.require_processor().window - len(self._seen)
-        seen = [self._seen[0]] * missing + self._seen
-        return torch.stack([self._drawn(images) for images, _ in seen]), torch.stack([state for _, state in seen])
+        missing = self._policy.require_processor().window - len(self._recent)
+        frames = [self._recent[0]] * missing + self._recent
+        return torch.stack([self._require_rendered(images) for images, _ in frames]), torch.stack(
+            [state for _, state in frames]
+        )
 
     @property
     def past(self) -> PastViews | None:
@@ -327,16 +329,16 @@ class Episode:
         """
         if self._past is None:
             return None
-        return self._past.at(self.frames_seen - 1, self._policy.require_processor().images)
+        return self._past.at(self.n_observed_frames - 1, self._policy.require_processor().images)
 
     @property
     def prompt(self) -> Any:
         """What the policy reads of the goal, and of the subgoal where it reads one."""
-        processor, state = self._policy.require_processor(), self._seen[-1][1] if self._seen else None
+        processor, state = self._policy.require_processor(), self._recent[-1][1] if self._recent else None
         goal = self._robot.action.worded(self.goal, self.options)
         return processor.prompt(goal, subgoal=self.subgoal, state=state, past_actions=self._executed)
 
-    def promise(self, actions: np.ndarray, delay: int = 0) -> None:
+    def set_action_prefix(self, actions: np.ndarray, delay: int = 0) -> None:
         """Let the next chunk, and it alone, agree with actions that the robot executes while it is chosen.
 
         Args:
@@ -348,24 +350,24 @@ class Episode:
             UserError: actions of another form, more than a chunk, or a delay that they do not cover.
         """
         space = self._robot.action
-        self.promised = checked_promise(actions, delay, space.horizon, space.width)
+        self.action_prefix = checked_prefix(actions, delay, space.horizon, space.width)
 
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
         """Hear at which frames sub-tasks began, where an environment tells; only what probes a policy listens."""
 
     def acted(self, chunk: np.ndarray) -> None:
         """Note the chunk [h, w] the policy chose; the frames that follow say how much of it was executed."""
-        self._chunk, self.promised = chunk, None
+        self._chunk, self.action_prefix = chunk, None
 
     def _executed_now(self, count: int, actions: np.ndarray | None) -> np.ndarray:
         """The actions that led to the last `count` frames: those given, else the next ones of the chunk."""
         space = self._robot.action
         if actions is None:
             return self._no_actions if self._chunk is None or space.frames is None else self._chunk[:count]
-        given = finite_array(actions, "actions")
-        if space.frames is None and given.ndim:
-            count = len(given)
-        executed = given[max(len(given) - count, 0) :] if given.ndim else given
+        values = finite_array(actions, "actions")
+        if space.frames is None and values.ndim:
+            count = len(values)
+        executed = values[max(len(values) - count, 0) :] if values.ndim else values
         if executed.shape != (count, space.width):
             raise UserError(
                 f"actions must be [{count}, {space.width}], one for each execution frame; got {executed.shape}."
@@ -389,29 +391,29 @@ class Episode:
         """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
         return self._policy.sample_draws(self._generator)
 
-    def _pictures(
-        self, views: Mapping[str, np.ndarray], drawn: Mapping[str, np.ndarray] | None, frame: int
+    def _prepared_images(
+        self, views: Mapping[str, np.ndarray], rendered: Mapping[str, np.ndarray] | None, frame: int
     ) -> Tensor | None:
         """One of the frames given as the network takes it; None where a camera did not show it."""
-        if drawn is None:
-            shown = [view[frame] for view in views.values()]
-        elif all(frame in drawn[name] for name in views):
-            shown = [view[int(np.searchsorted(drawn[name], frame))] for name, view in views.items()]
+        if rendered is None:
+            images = [view[frame] for view in views.values()]
+        elif all(frame in rendered[name] for name in views):
+            images = [view[int(np.searchsorted(rendered[name], frame))] for name, view in views.items()]
         else:
             return None
-        return self._policy.require_processor().images(shown)
+        return self._policy.require_processor().images(images)
 
-    def _drawn(self, images: Tensor | None) -> Tensor:
+    def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:
             raise UserError("The current frame was not drawn: observe() a picture of every camera before act().")
         return images
 
-    def _see(self, seen: Sequence[tuple[Tensor | None, Tensor]]) -> None:
+    def _see(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
         """Take what is new into the window."""
-        self._seen = [*self._seen, *seen][-self._policy.require_processor().window :]
+        self._recent = [*self._recent, *frames][-self._policy.require_processor().window :]
 
     def _require_observation(self) -> None:
-        if not self._seen:
+        if not self._recent:
             raise UserError("The episode has seen no frame yet: call observe() with the current frame before act().")
 
     def _checked_view(self, frames: Mapping[str, np.ndarray], view: str) -> np.ndarray:

@@ -24,15 +24,15 @@ class Tunable(Protocol):
     """What fine-tuning asks of a policy, which is an `nn.Module` besides; see `Policy` for the words."""
 
     config: dict[str, Any]
-    adapted: Sequence[str]
+    lora_targets: Sequence[str]
     heads: Sequence[str]
-    unadaptable: str | None
+    lora_exclude: str | None
     frozen: str | None
     compute_dtype: torch.dtype
 
     def parts(self) -> Mapping[str, str]: ...
 
-    def part_of(self, name: str) -> str: ...
+    def component_of(self, name: str) -> str: ...
 
     def named_parameters(self) -> Iterator[tuple[str, nn.Parameter]]: ...
 
@@ -87,7 +87,7 @@ def apply_finetuning(
         in_full = _named(policy, train)  # before anything is changed
         add_adapters(policy, rank=rank, alpha=alpha, dropout=dropout, init=init, targets=targets)
     for name, parameter in policy.named_parameters():
-        part = policy.part_of(name)
+        part = policy.component_of(name)
         if mode == "full":
             learns = True
         elif mode == "expert_only":
@@ -99,7 +99,7 @@ def apply_finetuning(
     cast_frozen(policy, frozen_dtype)
     counts = dict.fromkeys(policy.parts(), 0)
     for name, parameter in policy.named_parameters():
-        counts[policy.part_of(name)] += parameter.numel() if parameter.requires_grad else 0
+        counts[policy.component_of(name)] += parameter.numel() if parameter.requires_grad else 0
     return counts
 
 
@@ -149,13 +149,13 @@ def add_adapters(
         )
     if init not in INITS:
         raise UserError(f"finetune.init={brief(init)}. {did_you_mean(str(init), INITS)}")
-    targets = list(policy.adapted if targets is None else targets)
-    chosen = _targets(policy, targets)
+    targets = list(policy.lora_targets if targets is None else targets)
+    target_modules = _targets(policy, targets)
     try:
         from peft import LoraConfig, inject_adapter_in_model
     except ImportError:
         raise missing_extra("LoRA", "vlm") from None
-    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": chosen, "init_lora_weights": INITS[init]}
+    options: dict[str, Any] = {"lora_alpha": alpha, "target_modules": target_modules, "init_lora_weights": INITS[init]}
     config = LoraConfig(r=rank, lora_dropout=dropout, **options)
     inject_adapter_in_model(config, policy, ADAPTER)  # type: ignore[arg-type]
     policy.config["adapters"] = {"rank": rank, "alpha": alpha, "dropout": dropout, "init": init, "targets": targets}
@@ -206,8 +206,8 @@ def _has_adapters(policy: Tunable) -> bool:
 def _targets(policy: Tunable, targets: Sequence[str]) -> list[str]:
     """Full names of the layers that the targets mean (what is the memory's learns in full)."""
     linear = [name for name, module in policy.named_modules() if isinstance(module, nn.Linear | nn.Conv2d)]
-    layers = [name for name in linear if policy.part_of(f"{name}.") != "memory"]
-    chosen: list[str] = []
+    layers = [name for name in linear if policy.component_of(f"{name}.") != "memory"]
+    selected: list[str] = []
     for target in targets:
         matching = [name for name in layers if f".{name}".endswith(f".{target}")]
         if not matching:
@@ -215,33 +215,33 @@ def _targets(policy: Tunable, targets: Sequence[str]) -> list[str]:
                 f"finetune.targets: no linear layer of the policy's other parts ends in {target!r}. "
                 + _near(target, layers)
             )
-        past = policy.unadaptable
+        past = policy.lora_exclude
         unreachable = [name for name in matching if past is not None and re.search(past, name)]
         if unreachable:
             raise UserError(
                 f"finetune.targets: {target!r} means {unreachable[0]}, whose weight is used in float32 past any "
                 "adapter: it would never act. Train it in full (finetune.train), or leave it."
             )
-        chosen += matching
-    if not chosen:
+        selected += matching
+    if not selected:
         raise UserError(
-            f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(policy.adapted[:2])}."
+            f"finetune.targets is empty: LoRA needs layers to adapt, such as {', '.join(policy.lora_targets[:2])}."
         )
-    return sorted(set(chosen))
+    return sorted(set(selected))
 
 
 def _named(policy: Tunable, train: Sequence[str]) -> list[str]:
     """Full names of the modules that `train` means; parts are left to the caller."""
     modules = [name for name, _ in policy.named_modules() if name]
-    chosen: list[str] = []
+    selected: list[str] = []
     for entry in train:
         matching = [name for name in modules if f".{name}".endswith(f".{entry}")]
         if not matching and entry not in policy.parts():
             raise UserError(
                 f"finetune.train: {entry!r} is no part and no module. {_near(entry, [*policy.parts(), *modules])}"
             )
-        chosen += [] if entry in policy.parts() else matching
-    return chosen
+        selected += [] if entry in policy.parts() else matching
+    return selected
 
 
 def _near(target: str, names: Sequence[str]) -> str:

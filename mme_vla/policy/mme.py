@@ -15,14 +15,14 @@ from mme_vla.backbone.config import read_backbone, shapes_only
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, listed
-from mme_vla.integration.base import Integration, doors_of
+from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import Memory
-from mme_vla.memory.history import MarkedHistory
+from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.masking import masked_mean
-from mme_vla.policy.promises import promised_overlap
+from mme_vla.policy.promises import prefix_overlap
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.policy.vision_cache import encode_frames, tower_fingerprint
@@ -84,8 +84,8 @@ class MMEPolicy(Policy):
             memory.choose_products(checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         self.sample_steps = backbone.sample_steps
-        self.agrees = backbone.agrees
-        self.adapted, self.heads, self.unadaptable = backbone.adapted, backbone.heads, backbone.unadaptable
+        self.supports_rtc = backbone.supports_rtc
+        self.lora_targets, self.heads, self.lora_exclude = backbone.lora_targets, backbone.heads, backbone.lora_exclude
 
     @classmethod
     def from_config(
@@ -100,14 +100,14 @@ class MMEPolicy(Policy):
         """
         backbone_cls, sizes = read_backbone(config["backbone"])
         embodiment_of(config)  # a robot that does not fit is told before anything is built
-        chosen = config.get("integration")
-        if chosen and (unhosted := doors_of(INTEGRATIONS[chosen.get("name")]) - backbone_cls.hosts):
+        section = config.get("integration")
+        if section and (unhosted := extension_points(INTEGRATIONS[section.get("name")]) - backbone_cls.supports):
             raise UserError(
                 f"The backbone {config['backbone']['name']!r} has no place for {listed(sorted(unhosted))} of the "
-                f"integration {chosen['name']!r}; it hosts {listed(sorted(backbone_cls.hosts))}. Choose another "
+                f"integration {section['name']!r}; it hosts {listed(sorted(backbone_cls.supports))}. Choose another "
                 "integration or backbone."
             )
-        integration: Integration = INTEGRATIONS.build(chosen, sizes) if chosen else Integration(sizes)
+        integration: Integration = INTEGRATIONS.build(section, sizes) if section else Integration(sizes)
         experts = integration.extra_experts()
         with nullcontext() if fresh_backbone else shapes_only():
             backbone = backbone_cls(sizes, experts)
@@ -117,7 +117,7 @@ class MMEPolicy(Policy):
         memory: Memory | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
-        check_integrated(config, integration, memory, backbone_cls.hosts)
+        check_integrated(config, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
 
     def autocast(self) -> torch.autocast:
@@ -131,7 +131,7 @@ class MMEPolicy(Policy):
         """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
         return self.backbone.loss_draws(count, generator)
 
-    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
         """While training with augmentation `changes` [n, …]: what happens to a sample's pictures."""
         return {"changes": self._draw_changes(count, generator)} if self.training and self.augment else {}
 
@@ -155,16 +155,16 @@ class MMEPolicy(Policy):
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        given = named_draws(draws, time=time)
-        if set(self.loss_draws(0, torch.default_generator)) - set(given):
-            given = self.loss_draws(len(batch.actions), torch.default_generator) | given
-        if "changes" not in given:
-            given = given | self.picture_draws(len(batch.actions), torch.default_generator)
-        drawn = map_draws(given, lambda value: value.to(self.device))
-        batch, views = self._seen(batch, drawn.pop("changes", None))
+        values = named_draws(draws, time=time)
+        if set(self.loss_draws(0, torch.default_generator)) - set(values):
+            values = self.loss_draws(len(batch.actions), torch.default_generator) | values
+        if "changes" not in values:
+            values = values | self.image_draws(len(batch.actions), torch.default_generator)
+        sampled = map_draws(values, lambda value: value.to(self.device))
+        batch, views = self._current_views(batch, sampled.pop("changes", None))
         with self.autocast():
-            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            losses = self.backbone.loss(batch, views, self._inject(memory), drawn)  # b h
+            memory = self.encode_memory(self._conditioned_history(batch)) if memory is None else memory
+            losses = self.backbone.loss(batch, views, self._inject(memory), sampled)  # b h
         loss = masked_mean(losses, batch.action_mask)
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
@@ -172,12 +172,12 @@ class MMEPolicy(Policy):
     def velocity(self, batch: Batch, x_t: Tensor, time: Tensor, memory: MemoryTokens | None = None) -> Tensor:
         """Predicted velocity [b, h, a] of a flow backbone at noisy chunks x_t [b, h, a] and times [b], in one pass."""
         with self.autocast():
-            memory = self.encode_memory(self._marked(batch)) if memory is None else memory
-            return self.backbone.velocity(*self._seen(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
+            memory = self.encode_memory(self._conditioned_history(batch)) if memory is None else memory
+            return self.backbone.velocity(*self._current_views(batch), self._inject(memory), x_t, time)  # type: ignore[operator]
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Compute activations again in the backward pass instead of keeping them, or keep them."""
-        self.backbone.recompute(wanted)
+        self.backbone.recompute(mode)
 
     def compile(self, **options: Any) -> None:
         """Compile the backbone's tower and layers in place, each by itself, and what of the memory is worth it."""
@@ -198,12 +198,12 @@ class MMEPolicy(Policy):
             return None
         return self.memory(history)
 
-    def _marked(self, batch: Batch) -> HistoryTokens | None:
+    def _conditioned_history(self, batch: Batch) -> HistoryTokens | None:
         """The batch's selection as the backbone reads it beside the prompt."""
         if self.memory is None or batch.history is None:
             return None
         mark = partial(self.backbone.mark, prompt=batch.prompt, prompt_mask=batch.prompt_mask)
-        return self.memory.marked(batch.history, mark)
+        return self.memory.condition_on_prompt(batch.history, mark)
 
     def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
         """The random numbers that change the pictures of `count` training samples, [count, …] on the CPU."""
@@ -211,7 +211,7 @@ class MMEPolicy(Policy):
 
         return augmentation_draws(count, generator)
 
-    def _seen(self, batch: Batch, changes: Tensor | None = None) -> tuple[Batch, Tensor]:
+    def _current_views(self, batch: Batch, changes: Tensor | None = None) -> tuple[Batch, Tensor]:
         """The batch and its current views as the backbone takes them; past ones are changed as the current ones are."""
         views = self._views(batch, changes)
         if batch.past is None:
@@ -254,20 +254,20 @@ class MMEPolicy(Policy):
         if draws is None:
             source = torch.default_generator if generator is None else generator
             draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
-        drawn = map_draws(named_draws(draws), lambda value: send(value, self.device))
+        sampled = map_draws(named_draws(draws), lambda value: send(value, self.device))
         if memory is None:
             with self.autocast():
-                memory = self.encode_memory(self._marked(batch))
+                memory = self.encode_memory(self._conditioned_history(batch))
         # A chunk that agrees with promised actions runs the network backwards as well: no graph is made of that.
         if self._sampler is not None and not self.training and batch.overlap is None:
-            return self._sampler(batch, memory, drawn, steps or self.sample_steps)
-        return self._sample(batch, memory, drawn, steps)
+            return self._sampler(batch, memory, sampled, steps or self.sample_steps)
+        return self._sample(batch, memory, sampled, steps)
 
     def _sample(
-        self, batch: Batch, memory: MemoryTokens | None, drawn: Mapping[str, Tensor], steps: int | None
+        self, batch: Batch, memory: MemoryTokens | None, sampled: Mapping[str, Tensor], steps: int | None
     ) -> Tensor:
         with self.autocast():
-            return self.backbone.sample(*self._seen(batch), self._inject(memory), drawn, steps)
+            return self.backbone.sample(*self._current_views(batch), self._inject(memory), sampled, steps)
 
     @property
     def compiles_sampling(self) -> bool:
@@ -305,14 +305,14 @@ class MMEPolicy(Policy):
         """The current views and prompts of running episodes."""
         prompts, masks = zip(*(e.prompt for e in episodes), strict=True)
         states = torch.stack([e.state for e in episodes])
-        promises = [e.promised for e in episodes]
+        prefixes = [e.action_prefix for e in episodes]
         batch = Batch(
             images=torch.stack([e.images for e in episodes]),
             image_mask=torch.ones(len(episodes), len(self.embodiment.cameras), dtype=torch.bool),
             prompt=torch.stack(prompts),
             prompt_mask=torch.stack(masks),
             state=states,
-            overlap=promised_overlap(promises, states, self.require_processor(), self.action_dim),
+            overlap=prefix_overlap(prefixes, states, self.require_processor(), self.action_dim),
             past=stack_past([e.past for e in episodes]),
         )
         return batch.without_prompt_padding().sent(self.device)
@@ -321,16 +321,18 @@ class MMEPolicy(Policy):
         self, batch: Batch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories."""
-        return self.sample_actions(batch, draws, steps, memory=self._remember(episodes, batch))
+        return self.sample_actions(batch, draws, steps, memory=self._memory_tokens(episodes, batch))
 
     @torch.no_grad()
-    def _remember(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
+    def _memory_tokens(self, episodes: Sequence[Episode], batch: Batch) -> MemoryTokens | None:
         """Memory tokens of running episodes, through what their streams have already taken."""
         if self.memory is None:
             return None
         with self.autocast():
             histories = [
-                MarkedHistory(e.required_history(), partial(self._mark_one, batch.prompt[i], batch.prompt_mask[i]))
+                PromptConditionedHistory(
+                    e.required_history(), partial(self._mark_one, batch.prompt[i], batch.prompt_mask[i])
+                )
                 for i, e in enumerate(episodes)
             ]
             for episode, history in zip(episodes, histories, strict=True):
@@ -358,8 +360,8 @@ class MMEPolicy(Policy):
 
     def vision_fingerprint(self) -> str:
         """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        pictures = "" if self.processor is None else self.processor.memory_pictures
-        return tower_fingerprint(self.backbone.vision, self.compute_dtype, pictures)
+        image_format = "" if self.processor is None else self.processor.memory_image_format
+        return tower_fingerprint(self.backbone.vision, self.compute_dtype, image_format)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""
@@ -371,13 +373,13 @@ class MMEPolicy(Policy):
             prompt_mask=torch.ones(1, length, dtype=torch.bool, device=device),
             history=None if self.memory is None else self.memory.full_history(self.backbone.vision_width, device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            past=None if self.memory is None else full_past(self.memory.looks_back, views, size, device),
+            past=None if self.memory is None else full_past(self.memory.past_view_spec, views, size, device),
         )
 
     def _prompt_length(self) -> int:
         return int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
 
-    def see_empty_frame(self) -> None:
+    def warm_up_vision(self) -> None:
         """Run the vision tower on one black memory frame."""
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
@@ -387,11 +389,11 @@ class MMEPolicy(Policy):
         super().check_processor(source)
         processor = self.require_processor()
         for name in ("image_size", "action_dim", "horizon"):
-            found, expected = getattr(processor, name), getattr(self.backbone, name)
-            if found != expected:
+            actual, expected = getattr(processor, name), getattr(self.backbone, name)
+            if actual != expected:
                 raise UserError(
-                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
-                    "two checkpoints, or one was changed."
+                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+                    "from two checkpoints, or one was changed."
                 )
 
     def parts(self) -> Mapping[str, str]:

@@ -14,8 +14,8 @@ _STEP = re.compile(r"step_(\d+)")
 
 def checkpoints_in(folder: Path) -> list[Path]:
     """The finished checkpoints in a `checkpoints` folder, oldest step first."""
-    found = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
-    return sorted(found, key=step_of)
+    folders = [path for path in folder.glob("step_*") if _STEP.fullmatch(path.name) and (path / STATE).is_file()]
+    return sorted(folders, key=step_of)
 
 
 def checkpoint_name(step: int) -> str:
@@ -65,9 +65,9 @@ def resolve_checkpoint(path: Path) -> Path:
     Raises:
         UserError: there is no checkpoint.
     """
-    found = newest_checkpoint(path)
-    if found != path or (path / "config.json").is_file():
-        return found
+    newest = newest_checkpoint(path)
+    if newest != path or (path / "config.json").is_file():
+        return newest
     if _is_released(path):
         raise UserError(
             f"{path} is a checkpoint of the released code, in another format. Convert it, then name the new folder: "
@@ -93,8 +93,8 @@ def newest_checkpoint(path: Path) -> Path:
         UserError: `latest`, and there is no run with a checkpoint beside it.
     """
     path = find_run(path)
-    found = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
-    return found[-1] if found else path
+    checkpoints = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
+    return checkpoints[-1] if checkpoints else path
 
 
 def locate_checkpoint(source: str | Path) -> str:

@@ -20,7 +20,7 @@ from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
-from mme_vla.policy.tensor_files import assign_tensors, dtype_of, load_tensors, save_tensors, written_weights
+from mme_vla.policy.tensor_files import assign_tensors, dtype_of, list_weight_files, load_tensors, save_tensors
 from mme_vla.registry import POLICIES
 from mme_vla.utils import check_sums, inside, read_json, write_sums
 
@@ -36,12 +36,12 @@ def composition_digest(config: Mapping[str, Any]) -> str:
             which precision it computes do not count; nor do keys that are not set, so that a later option with an
             empty default changes no digest. The robot counts where it is not RoboMME's Panda in joint space.
     """
-    kept = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(config.get("policy") or {})
-    kept = {key: value for key, value in kept.items() if value is not None and key != "processor.tokenizer"}
+    settings = flat({key: config.get(key) for key in (*DECISIVE, "backbone")}) | of_policy(config.get("policy") or {})
+    settings = {key: value for key, value in settings.items() if value is not None and key != "processor.tokenizer"}
     robot = embodiment_of(config)
     if robot != ROBOMME_JOINT.with_horizon(robot.action.horizon):  # which configurations did not use to name
-        kept |= flat({"embodiment": robot.to_dict()})
-    return digest(kept, 12)
+        settings |= flat({"embodiment": robot.to_dict()})
+    return digest(settings, 12)
 
 
 DEFAULT = "mme"
@@ -66,23 +66,23 @@ def policy_class(config: Mapping[str, Any]) -> type[Any]:
     Raises:
         UserError: there is no policy of that name.
     """
-    found: type[Any] = POLICIES[policy_name(config)]
-    return found
+    kind: type[Any] = POLICIES[policy_name(config)]
+    return kind
 
 
-def policy_class_for[P](asked: type[P], config: Mapping[str, Any], source: str) -> type[P]:
+def policy_class_for[P](requested: type[P], config: Mapping[str, Any], source: str) -> type[P]:
     """The class to load a checkpoint with, where `asked.from_pretrained` was called.
 
     Raises:
         UserError: the checkpoint holds a policy of another class than was asked for.
     """
     kind = policy_class(config)
-    if issubclass(asked, kind):
-        return asked
-    if issubclass(kind, asked):
+    if issubclass(requested, kind):
+        return requested
+    if issubclass(kind, requested):
         return kind
     raise UserError(
-        f"{source} holds a {policy_name(config)!r} policy, which is no {asked.__name__}: load it with "
+        f"{source} holds a {policy_name(config)!r} policy, which is no {requested.__name__}: load it with "
         "Policy.from_pretrained(), which knows every kind."
     )
 
@@ -146,8 +146,8 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
     try:
         if not within:
             return Path(snapshot_download(repository, revision=revision, token=token))
-        wanted = [within, f"{within}/*"]
-        root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=wanted))
+        patterns = [within, f"{within}/*"]
+        root = Path(snapshot_download(repository, revision=revision, token=token, allow_patterns=patterns))
         if not (root / within).exists():
             raise UserError(f"The hub repository {repository} has no {within!r}: nothing of that name was in it.")
         return root / within
@@ -235,7 +235,7 @@ class Saved(nn.Module):
             self.config["card"] = {**self.config.get("card", {}), **card}
         save_tensors(self.state_dict(), folder, dtype=kind)
         about = self.save_about(folder)
-        write_sums(folder, [*about, *written_weights(folder)])  # not of the card, which people edit
+        write_sums(folder, [*about, *list_weight_files(folder)])  # not of the card, which people edit
 
     def save_about(self, folder: Path) -> list[str]:
         """Write all that `save_pretrained` writes beside the weights; return the names of what has checksums."""
@@ -277,7 +277,7 @@ class Saved(nn.Module):
         """
         from mme_vla.processing.base import load_processor
 
-        wanted, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
+        target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
         if not (folder / CONFIG).is_file():
             raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
         config = read_config(folder)
@@ -287,12 +287,12 @@ class Saved(nn.Module):
                 "are read by mme_vla.weights.load_weights() and converted by python -m mme_vla.weights.convert."
             )
         import_trusted(config, str(source), trust_plugins)
-        chosen = policy_class_for(cls, config, str(source))
+        policy_type = policy_class_for(cls, config, str(source))
         on_gpu = torch.device(device).type == "cuda"
-        kind = wanted or (torch.bfloat16 if on_gpu and chosen.acts_in_bfloat16 else torch.float32)
+        kind = target_dtype or (torch.bfloat16 if on_gpu and policy_type.acts_in_bfloat16 else torch.float32)
         if kind == torch.bfloat16:
             policy = {"compute_dtype": "bfloat16", **policy}
-        loaded = chosen.from_saved(config, str(folder / CONFIG), policy)
+        loaded = policy_type.from_saved(config, str(folder / CONFIG), policy)
         assign_tensors(loaded, load_tensors(folder), str(source), kind)
         loaded.compute_unsaved()
         loaded.processor = load_processor(folder, tokenizer)
@@ -312,10 +312,10 @@ class Saved(nn.Module):
         Raises:
             UserError: they describe nothing that can be built.
         """
-        given = config.get("policy", {})
-        if not isinstance(given, dict):
-            raise UserError(f"{source}: policy={brief(given)} must be a section.")
-        config = {**config, "policy": {**given, **(policy or {})}}
+        options = config.get("policy", {})
+        if not isinstance(options, dict):
+            raise UserError(f"{source}: policy={brief(options)} must be a section.")
+        config = {**config, "policy": {**options, **(policy or {})}}
         try:
             with shapes_only():
                 built = cls.from_config(config)

@@ -45,7 +45,7 @@ class Prepare[L]:
     work: L
 
 
-class Turns[R: Reading, A, L]:
+class Scheduler[R: Reading, A, L]:
     """Collects who waits; `turn` says what is to be done next, and the caller does it before asking on.
 
     Args:
@@ -63,7 +63,7 @@ class Turns[R: Reading, A, L]:
         """Whether there is anything to do."""
         return bool(self.reading or self.acting or self.later)
 
-    def turn(self) -> Iterator[Read[R] | Act[A] | Prepare[L]]:
+    def next_steps(self) -> Iterator[Read[R] | Act[A] | Prepare[L]]:
         """The steps of one turn. Who comes in the meantime may be in its batch already."""
         begun = time.perf_counter()
         for short in [work for work in self.reading if work.pieces <= 1]:

@@ -50,11 +50,11 @@ def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
     check_sums(folder, [file.relative_to(folder).as_posix() for file in files])
     tensors: dict[str, Tensor] = {}
     for file in files:
-        found = read_safetensors(file)
-        twice = sorted(set(found) & set(tensors))
+        loaded = read_safetensors(file)
+        twice = sorted(set(loaded) & set(tensors))
         if twice:
             raise UserError(f"{file} holds tensors that another file of {folder} holds too: {listed(twice)}.")
-        tensors |= found
+        tensors |= loaded
     return tensors
 
 
@@ -76,7 +76,7 @@ def weight_files(folder: Path) -> list[Path]:
     raise UserError(f"No weights in {folder}: expected {WEIGHTS} or {INDEX}. Is this a checkpoint folder?")
 
 
-def written_weights(folder: Path) -> list[str]:
+def list_weight_files(folder: Path) -> list[str]:
     """The names of a folder's weights and of their index."""
     return [*(INDEX for _ in folder.glob(INDEX)), *(file.name for file in weight_files(folder))]
 
@@ -112,8 +112,8 @@ def check_header(file: Path) -> None:
         with file.open("rb") as opened:
             header = int.from_bytes(opened.read(8), "little")
     except OSError as error:
-        shown = brief(str(file), 300, quote=False)  # an index may give a name of any length
-        raise UserError(f"{shown} cannot be read as a safetensors file: {error.strerror or error}.") from None
+        label = brief(str(file), 300, quote=False)  # an index may give a name of any length
+        raise UserError(f"{label} cannot be read as a safetensors file: {error.strerror or error}.") from None
     if header > min(_HEADER_LIMIT, about.st_size - 8):
         raise UserError(
             f"{file} is damaged or not a safetensors file: its header would have {header:,} bytes, the file has "
@@ -138,7 +138,7 @@ def dtype_of(name: str, what: str = "dtype") -> torch.dtype:
 
 
 def check_fit(
-    found: Mapping[str, Tensor],
+    tensors: Mapping[str, Tensor],
     expected: Mapping[str, tuple[int, ...]],
     source: str,
     optional: Collection[str] = (),
@@ -148,12 +148,12 @@ def check_fit(
     Raises:
         UserError: lists the tensors that are missing (and not `optional`), left over or misshapen; of many, the first.
     """
-    missing = sorted(set(expected) - set(found) - set(optional))
-    unexpected = sorted(set(found) - set(expected))
+    missing = sorted(set(expected) - set(tensors) - set(optional))
+    unexpected = sorted(set(tensors) - set(expected))
     misshapen = [
-        f"{name}: {tuple(found[name].shape)} instead of {tuple(expected[name])}"
-        for name in sorted(set(expected) & set(found))
-        if tuple(found[name].shape) != tuple(expected[name])
+        f"{name}: {tuple(tensors[name].shape)} instead of {tuple(expected[name])}"
+        for name in sorted(set(expected) & set(tensors))
+        if tuple(tensors[name].shape) != tuple(expected[name])
     ]
     problems = [
         f"{len(names):,} {what}:\n  {listed(names, 5)}"
@@ -189,9 +189,9 @@ def assign_tensors(
         UserError: lists the tensors that do not fit, are of another kind of number, or hold NaN, before anything is
             changed.
     """
-    own = module.state_dict()
-    check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in own.items()}, source)
-    check_kinds(tensors, own, source)
+    state = module.state_dict()
+    check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in state.items()}, source)
+    check_kinds(tensors, state, source)
     check_values(tensors, source)
     trainable = {name: p.requires_grad for name, p in module.named_parameters()}
     module.load_state_dict({name: cast(t, dtype) for name, t in tensors.items()}, strict=True, assign=True)
@@ -210,16 +210,17 @@ def take_memory(module: nn.Module) -> None:
             tensor.data = tensor.data.clone()
 
 
-def check_kinds(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], source: str) -> None:
+def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: str) -> None:
     """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are.
 
     Raises:
         UserError: names the tensors that are not.
     """
     wrong = [
-        f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of {str(own[name].dtype).removeprefix('torch.')}"
+        f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of "
+        f"{str(expected[name].dtype).removeprefix('torch.')}"
         for name, tensor in tensors.items()
-        if name in own and _kind(tensor) != _kind(own[name])
+        if name in expected and _kind(tensor) != _kind(expected[name])
     ]
     if wrong:
         raise UserError(f"The weights in {source} are of another kind of number: {listed(sorted(wrong), 5)}.")

@@ -17,7 +17,7 @@ Pooled = Callable[[Tensor, int, str], Tensor]
 """Pictures as the tower takes them, the side of the grid and the pooling → tokens [n, grid², d_vision]."""
 
 
-class Seeing(Protocol):
+class VisionEncoder(Protocol):
     """What is asked of such a policy."""
 
     history_dtype: torch.dtype
@@ -35,7 +35,7 @@ class Seeing(Protocol):
 
 @torch.no_grad()
 def encode_frames(
-    policy: Seeing, frames: np.ndarray | Tensor, pooled: Pooled, d_vision: int, batch_size: int
+    policy: VisionEncoder, frames: np.ndarray | Tensor, pooled: Pooled, d_vision: int, batch_size: int
 ) -> Tensor:
     """Memory-view frames [n, H, W, 3] uint8, in batches → tokens [n, grid², d_vision] as the memory stores them."""
     storage, device = policy.require_memory().storage, policy.device
@@ -48,9 +48,9 @@ def encode_frames(
     return torch.cat(encoded)
 
 
-def prepare(policy: Seeing, episode: "Episode") -> bool:
+def prepare(policy: VisionEncoder, episode: "Episode") -> bool:
     """`Policy.prepare` where the memory reads the episode's own history."""
-    if policy.memory is None or not episode.frames_seen:
+    if policy.memory is None or not episode.n_observed_frames:
         return False
     with policy.autocast():
         return policy.memory.prepare(episode.required_history(), episode.stream)

@@ -12,7 +12,7 @@ from mme_vla.probing.channels import Channel, NoChannel, Remembered
 from mme_vla.probing.interventions import NEEDS, Feed, Intervention, Moment
 from mme_vla.registry import INTERVENTIONS
 
-USUAL = (
+DEFAULT_ARMS = (
     "drop:all", "nodemo", "swap", "shuffle", "recent", "oracle", "delay:16", "delay:64", "delay:256", "pause",
     "distract:1", "distract:3", "subgoal_swap", "subgoal_delay", "subgoal_count",
 )  # fmt: skip
@@ -82,19 +82,19 @@ class Arm:
 UNPROBED = Arm("unprobed")
 
 
-def read_arm(given: Any) -> Arm:
+def read_arm(spec: Any) -> Arm:
     """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`.
 
     Raises:
         UserError: an unknown intervention, or a dial or option that cannot be.
     """
-    if isinstance(given, Mapping):
-        part: Intervention = INTERVENTIONS.build(given)
-        options = ",".join(f"{key}={value}" for key, value in given.items() if key != "name")
-        return Arm(f"{given['name']}({options})" if options else str(given["name"]), (part,))
-    if not isinstance(given, str) or not given:
-        raise UserError(f"with={brief(given)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop, …}}.")
-    return Arm(given, tuple(_read_part(word) for word in given.split("+")))
+    if isinstance(spec, Mapping):
+        part: Intervention = INTERVENTIONS.build(spec)
+        options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
+        return Arm(f"{spec['name']}({options})" if options else str(spec["name"]), (part,))
+    if not isinstance(spec, str) or not spec:
+        raise UserError(f"with={brief(spec)}: write words such as drop:2 or nodemo+shuffle, or {{name: drop, …}}.")
+    return Arm(spec, tuple(_read_part(word) for word in spec.split("+")))
 
 
 def _read_part(word: str) -> Intervention:
@@ -112,13 +112,13 @@ def _read_part(word: str) -> Intervention:
     return made
 
 
-def read_arms(given: Any) -> list[Arm]:
+def read_arms(specs: Any) -> list[Arm]:
     """Arms of `with`, each once.
 
     Raises:
         UserError: as `read_arm`; or one twice.
     """
-    words = [given] if isinstance(given, str | Mapping) else list(given)
+    words = [specs] if isinstance(specs, str | Mapping) else list(specs)
     arms = [read_arm(word) for word in words]
     names = [arm.name for arm in arms]
     if twice := [name for i, name in enumerate(names) if name in names[:i]]:
@@ -151,7 +151,7 @@ def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boun
 
 
 def choose_arms(
-    given: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
+    specs: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
 ) -> tuple[list[Arm], list[str]]:
     """The arms asked for; unasked, those of `USUAL` that this policy and these data allow, and why not the others.
 
@@ -159,11 +159,11 @@ def choose_arms(
         UserError: an arm that was asked for by name is not possible.
     """
     arms, left_out = [], []
-    for arm in read_arms(USUAL if given is None else given):
+    for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
         why = lacking(arm, policy, channel, recordings, boundaries=boundaries)
         if why is None:
             arms.append(arm)
-        elif given is None:
+        elif specs is None:
             left_out.append(f"{arm.name} was left out: it needs {why}.")
         else:
             raise UserError(f"with={arm.name} needs {why}; {policy.config.get('name', 'this policy')} has none here.")
@@ -172,11 +172,11 @@ def choose_arms(
 
 def options_of(arm: Arm) -> list[dict[str, Any]]:
     """The options of an arm's parts, as plain values."""
-    told: list[dict[str, Any]] = []
+    options: list[dict[str, Any]] = []
     for part in arm.parts:
         names: list[str] = [option.name for option in fields(part)] if is_dataclass(part) else []
-        told.append({"intervention": type(part).__name__, **{name: getattr(part, name) for name in names}})
-    return told
+        options.append({"intervention": type(part).__name__, **{name: getattr(part, name) for name in names}})
+    return options
 
 
 def slug(name: str) -> str:

@@ -14,7 +14,7 @@ from torch import Tensor
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import FrameScores, History
 from mme_vla.policy.base import Policy
-from mme_vla.policy.episode import Episode, Writes
+from mme_vla.policy.episode import Episode, WritableMemory
 from mme_vla.types import HistoryTokens
 
 
@@ -45,7 +45,7 @@ class Remembered:
         return len(self.entries)
 
     @property
-    def held(self) -> list[int]:
+    def occupied(self) -> list[int]:
         """Slots that hold something."""
         return [slot for slot, entry in enumerate(self.entries) if entry is not None]
 
@@ -89,15 +89,15 @@ class OnlyFrames(History):
     What the memory then chooses is a choice among these; `frames` says which frame each of its numbers stands for.
     """
 
-    def __init__(self, whole: History, frames: np.ndarray) -> None:
+    def __init__(self, full: History, frames: np.ndarray) -> None:
         """Take the stored frames `frames` [m], ascending, at least one; the last stands for the current one."""
-        every = whole.spec.keep_every
+        every = full.spec.keep_every
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
-        self._kept = whole.spec.kept_frames(self._length)
+        self._kept = full.spec.stored_frames(self._length)
         self.frames = dict(zip(self._kept.tolist(), frames.tolist(), strict=True))
-        earlier = int((frames < whole.exec_start).sum())
-        super().__init__(whole.spec, int(self._kept[earlier]) if earlier < len(frames) else self._length)
-        self._whole = whole
+        earlier = int((frames < full.exec_start).sum())
+        super().__init__(full.spec, int(self._kept[earlier]) if earlier < len(frames) else self._length)
+        self._whole = full
 
     def __len__(self) -> int:
         return self._length
@@ -106,9 +106,9 @@ class OnlyFrames(History):
     def scores(self) -> FrameScores:
         rows = {frame: i for i, frame in enumerate(self._whole.scores.frames.tolist())}
         # The first frame is remembered whatever its score, as that of an episode is.
-        found = [(mine, rows[its]) for mine, its in self.frames.items() if mine and its in rows]
-        values = self._whole.scores.values[[row for _, row in found]]
-        return FrameScores(np.array([mine for mine, _ in found], np.int64), values)
+        pairs = [(mine, rows[its]) for mine, its in self.frames.items() if mine and its in rows]
+        values = self._whole.scores.values[[row for _, row in pairs]]
+        return FrameScores(np.array([mine for mine, _ in pairs], np.int64), values)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         its = np.array([self.frames[frame] for frame in indices[:, 0].tolist()], np.int64)
@@ -118,9 +118,9 @@ class OnlyFrames(History):
 class Exchanged(History):
     """A history whose frames hold what other frames held, of this episode or another."""
 
-    def __init__(self, whole: History, places: Mapping[int, Place]) -> None:
-        super().__init__(whole.spec, whole.exec_start)
-        self._whole, self._places = whole, places
+    def __init__(self, full: History, places: Mapping[int, Place]) -> None:
+        super().__init__(full.spec, full.exec_start)
+        self._whole, self._places = full, places
 
     def __len__(self) -> int:
         return len(self._whole)
@@ -140,12 +140,12 @@ class Exchanged(History):
             tokens = history.gather(np.array([parts[i][1] for i in at], np.int64))
             for i, row in zip(at, tokens, strict=True):
                 rows[i] = row
-        found = [row for row in rows if row is not None]
-        return torch.stack(found) if found else self._whole.gather(indices)
+        present = [row for row in rows if row is not None]
+        return torch.stack(present) if present else self._whole.gather(indices)
 
 
 @dataclass(frozen=True)
-class Recollection:
+class MemorySnapshot:
     """What an episode remembers now: its stores, and what the channel needs to give them back."""
 
     stores: tuple[Remembered, ...]
@@ -161,11 +161,11 @@ class Channel:
     chooses = True
     """Whether the memory chooses among frames, so that it can be given fewer."""
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> Recollection:
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
         """What is remembered at `step` (by default now), choosing among the frames `only` where they are given."""
         raise NotImplementedError
 
-    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> Any:
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
         """What `answer` takes for an episode that remembers `stores` instead."""
         raise NotImplementedError
 
@@ -175,7 +175,7 @@ class Channel:
         """Normalised chunks [n, h, a] for what `observation` saw of n episodes, through what `as_if` made of them."""
         raise NotImplementedError
 
-    def chosen(self, episode: Episode, remembering: Any) -> None:
+    def commit(self, episode: Episode, remembering: Any) -> None:
         """Let the real episode go on from a chunk that was chosen so."""
 
 
@@ -188,20 +188,20 @@ class SelectionChannel(Channel):
     def __init__(self, policy: Policy) -> None:
         self._policy, self._memory = policy, policy.require_memory()
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> Recollection:
-        whole = episode.required_history()
-        now = len(whole) - 1 if step is None else step
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        full = episode.required_history()
+        now = len(full) - 1 if step is None else step
         if only is not None and step is not None:
             raise ValueError("Choosing among some frames is for the current one.")
-        view: History = whole if only is None else OnlyFrames(whole, only)
+        view: History = full if only is None else OnlyFrames(full, only)
         at = now if only is None else len(view) - 1
         names = view.frames if isinstance(view, OnlyFrames) else {}
         frames = np.unique(self._memory.select(view, at)[:, 0]).tolist()
         entries = tuple(Entry(names.get(frame, frame), (view, frame)) for frame in frames)
-        return Recollection((Remembered(entries, now),), (view, at, frames))
+        return MemorySnapshot((Remembered(entries, now),), (view, at, frames))
 
-    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> HistoryTokens:
-        view, at, frames = recollection.source
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> HistoryTokens:
+        view, at, frames = snapshot.source
         slots = dict(zip(frames, stores[0].entries, strict=True))
         places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
         tokens = self._memory.recall(Exchanged(view, places), at)
@@ -210,8 +210,10 @@ class SelectionChannel(Channel):
             its = tokens.mask & (tokens.positions[:, 0] == frame)
             positions[its, 0] = 0.0 if entry is None else float(entry.time)
             mask[its] = entry is not None
-        kept = mask[:, None]
-        return HistoryTokens(tokens.features.masked_fill(~kept, 0), positions.masked_fill(~kept, 0), mask, tokens.step)
+        mask_3d = mask[:, None]
+        return HistoryTokens(
+            tokens.features.masked_fill(~mask_3d, 0), positions.masked_fill(~mask_3d, 0), mask, tokens.step
+        )
 
     def answer(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
@@ -220,7 +222,7 @@ class SelectionChannel(Channel):
         return self._policy.sample_actions(batch, draws, steps)
 
 
-class WrittenChannel(Channel):
+class WritableChannel(Channel):
     """Episodes that write a memory of their own (`policy/episode.py`), where chunks are chosen."""
 
     sees_pauses, chooses = False, False
@@ -228,27 +230,27 @@ class WrittenChannel(Channel):
     def __init__(self, policy: Policy, clock: str | None) -> None:
         self._policy, self.clock = policy, clock
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> Recollection:
-        assert isinstance(episode, Writes)
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        assert isinstance(episode, WritableMemory)
         stores = [
             Remembered(tuple(Entry(time, content) for time, content in store.entries), store.now, store.name)
-            for store in episode.written()
+            for store in episode.writable_memory()
         ]
-        return Recollection(tuple(stores))
+        return MemorySnapshot(tuple(stores))
 
-    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> Any:
-        assert isinstance(episode, Writes)
-        held = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
-        return episode.as_if_written(held)
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Any:
+        assert isinstance(episode, WritableMemory)
+        entries = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
+        return episode.with_entries(entries)
 
     def answer(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         return self._policy.answer(batch, remembering, draws, steps)
 
-    def chosen(self, episode: Episode, remembering: Any) -> None:
-        assert isinstance(episode, Writes)
-        episode.go_on_from(remembering)
+    def commit(self, episode: Episode, remembering: Any) -> None:
+        assert isinstance(episode, WritableMemory)
+        episode.resume_from(remembering)
 
 
 class NoChannel(Channel):
@@ -259,10 +261,10 @@ class NoChannel(Channel):
     def __init__(self, policy: Policy) -> None:
         self._policy = policy
 
-    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> Recollection:
-        return Recollection(())
+    def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
+        return MemorySnapshot(())
 
-    def as_if(self, episode: Episode, recollection: Recollection, stores: Sequence[Remembered]) -> Episode:
+    def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Episode:
         return episode
 
     def answer(
@@ -276,4 +278,4 @@ def channel_of(policy: Policy) -> Channel:
     if policy.memory is not None:
         return SelectionChannel(policy)
     episode = policy.start_episode("")
-    return WrittenChannel(policy, episode.written_clock) if isinstance(episode, Writes) else NoChannel(policy)
+    return WritableChannel(policy, episode.memory_clock) if isinstance(episode, WritableMemory) else NoChannel(policy)

@@ -33,7 +33,7 @@ class Feed:
             if getattr(self, name) < 0:
                 raise UserError(f"A probe cannot show {getattr(self, name)} {name}: the number must not be negative.")
 
-    def shown(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
+    def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
         """Where frames [n] of the episode stand among the shown ones, int64 [n]; −1 where one is left out.
 
         Args:
@@ -49,14 +49,14 @@ class Feed:
         """The first execution frame among the shown ones."""
         return before + (exec_start if self.video else 0)
 
-    def own(self, shown: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
+    def source_frames(self, displayed: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
         """The episode's own frames behind shown ones [m], ascending, each once; those of sessions are left out."""
-        shown = np.asarray(shown, np.int64) - before
-        shown = shown[shown >= 0]
+        displayed = np.asarray(displayed, np.int64) - before
+        displayed = displayed[displayed >= 0]
         video = exec_start if self.video else 0
-        past = shown - video
+        past = displayed - video
         executed = np.where(past > self.at, np.maximum(past - self.stills, self.at), past)
-        return np.unique(np.where(shown < video, shown, exec_start + executed))
+        return np.unique(np.where(displayed < video, displayed, exec_start + executed))
 
 
 NEEDS = {
@@ -87,11 +87,11 @@ class Moment:
 
     rng: np.random.Generator
     now: int = 0
-    kept: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
+    stored: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     boundaries: Sequence[int] = ()
-    said: Sequence[str | None] = ()
+    subgoals: Sequence[str | None] = ()
     donor: Callable[[str], Remembered] = _nothing
-    donor_said: str | None = None
+    donor_subgoal: str | None = None
     weigh: Callable[[Remembered], np.ndarray] | None = None
 
 
@@ -121,7 +121,7 @@ class Intervention:
         return subgoal
 
 
-def whole(name: str, value: Any, least: int) -> None:
+def check_integer(name: str, value: Any, least: int) -> None:
     """Make sure that a dial is a whole number.
 
     Raises:
@@ -142,9 +142,9 @@ class Shuffle(Intervention):
     needs: ClassVar = frozenset({"entries"})
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        held = store.held
-        order = moment.rng.permutation(held)
-        return store.rearranged(held, [_content(store, int(slot)) for slot in order])
+        slots = store.occupied
+        order = moment.rng.permutation(slots)
+        return store.rearranged(slots, [_content(store, int(slot)) for slot in order])
 
 
 @INTERVENTIONS.register("drop")
@@ -163,13 +163,13 @@ class Drop(Intervention):
 
     def __post_init__(self) -> None:
         if self.count is not None:
-            whole("drop.count", self.count, 1)
+            check_integer("drop.count", self.count, 1)
         if self.which not in WHICH:
             raise UserError(f"drop.which={self.which!r}. {did_you_mean(str(self.which), WHICH)}")
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        held = store.held
-        most = len(held) if self.count is None else min(self.count, len(held))
+        slots = store.occupied
+        most = len(slots) if self.count is None else min(self.count, len(slots))
         return store.without(_ranked(store, self.which, moment)[:most])
 
 
@@ -187,16 +187,18 @@ class Swap(Intervention):
 
     def __post_init__(self) -> None:
         if self.count is not None:
-            whole("swap.count", self.count, 1)
+            check_integer("swap.count", self.count, 1)
 
     def edit(self, store: Remembered, moment: Moment) -> Remembered:
-        held, donor = store.held, moment.donor(store.name)
-        if not donor.held or not held:
+        occupied, donor = store.occupied, moment.donor(store.name)
+        if not donor.occupied or not occupied:
             return store
         # Paired over all entries, so that a part of them is swapped as it would be among all.
-        their = dict(zip(held, np.array(donor.held)[same_progress(held, len(donor.held))].tolist(), strict=True))
-        count = len(held) if self.count is None else min(self.count, len(held))
-        slots = sorted(moment.rng.permutation(held)[:count].tolist())
+        their = dict(
+            zip(occupied, np.array(donor.occupied)[same_progress(occupied, len(donor.occupied))].tolist(), strict=True)
+        )
+        count = len(occupied) if self.count is None else min(self.count, len(occupied))
+        slots = sorted(moment.rng.permutation(occupied)[:count].tolist())
         return store.rearranged(slots, [_content(donor, their[slot]) for slot in slots])
 
 
@@ -227,11 +229,11 @@ class Recent(Intervention):
     needs: ClassVar = frozenset({"entries", "choice"})
 
     def __post_init__(self) -> None:
-        whole("recent.frames", self.frames, 1)
+        check_integer("recent.frames", self.frames, 1)
 
     def only(self, moment: Moment) -> np.ndarray | None:
-        inside = moment.kept[moment.kept > moment.now - self.frames]
-        return inside if len(inside) else moment.kept[-1:]
+        inside = moment.stored[moment.stored > moment.now - self.frames]
+        return inside if len(inside) else moment.stored[-1:]
 
 
 @INTERVENTIONS.register("oracle")
@@ -243,8 +245,8 @@ class Oracle(Intervention):
 
     def only(self, moment: Moment) -> np.ndarray | None:
         past = [frame for frame in moment.boundaries if frame <= moment.now]
-        at = np.searchsorted(moment.kept, past, side="right") - 1
-        return moment.kept[np.unique(np.append(np.maximum(at, 0), len(moment.kept) - 1))]
+        at = np.searchsorted(moment.stored, past, side="right") - 1
+        return moment.stored[np.unique(np.append(np.maximum(at, 0), len(moment.stored) - 1))]
 
 
 @INTERVENTIONS.register("pause")
@@ -291,18 +293,18 @@ def _content(store: Remembered, slot: int) -> Any:
 
 def _ranked(store: Remembered, which: str, moment: Moment) -> list[int]:
     """Slots that hold something, those to be taken first at the beginning."""
-    held = store.held
+    slots = store.occupied
 
     def used() -> list[int]:
         if moment.weigh is None:
             raise UserError("drop.which=used needs a policy to ask, and here is none.")
         weights = moment.weigh(store)
-        return sorted(held, key=lambda slot: -weights[slot])
+        return sorted(slots, key=lambda slot: -weights[slot])
 
     orders: Mapping[str, Callable[[], list[int]]] = {
-        "oldest": lambda: sorted(held, key=lambda slot: -store.age(slot)),
-        "newest": lambda: sorted(held, key=store.age),
-        "random": lambda: moment.rng.permutation(held).tolist(),
+        "oldest": lambda: sorted(slots, key=lambda slot: -store.age(slot)),
+        "newest": lambda: sorted(slots, key=store.age),
+        "random": lambda: moment.rng.permutation(slots).tolist(),
         "used": used,
     }
     return orders[which]()
@@ -321,7 +323,7 @@ class SubgoalSwap(Intervention):
     needs: ClassVar = frozenset({"subgoal", "recordings"})
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        return subgoal if moment.donor_said is None else moment.donor_said
+        return subgoal if moment.donor_subgoal is None else moment.donor_subgoal
 
 
 @INTERVENTIONS.register("subgoal_delay")
@@ -334,10 +336,10 @@ class SubgoalDelay(Intervention):
     needs: ClassVar = frozenset({"subgoal"})
 
     def __post_init__(self) -> None:
-        whole("subgoal_delay.decisions", self.decisions, 1)
+        check_integer("subgoal_delay.decisions", self.decisions, 1)
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        return moment.said[max(len(moment.said) - 1 - self.decisions, 0)] if moment.said else subgoal
+        return moment.subgoals[max(len(moment.subgoals) - 1 - self.decisions, 0)] if moment.subgoals else subgoal
 
 
 @INTERVENTIONS.register("subgoal_count")
@@ -352,8 +354,8 @@ class SubgoalCount(Intervention):
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
         return None if subgoal is None else _COUNT.sub(self._wrong, subgoal)
 
-    def _wrong(self, found: re.Match[str]) -> str:
-        word = found[0]
+    def _wrong(self, match: re.Match[str]) -> str:
+        word = match[0]
         for words in (_ORDINALS, _NUMBERS):
             if word in words:
                 return words[(words.index(word) + self.by) % len(words)]

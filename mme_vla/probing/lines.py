@@ -70,19 +70,19 @@ def append(path: Path, lines: Iterable[Line], recording: str) -> None:
     rows.append({"kind": "done", "recording": recording})
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
-        file.truncate(_whole(path.read_bytes()))
+        file.truncate(_complete_length(path.read_bytes()))
         file.write("".join(json.dumps(row, separators=(",", ":")) + "\n" for row in rows).encode())
         file.flush()
         os.fsync(file.fileno())
 
 
-def _whole(content: bytes) -> int:
+def _complete_length(content: bytes) -> int:
     """How many bytes there are up to the last recorded episode that is done: what follows was cut off."""
-    end = kept = 0
+    end = length = 0
     for line in content.splitlines(keepends=True):
         end += len(line)
-        kept = end if line.startswith(DONE) and line.endswith(b"\n") else kept
-    return kept
+        length = end if line.startswith(DONE) and line.endswith(b"\n") else length
+    return length
 
 
 def read(path: Path) -> tuple[list[Line], set[str]]:
@@ -93,18 +93,18 @@ def read(path: Path) -> tuple[list[Line], set[str]]:
     """
     if not path.is_file():
         return [], set()
-    *whole, rest = read_bytes(path, "lines of a probe", LIMIT).split(b"\n")
-    if rest.strip():
+    *complete, incomplete = read_bytes(path, "lines of a probe", LIMIT).split(b"\n")
+    if incomplete.strip():
         warnings.warn(f"{path}: ignored a half-written last line.", stacklevel=2)
-    found: dict[str, list[Line]] = {}
+    pending: dict[str, list[Line]] = {}
     done: dict[str, list[Line]] = {}
-    for number, line in enumerate(whole, 1):
+    for number, line in enumerate(complete, 1):
         row = parse_json(line, f"{path}, line {number},")
         if row.get("kind") == "done":
-            done[row["recording"]] = found.pop(row["recording"], [])
+            done[row["recording"]] = pending.pop(row["recording"], [])
         else:
             read_line = _line(row, f"{path}, line {number}")
-            found.setdefault(read_line.recording, []).append(read_line)
+            pending.setdefault(read_line.recording, []).append(read_line)
     return [line for lines in done.values() for line in lines], set(done)
 
 

@@ -16,10 +16,10 @@ from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.policy.base import Policy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import UNPROBED, Arm
-from mme_vla.probing.channels import Recollection
-from mme_vla.probing.interventions import Feed, whole
+from mme_vla.probing.channels import MemorySnapshot
+from mme_vla.probing.interventions import Feed, check_integer
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
-from mme_vla.probing.probed import Lenders, ProbedEpisode, ProbedPolicy
+from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy
 from mme_vla.probing.recordings import Recording, others
 from mme_vla.processing.prompt import subgoal_kind
 
@@ -42,10 +42,10 @@ def compare_chunks(before: Tensor, after: Tensor) -> Change:
     first, second = (x.double().flatten(1).numpy() for x in (before, after))
     across, within, inside = _distances(first, second), _distances(first, first), _distances(second, second)
     energy = 2 * across.mean() - within.mean() - inside.mean()
-    return Change(float(np.diagonal(across).mean()), spread_of(within), float(max(energy, 0.0)))
+    return Change(float(np.diagonal(across).mean()), std_of(within), float(max(energy, 0.0)))
 
 
-def spread_of(distances: np.ndarray) -> float:
+def std_of(distances: np.ndarray) -> float:
     """Mean of the distances [n, n] between different rows; 0 for one row."""
     n = len(distances)
     return float(distances.sum() / (n * (n - 1))) if n > 1 else 0.0
@@ -72,7 +72,7 @@ class OfflineSettings:
     def __post_init__(self) -> None:
         least = {"seed": 0, "draws": 1, **({} if self.moments is None else {"moments": 1})}
         for name, smallest in least.items():
-            whole(name, getattr(self, name), smallest)
+            check_integer(name, getattr(self, name), smallest)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -103,11 +103,11 @@ def probe_offline(
         UserError: the policy reads depth, and the data keep none.
     """
     _, done = lines.read(path)
-    lenders = Lenders(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
+    donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
     for recording in recordings:
         if recording.name not in done:
-            found = _Moments(policy, arms, recording, lend, lenders, settings).lines()
-            lines.append(path, found, recording.name)
+            result = _Moments(policy, arms, recording, lend, donors, settings).lines()
+            lines.append(path, result, recording.name)
         after(1)
     return lines.read(path)[0]
 
@@ -121,20 +121,20 @@ class _Moments:
         arms: Sequence[Arm],
         recording: Recording,
         lend: Sequence[Recording],
-        lenders: Lenders | None,
+        donors: DonorEpisodes | None,
         settings: OfflineSettings,
     ) -> None:
         self._policy, self._recording, self._settings = policy, recording, settings
         self._seed = episode_seed(settings.seed, recording.task, recording.episode)
         self._steps = recording.decisions(policy.embodiment.action.execute, settings.moments)
-        self._said = subgoal_kind(policy)
+        self._subgoal_kind = subgoal_kind(policy)
         self._boundaries = recording.boundaries()
         sessions = others(lend, recording, recording.goal)
         self._by_feed: dict[Feed, list[ProbedPolicy]] = defaultdict(list)
         for arm in [UNPROBED, *arms]:
-            self._by_feed[arm.feed].append(ProbedPolicy(policy, arm, sessions, lenders).eval())
+            self._by_feed[arm.feed].append(ProbedPolicy(policy, arm, sessions, donors).eval())
         self._draws = self._shared_noise()
-        self._plain: dict[int, Tensor] = {}
+        self._baseline: dict[int, Tensor] = {}
         """Unprobed chunks [draws, h, w] of each step."""
 
     def lines(self) -> list[Line]:
@@ -148,69 +148,69 @@ class _Moments:
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Show the episode once to arms that are shown the same."""
-        found: list[Line] = []
+        result: list[Line] = []
         recording, first = self._recording, arms[0]
         episode = first.start_episode(recording.goal, self._seed)
         episode.recording = recording
-        wanted = self._wanted(arms)
-        seen = 0
+        required = self._required_frames(arms)
+        n_observed = 0
         for step in self._steps:
-            recording.show(episode, seen, step + 1, wanted)
-            seen = step + 1
-            episode.boundaries = self._shown(first)
-            episode.subgoal = None if self._said is None else recording.subgoal(step, self._said)
-            episode.said.append(episode.subgoal)
+            recording.show(episode, n_observed, step + 1, required)
+            n_observed = step + 1
+            episode.boundaries = self._boundary_frames(first)
+            episode.subgoal = None if self._subgoal_kind is None else recording.subgoal(step, self._subgoal_kind)
+            episode.subgoals.append(episode.subgoal)
             for probed in arms:
-                found += self._probe(probed, episode, step)
-            episode.told(episode.subgoal)
+                result += self._probe(probed, episode, step)
+            episode.set_subgoal(episode.subgoal)
             self._policy.act([episode.inner], self._settings.flow_steps)  # banks are written where chunks are chosen
-        return found
+        return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:
         """What an arm does at a moment; of the unprobed one, what it is compared with."""
         arm, draws, steps = probed.arm, self._draws[step], self._settings.flow_steps
-        episode.told(arm.say(episode.subgoal, probed.moment(episode)))
-        recollection, edited = probed.recall(episode, draws[0])
+        episode.set_subgoal(arm.say(episode.subgoal, probed.moment(episode)))
+        snapshot, edited = probed.snapshot(episode, draws[0])
         if arm is UNPROBED:
-            self._plain[step] = probed.ask(episode, recollection, [edited], draws, steps)[0]
-            return self._scan(probed, episode, recollection, step) if self._settings.scan else []
-        change = compare_chunks(self._plain[step], probed.ask(episode, recollection, [edited], draws, steps)[0])
-        stores = recollection.stores
+            self._baseline[step] = probed.ask(episode, snapshot, [edited], draws, steps)[0]
+            return self._scan(probed, episode, snapshot, step) if self._settings.scan else []
+        change = compare_chunks(self._baseline[step], probed.ask(episode, snapshot, [edited], draws, steps)[0])
+        stores = snapshot.stores
         touched = [age for old, new in zip(stores, edited, strict=True) for age in old.changed(new)]
         return [MomentLine(
             self._recording.name, self._recording.task, step, self._phase(step), self._recording.subgoal(step) or "",
             arm.name, arm.dial(), sum(map(len, stores)), touched, **asdict(change),
         )]  # fmt: skip
 
-    def _scan(self, probed: ProbedPolicy, episode: ProbedEpisode, recollection: Recollection, step: int) -> list[Line]:
+    def _scan(self, probed: ProbedPolicy, episode: ProbedEpisode, snapshot: MemorySnapshot, step: int) -> list[Line]:
         """The change that each entry's absence makes, one at a time."""
-        stores, places = recollection.stores, []
+        stores, places = snapshot.stores, []
         for i, store in enumerate(stores):
-            places += [(i, slot) for slot in store.held]
+            places += [(i, slot) for slot in store.occupied]
         if not places:
             return []
         variants = [[*stores[:i], stores[i].without([slot]), *stores[i + 1 :]] for i, slot in places]
-        chunks = probed.ask(episode, recollection, variants, self._draws[step], self._settings.flow_steps)
-        found: list[Line] = []
+        chunks = probed.ask(episode, snapshot, variants, self._draws[step], self._settings.flow_steps)
+        result: list[Line] = []
         for (i, slot), chunk in zip(places, chunks, strict=True):
-            change, entry = compare_chunks(self._plain[step], chunk), stores[i].entries[slot]
+            change, entry = compare_chunks(self._baseline[step], chunk), stores[i].entries[slot]
             assert entry is not None
-            found.append(EntryLine(
+            result.append(EntryLine(
                 self._recording.name, self._recording.task, step, self._phase(step), stores[i].name, slot, entry.time,
                 stores[i].age(slot), entry.time < self._recording.exec_start, change.change, change.spread,
             ))  # fmt: skip
-        return found
+        return result
 
     def _phase(self, step: int) -> int:
         """Sub-tasks of the execution that began before this step's."""
         return sum(self._recording.exec_start < frame <= step for frame in self._boundaries)
 
-    def _shown(self, probed: ProbedPolicy) -> list[int]:
+    def _boundary_frames(self, probed: ProbedPolicy) -> list[int]:
         """Where sub-tasks began, among the frames as they are shown."""
-        shown = probed.arm.feed.shown(np.array(self._boundaries), self._recording.exec_start, probed.before)
-        return sorted({int(frame) for frame in shown if frame >= 0})
+        displayed = probed.arm.feed.displayed(np.array(self._boundaries), self._recording.exec_start, probed.before)
+        return sorted({int(frame) for frame in displayed if frame >= 0})
 
-    def _wanted(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
+    def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
         """Frames that any of these arms looks at; None for all."""
         parts = [probed.frames_read(np.array(self._steps), self._recording.exec_start) for probed in arms]
         known = [part for part in parts if part is not None]

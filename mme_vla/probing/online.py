@@ -20,7 +20,7 @@ from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.policy.base import Policy
 from mme_vla.probing.arms import UNPROBED, Arm, lacking, read_arm, slug
 from mme_vla.probing.channels import channel_of
-from mme_vla.probing.probed import Lenders, ProbedPolicy
+from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.probing.recordings import Recording
 from mme_vla.subgoal import SubgoalPredictor
 
@@ -40,7 +40,7 @@ def probe_online(
     shard: Shard | None = None,
     source: str | None = None,
     base: Callable[..., Any] = make_env,
-    shown: bool = True,
+    show_progress: bool = True,
 ) -> list[EpisodeRecord]:
     """Run what `folder` has no record of yet, first without and then under each arm; all records.
 
@@ -52,11 +52,12 @@ def probe_online(
     """
     records: list[EpisodeRecord] = []
     for arm in [UNPROBED, *arms]:
-        lenders = Lenders(policy, ProbedPolicy(policy).channel, lend) if lend else None
-        probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, lend, lenders).eval()
+        donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if lend else None
+        probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, lend, donors).eval()
         done = evaluate(
             probed, jobs, folder / FOLDER / slug(arm.name), replace(facts, model=named(facts.model, arm)), settings,
-            subgoals=subgoals, shard=shard, source=source, base=base, notes={"arm": arm.name}, shown=shown,
+            subgoals=subgoals, shard=shard, source=source, base=base, notes={"arm": arm.name},
+            show_progress=show_progress,
         )  # fmt: skip
         records += done.records
     return records
@@ -83,10 +84,10 @@ def paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Com
         return []
     protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
     methods = aggregate(records, protocol, split).methods
-    plain = next((method for method in methods if method.model == model), None)
-    if plain is None:
+    baseline = next((method for method in methods if method.model == model), None)
+    if baseline is None:
         return []
-    return compare_all([(m, plain) for m in methods if m is not plain and common_episodes(m, plain)], protocol)
+    return compare_all([(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)], protocol)
 
 
 def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -> Policy:
@@ -111,6 +112,6 @@ def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -
     arm = read_arm(f"distract:{variant.sessions}")
     if why := lacking(arm, policy, channel_of(policy), len(recordings), boundaries=False):
         raise UserError(f"split={split} needs {why}.")
-    shown = ProbedPolicy(policy, arm, recordings, of_split=True).eval()
-    shown.config["sessions"] = [recording.name for recording in shown.sessions]
-    return shown
+    probed = ProbedPolicy(policy, arm, recordings, of_split=True).eval()
+    probed.config["sessions"] = [recording.name for recording in probed.sessions]
+    return probed

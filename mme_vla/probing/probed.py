@@ -14,7 +14,7 @@ from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.probing.arms import UNPROBED, Arm, options_of
-from mme_vla.probing.channels import Channel, Recollection, Remembered, channel_of
+from mme_vla.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.probing.interventions import Moment
 from mme_vla.probing.recordings import SUBGOAL, Recording, others, stored_frames
 from mme_vla.processing.prompt import subgoal_kind
@@ -46,7 +46,7 @@ class ProbedEpisode(Episode):
         self.recording: Recording | None = None
         self.exec_start: int | None = None
         self.boundaries: Sequence[int] = ()
-        self.said: list[str | None] = []
+        self.subgoals: list[str | None] = []
 
     def observe(
         self,
@@ -61,20 +61,20 @@ class ProbedEpisode(Episode):
         feed, count = self._prober.arm.feed, len(states)
         demo = np.broadcast_to(np.asarray(is_demo, bool), (count,))
         video = int(demo.sum())
-        if not self.frames_seen:
+        if not self.n_observed_frames:
             self._show_sessions()
         if self.exec_start is None and video < count:
-            self.exec_start = self.frames_seen + video
-        given = _Frames(frames, np.asarray(states), demo, actions, drawn, self._robot.action.frames is None)
+            self.exec_start = self.n_observed_frames + video
+        chunk = _Frames(frames, np.asarray(states), demo, actions, drawn, self._robot.action.frames is None)
         if feed.video:
-            given.show(self.inner, 0, video)
-        held = -1 if self.exec_start is None else self.exec_start + feed.at - self.frames_seen
-        if feed.stills and video <= held < count:
-            given.show(self.inner, video, held + 1)
-            given.hold(self.inner, held, feed.stills)
-            video = held + 1
-        given.show(self.inner, video, count)
-        self.frames_seen += count
+            chunk.show(self.inner, 0, video)
+        pause = -1 if self.exec_start is None else self.exec_start + feed.at - self.n_observed_frames
+        if feed.stills and video <= pause < count:
+            chunk.show(self.inner, video, pause + 1)
+            chunk.hold(self.inner, pause, feed.stills)
+            video = pause + 1
+        chunk.show(self.inner, video, count)
+        self.n_observed_frames += count
 
     def _show_sessions(self) -> None:
         stored, before = stored_frames(self._prober.inner, self._prober.before), 0
@@ -83,15 +83,15 @@ class ProbedEpisode(Episode):
             recording.show(self.inner, 0, recording.length, here, video=True)
             before += recording.length
 
-    def told(self, subgoal: str | None) -> None:
+    def set_subgoal(self, subgoal: str | None) -> None:
         """Tell the policy's own episode what the arm made of the subgoal."""
         self.inner.subgoal = subgoal
 
     def begun(self, frames: Sequence[int], exec_start: int) -> None:
         """Note where sub-tasks began, the execution among them, as the frames are shown."""
-        told = np.array(sorted({0, exec_start, *frames}), np.int64)
-        shown = self._prober.arm.feed.shown(told, exec_start, self._prober.before)
-        self.boundaries = [int(frame) for frame in shown if frame >= 0]
+        starts = np.array(sorted({0, exec_start, *frames}), np.int64)
+        displayed = self._prober.arm.feed.displayed(starts, exec_start, self._prober.before)
+        self.boundaries = [int(frame) for frame in displayed if frame >= 0]
 
     @property
     def state(self) -> Tensor:
@@ -110,7 +110,7 @@ class ProbedEpisode(Episode):
         """Not offered: an arm decides on whole observations."""
         raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
 
-    def look(self, pictures: Mapping[str, np.ndarray], state: np.ndarray) -> None:
+    def look(self, images: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Not offered: an arm decides on whole observations."""
         raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
 
@@ -128,40 +128,40 @@ class _Frames:
         motions: bool,
     ) -> None:
         self._frames, self._states, self._demo = frames, states, demo
-        self._actions, self._drawn, self._motions = actions, drawn, motions
-        self._video, self._told = int(demo.sum()), False
+        self._actions, self._rendered, self._motions = actions, drawn, motions
+        self._video, self._has_motions = int(demo.sum()), False
 
     def show(self, episode: Episode, start: int, stop: int) -> None:
         """Let an episode observe frames start … stop − 1."""
         if stop <= start:
             return
-        views, drawn = self._views(start, stop)
+        views, rendered = self._views(start, stop)
         led = self._actions
         if led is not None and start >= self._video:
-            led = led[:0] if self._motions and self._told else led
+            led = led[:0] if self._motions and self._has_motions else led
             led = led if self._motions else led[start - self._video : stop - self._video]
-            self._told = True
+            self._has_motions = True
         elif start < self._video:
             led = None
-        episode.observe(views, self._states[start:stop], self._demo[start:stop], led, **drawn)
+        episode.observe(views, self._states[start:stop], self._demo[start:stop], led, **rendered)
 
     def hold(self, episode: Episode, at: int, count: int) -> None:
         """Let an episode observe one frame `count` times more, holding the action that led to it."""
-        views, drawn = self._views(at, at + 1)
+        views, rendered = self._views(at, at + 1)
         views = {name: np.repeat(view, count, 0) for name, view in views.items()}
-        if drawn:
-            drawn = {
-                "drawn": {n: np.arange(count) if len(views[n]) else places for n, places in drawn["drawn"].items()}
+        if rendered:
+            rendered = {
+                "drawn": {n: np.arange(count) if len(views[n]) else places for n, places in rendered["drawn"].items()}
             }
         led = self._actions
         if led is not None:
             led = led[:0] if self._motions else np.repeat(led[at - self._video : at - self._video + 1], count, 0)
-        episode.observe(views, np.repeat(self._states[at : at + 1], count, 0), False, led, **drawn)
+        episode.observe(views, np.repeat(self._states[at : at + 1], count, 0), False, led, **rendered)
 
     def _views(self, start: int, stop: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        if self._drawn is None:
+        if self._rendered is None:
             return {name: view[start:stop] for name, view in self._frames.items()}, {}
-        places = {name: np.asarray(at, np.int64) for name, at in self._drawn.items()}
+        places = {name: np.asarray(at, np.int64) for name, at in self._rendered.items()}
         inside = {name: (at >= start) & (at < stop) for name, at in places.items()}
         views = {
             name: view[inside[name]] if name in inside else view[start:stop] for name, view in self._frames.items()
@@ -172,7 +172,7 @@ class _Frames:
 ALIKE = 3  # of the other episodes, so many with the most similar goals lend
 
 
-class Lent:
+class DonorEpisode:
     """A recorded episode that a policy has seen."""
 
     def __init__(self, policy: Policy, channel: Channel, recording: Recording) -> None:
@@ -186,19 +186,19 @@ class Lent:
 
         def store(name: str) -> Remembered:
             step = self._step(episode) if self._channel.chooses else None
-            found = {store.name: store for store in self._channel.read(self._seen(), step).stores}
-            return found[name]
+            stores = {store.name: store for store in self._channel.read(self._seen(), step).stores}
+            return stores[name]
 
         return store
 
-    def said_of(self, episode: ProbedEpisode) -> str | None:
+    def subgoal_of(self, episode: ProbedEpisode) -> str | None:
         """What was said there, as many execution frames in."""
         if self._said not in self.recording.source.subgoal_names:
             return None
         return self.recording.subgoal(self._step(episode), self._said)
 
     def _step(self, episode: ProbedEpisode) -> int:
-        executed = episode.frames_seen - 1 - (episode.exec_start or 0)
+        executed = episode.n_observed_frames - 1 - (episode.exec_start or 0)
         return min(self.recording.exec_start + max(executed, 0), self.recording.length - 1)
 
     def _seen(self) -> Episode:
@@ -217,20 +217,20 @@ class Lent:
         return self._episode
 
 
-class Lenders:
+class DonorEpisodes:
     """Who lends to whom: for each episode always the same, one of those whose goals are most alike."""
 
     def __init__(self, policy: Policy, channel: Channel, recordings: Sequence[Recording]) -> None:
         self._policy, self._channel, self._recordings = policy, channel, list(recordings)
-        self._lent: dict[str, Lent] = {}
+        self._donors: dict[str, DonorEpisode] = {}
 
-    def of(self, episode: ProbedEpisode) -> Lent:
+    def of(self, episode: ProbedEpisode) -> DonorEpisode:
         """Who lends to this episode."""
         alike = others(self._recordings, episode.recording, episode.goal)[:ALIKE]
-        chosen = alike[int(np.random.default_rng(episode.seed).integers(len(alike)))]
-        if chosen.name not in self._lent:
-            self._lent[chosen.name] = Lent(self._policy, self._channel, chosen)
-        return self._lent[chosen.name]
+        donor = alike[int(np.random.default_rng(episode.seed).integers(len(alike)))]
+        if donor.name not in self._donors:
+            self._donors[donor.name] = DonorEpisode(self._policy, self._channel, donor)
+        return self._donors[donor.name]
 
 
 class ProbedPolicy(Policy):
@@ -241,24 +241,24 @@ class ProbedPolicy(Policy):
         inner: Policy,
         arm: Arm = UNPROBED,
         sessions: Sequence[Recording] = (),
-        lenders: Lenders | None = None,
+        donors: DonorEpisodes | None = None,
         of_split: bool = False,
     ) -> None:
         """Stand before a policy.
 
         Args:
             sessions: what is shown before each episode, as far as the arm asks for it.
-            lenders: other episodes to take from. of_split: the sessions are those of a stress split.
+            donors: other episodes to take from. of_split: the sessions are those of a stress split.
         """
         super().__init__()
         self.inner, self.arm, self.channel = inner, arm, channel_of(inner)
         self.memory, self.processor = inner.memory, inner.processor
         self.config = {**inner.config, **({"probe": [arm.name, options_of(arm)]} if arm.parts else {})}
-        self.history_dtype, self.horizon, self.skipped = inner.history_dtype, inner.horizon, inner.skipped
+        self.history_dtype, self.horizon, self.n_past_steps = inner.history_dtype, inner.horizon, inner.n_past_steps
         self.sample_steps, self.action_dim = inner.sample_steps, inner.action_dim
-        self.most_actions = inner.most_actions
-        self.sessions, self.lenders = list(sessions)[: arm.feed.sessions], lenders
-        self.sessions_before = len(self.sessions) if of_split else 0  # those of an arm are the probe's own
+        self.max_actions = inner.max_actions
+        self.sessions, self.donors = list(sessions)[: arm.feed.sessions], donors
+        self.n_distractor_episodes = len(self.sessions) if of_split else 0  # those of an arm are the probe's own
 
     @property
     def before(self) -> int:
@@ -284,76 +284,76 @@ class ProbedPolicy(Policy):
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """The episode's own frames that are looked at, through what the arm makes of them."""
         feed, before = self.arm.feed, self.before
-        shown = feed.shown(steps, exec_start, before)
-        reads = self.inner.frames_read(shown, feed.first_executed(exec_start, before))
+        displayed = feed.displayed(steps, exec_start, before)
+        reads = self.inner.frames_read(displayed, feed.first_executed(exec_start, before))
         if reads is None:
             return None
-        if "choice" in self.arm.needs and len(shown):  # which frames are left to choose from, only then is known
-            stored = stored_frames(self.inner, int(shown.max()) + 1)
+        if "choice" in self.arm.needs and len(displayed):  # which frames are left to choose from, only then is known
+            stored = stored_frames(self.inner, int(displayed.max()) + 1)
             reads = reads if stored is None else np.union1d(reads, stored)
-        held = [exec_start + feed.at] if feed.stills else []
-        return np.union1d(feed.own(reads, exec_start, before), np.array(held, np.int64))
+        paused = [exec_start + feed.at] if feed.stills else []
+        return np.union1d(feed.source_frames(reads, exec_start, before), np.array(paused, np.int64))
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
-        for episode in map(own, episodes):
-            episode.said.append(episode.subgoal)
-            episode.told(self.arm.say(episode.subgoal, self.moment(episode)))
-        return self.inner.observation([own(episode).inner for episode in episodes])
+        for episode in map(_probed, episodes):
+            episode.subgoals.append(episode.subgoal)
+            episode.set_subgoal(self.arm.say(episode.subgoal, self.moment(episode)))
+        return self.inner.observation([_probed(episode).inner for episode in episodes])
 
     def answer(
         self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        mine = [own(episode) for episode in episodes]
+        mine = [_probed(episode) for episode in episodes]
         if not self.arm.edits:
             return self.inner.answer(batch, [episode.inner for episode in mine], draws, steps)
         remembering = []
         for i, episode in enumerate(mine):
-            drawn = {name: value[i] for name, value in draws.items()}
-            recollection, stores = self.recall(episode, drawn)
-            remembering.append(self.channel.as_if(episode.inner, recollection, stores))
+            sampled = {name: value[i] for name, value in draws.items()}
+            snapshot, stores = self.snapshot(episode, sampled)
+            remembering.append(self.channel.counterfactual(episode.inner, snapshot, stores))
         chunk = self.channel.answer(batch, remembering, draws, steps)
         for episode, its in zip(mine, remembering, strict=True):
-            self.channel.chosen(episode.inner, its)
+            self.channel.commit(episode.inner, its)
         return chunk
 
-    def recall(self, episode: ProbedEpisode, drawn: Draws | None = None) -> tuple[Recollection, list[Remembered]]:
+    def snapshot(self, episode: ProbedEpisode, sampled: Draws | None = None) -> tuple[MemorySnapshot, list[Remembered]]:
         """What is remembered among the frames that may be, and what the arm makes of it."""
         moment = self.moment(episode)
-        recollection = self.channel.read(episode.inner, only=self.arm.only(moment))
+        snapshot = self.channel.read(episode.inner, only=self.arm.only(moment))
         edited = []
-        for place, store in enumerate(recollection.stores):
-            weigh = None if drawn is None else partial(self._weigh, episode, recollection, place, drawn)
+        for place, store in enumerate(snapshot.stores):
+            weigh = None if sampled is None else partial(self._weigh, episode, snapshot, place, sampled)
             edited.append(self.arm.edit(store, self.moment(episode, weigh)))  # the same chance for each store
-        return recollection, edited
+        return snapshot, edited
 
     def moment(self, episode: ProbedEpisode, weigh: Any = None) -> Moment:
         """What the arm may know now."""
-        now = max(episode.inner.frames_seen - 1, 0)
-        kept = np.zeros(0, np.int64) if self.memory is None else self.memory.storage.kept_frames(now + 1)
+        now = max(episode.inner.n_observed_frames - 1, 0)
+        stored = np.zeros(0, np.int64) if self.memory is None else self.memory.storage.stored_frames(now + 1)
         rng = np.random.default_rng([episode.seed, now, zlib.crc32(self.arm.name.encode())])
         known: dict[str, Any] = {}
-        if self.lenders is not None:
-            lent = self.lenders.of(episode)
-            known = {"donor": lent.store_of(episode), "donor_said": lent.said_of(episode)}
-        return Moment(rng, now, kept, episode.boundaries, episode.said, weigh=weigh, **known)
+        if self.donors is not None:
+            donor = self.donors.of(episode)
+            known = {"donor": donor.store_of(episode), "donor_subgoal": donor.subgoal_of(episode)}
+        return Moment(rng, now, stored, episode.boundaries, episode.subgoals, weigh=weigh, **known)
 
     def _weigh(
-        self, episode: ProbedEpisode, recollection: Recollection, place: int, drawn: Draws, store: Remembered
+        self, episode: ProbedEpisode, snapshot: MemorySnapshot, place: int, sampled: Draws, store: Remembered
     ) -> np.ndarray:
         """By how much a chunk changes without each slot of a store."""
-        held = store.held
-        variants = [store, *(store.without([slot]) for slot in held)]
-        stores = [[*recollection.stores[:place], v, *recollection.stores[place + 1 :]] for v in variants]
-        chunks = self.ask(episode, recollection, stores, [drawn])
+        slots = store.occupied
+        variants = [store, *(store.without([slot]) for slot in slots)]
+        stores = [[*snapshot.stores[:place], v, *snapshot.stores[place + 1 :]] for v in variants]
+        chunks = self.ask(episode, snapshot, stores, [sampled])
         changes = np.zeros(len(store))
-        changes[held] = (chunks[1:, 0] - chunks[0, 0]).square().mean((1, 2)).sqrt().numpy()
+        changes[slots] = (chunks[1:, 0] - chunks[0, 0]).square().mean((1, 2)).sqrt().numpy()
         return changes
 
     @torch.no_grad()
     def ask(
         self,
         episode: ProbedEpisode,
-        recollection: Recollection,
+        snapshot: MemorySnapshot,
         variants: Sequence[Sequence[Remembered]],
         draws: Sequence[Draws],
         steps: int | None = None,
@@ -365,20 +365,22 @@ class ProbedPolicy(Policy):
             variants: what is remembered, store by store. draws: the random numbers that all variants share.
             batch: most chunks that are chosen at once.
         """
-        found = []
-        pairs = [(variant, drawn) for variant in variants for drawn in draws]
-        ready = {id(variant): self.channel.as_if(episode.inner, recollection, variant) for variant in variants}
+        chunks = []
+        pairs = [(variant, sampled) for variant in variants for sampled in draws]
+        ready = {id(variant): self.channel.counterfactual(episode.inner, snapshot, variant) for variant in variants}
         for start in range(0, len(pairs), batch):
             part = pairs[start : start + batch]
-            seen = self.inner.observation([episode.inner] * len(part))
-            stacked = stack_draws([drawn for _, drawn in part])
-            found.append(self.channel.answer(seen, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu())
+            observation = self.inner.observation([episode.inner] * len(part))
+            stacked = stack_draws([sampled for _, sampled in part])
+            chunks.append(
+                self.channel.answer(observation, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu()
+            )
         action = self.embodiment.action
-        whole = torch.cat(found).unflatten(0, (len(variants), len(draws)))
-        return whole[:, :, self.skipped : self.skipped + action.execute, : action.width]
+        stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))
+        return stacked_chunks[:, :, self.n_past_steps : self.n_past_steps + action.execute, : action.width]
 
 
-def own(episode: Episode) -> ProbedEpisode:
+def _probed(episode: Episode) -> ProbedEpisode:
     """An episode of a probed policy."""
     assert isinstance(episode, ProbedEpisode)
     return episode

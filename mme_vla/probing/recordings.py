@@ -58,8 +58,8 @@ class Recording:
         """Frames at which a sub-task begins, the execution's first among them."""
         if not self.tells_subtasks:
             return [self.exec_start]
-        said = [self.subgoal(step) for step in range(self.length)]
-        changes = [step for step in range(1, self.length) if said[step] != said[step - 1]]
+        subgoals = [self.subgoal(step) for step in range(self.length)]
+        changes = [step for step in range(1, self.length) if subgoals[step] != subgoals[step - 1]]
         return sorted({0, self.exec_start, *changes})
 
     def decisions(self, stride: int, most: int | None) -> list[int]:
@@ -71,12 +71,12 @@ class Recording:
         return [int(step) for step in steps]
 
     def views(
-        self, start: int, stop: int, wanted: np.ndarray | None
+        self, start: int, stop: int, required: np.ndarray | None
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
         """Pictures of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
         Args:
-            wanted: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
+            required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
                 robot that reads depth is shown the frames that the dataset keeps depth of.
 
         Raises:
@@ -84,27 +84,29 @@ class Recording:
         """
         robot = self.source.robot
         if robot.readings:
-            kept = EpisodeKeyframes(file_of(self.source.root, self.episode))
-            here = kept.frames[(kept.frames >= start) & (kept.frames < stop)]
-            seen = kept.views(here, robot)
-            return seen, dict.fromkeys(seen, here - start)
-        if wanted is None:
-            whole = np.arange(start, stop)
-            return {name: self.source.frames(self.episode, whole, name) for name in robot.camera_names}, None
-        here = np.union1d(wanted[(wanted >= start) & (wanted < stop)], [stop - 1])
-        shown = {name: here if name == robot.memory_camera else here[-1:] for name in robot.camera_names}
-        views = {name: self.source.frames(self.episode, frames, name) for name, frames in shown.items()}
-        return views, {name: frames - start for name, frames in shown.items()}
+            keyframes = EpisodeKeyframes(file_of(self.source.root, self.episode))
+            here = keyframes.frames[(keyframes.frames >= start) & (keyframes.frames < stop)]
+            stored_views = keyframes.views(here, robot)
+            return stored_views, dict.fromkeys(stored_views, here - start)
+        if required is None:
+            indices = np.arange(start, stop)
+            return {name: self.source.frames(self.episode, indices, name) for name in robot.camera_names}, None
+        here = np.union1d(required[(required >= start) & (required < stop)], [stop - 1])
+        camera_frames = {name: here if name == robot.memory_camera else here[-1:] for name in robot.camera_names}
+        views = {name: self.source.frames(self.episode, frames, name) for name, frames in camera_frames.items()}
+        return views, {name: frames - start for name, frames in camera_frames.items()}
 
-    def show(self, running: Any, start: int, stop: int, wanted: np.ndarray | None = None, video: bool = False) -> None:
+    def show(
+        self, running: Any, start: int, stop: int, required: np.ndarray | None = None, video: bool = False
+    ) -> None:
         """Let an episode observe frames start … stop − 1.
 
         Args:
-            wanted: as for `views`. video: all of it as if it were a conditioning video.
+            required: as for `views`. video: all of it as if it were a conditioning video.
         """
         if stop <= start:
             return
-        views, drawn = self.views(start, stop, wanted)
+        views, rendered = self.views(start, stop, required)
         frames = np.arange(start, stop)
         executed = frames[frames >= self.exec_start]
         if video:
@@ -115,7 +117,7 @@ class Recording:
             actions = self.source.actions(self.episode)[np.maximum(executed - 1, 0)]
         demo = np.ones(len(frames), bool) if video else frames < self.exec_start
         states = self.source.states(self.episode, start, stop)
-        running.observe(views, states, demo, actions, **({} if drawn is None else {"drawn": drawn}))
+        running.observe(views, states, demo, actions, **({} if rendered is None else {"drawn": rendered}))
 
 
 def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
@@ -123,7 +125,7 @@ def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
     return [Recording(source, episode) for source in sources for episode in range(len(source))]
 
 
-def others(recordings: Sequence[Recording], own: Recording | None, goal: str) -> list[Recording]:
+def others(recordings: Sequence[Recording], exclude: Recording | None, goal: str) -> list[Recording]:
     """The other episodes, those with the most words of the goal in common first."""
     words = set(goal.split())
 
@@ -131,12 +133,12 @@ def others(recordings: Sequence[Recording], own: Recording | None, goal: str) ->
         their = set(recording.goal.split())
         return 1 - len(words & their) / max(len(words | their), 1)
 
-    return sorted((recording for recording in recordings if recording != own), key=unlike)
+    return sorted((recording for recording in recordings if recording != exclude), key=unlike)
 
 
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
     """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for all."""
     memory = policy.memory
-    if memory is None or memory.looks_back is not None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
+    if memory is None or memory.past_view_spec is not None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
         return None
-    return np.union1d(memory.storage.kept_frames(length), memory.frames_scored(length))
+    return np.union1d(memory.storage.stored_frames(length), memory.frames_scored(length))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, legend, picture, svg
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import document, html_table, pair, section
 from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
@@ -88,9 +88,9 @@ class Findings:
             if line.dial is not None:
                 dials.setdefault(line.arm.partition(":")[0], {}).setdefault(line.dial, []).append(line)
         return {
-            name: [(dial, effect(lines)) for dial, lines in sorted(found.items())]
-            for name, found in dials.items()
-            if len(found) > 1
+            name: [(dial, effect(lines)) for dial, lines in sorted(dial_lines.items())]
+            for name, dial_lines in dials.items()
+            if len(dial_lines) > 1
         }
 
     def decay(self, video: bool) -> list[tuple[float, Effect]]:
@@ -111,12 +111,12 @@ class Findings:
 
     def matters_most(self) -> dict[str, list[EntryLine]]:
         """For each task the moment at which a single entry mattered most: all entries of that moment."""
-        found: dict[str, list[EntryLine]] = {}
+        strongest: dict[str, list[EntryLine]] = {}
         moments = _grouped(self.entries, lambda e: (e.task, e.recording, e.step))
         for (task, *_), lines in moments.items():
-            if task not in found or max(e.change for e in lines) > max(e.change for e in found[task]):
-                found[task] = lines
-        return found
+            if task not in strongest or max(e.change for e in lines) > max(e.change for e in strongest[task]):
+                strongest[task] = lines
+        return strongest
 
 
 def _grouped[K, L](lines: Iterable[L], key: Callable[[L], K]) -> dict[K, list[L]]:
@@ -126,23 +126,23 @@ def _grouped[K, L](lines: Iterable[L], key: Callable[[L], K]) -> dict[K, list[L]
     return groups
 
 
-def show(found: Effect | None) -> str:
+def show(effect_of: Effect | None) -> str:
     """A change as a table has it: the change, and how many of the policy's own spread that is."""
-    if found is None:
+    if effect_of is None:
         return "–"
-    return f"{found.change:.3f}" + ("" if found.times is None else f" ({found.times:.1f}×)")
+    return f"{effect_of.change:.3f}" + ("" if effect_of.times is None else f" ({effect_of.times:.1f}×)")
 
 
 def arms_table(findings: Findings) -> Table:
     """Every arm over all moments."""
     rows = []
-    for name, found in findings.arms().items():
+    for name, effect_of in findings.arms().items():
         lines = [line for line in findings.moments if line.arm == name]
         ages = [age for line in lines for age in line.touched]
         touched = f"{np.mean(ages):.0f}" if ages else "–"
-        times = "–" if found.times is None else f"{found.times:.1f}×"
-        rows.append([name, str(found.moments), touched, f"{found.change:.3f}", f"{found.spread:.3f}", times,
-                     f"{100 * found.beyond:.0f} %", f"{found.distance:.3f}"])  # fmt: skip
+        times = "–" if effect_of.times is None else f"{effect_of.times:.1f}×"
+        rows.append([name, str(effect_of.moments), touched, f"{effect_of.change:.3f}", f"{effect_of.spread:.3f}", times,
+                     f"{100 * effect_of.beyond:.0f} %", f"{effect_of.distance:.3f}"])  # fmt: skip
     columns = ("arm", "moments", "age touched", "change", "own spread", "times that", "beyond it", "energy distance")
     return Table("What each intervention does to the chunk", columns, rows)
 
@@ -164,8 +164,8 @@ def phases_table(findings: Findings) -> Table:
 def checkpoints_table(findings: dict[str, Findings]) -> Table:
     """One row a checkpoint: what it takes from its memory."""
     rows = []
-    for name, found in findings.items():
-        arms, reach, video = found.arms(), found.reach(), found.from_video()
+    for name, checkpoint in findings.items():
+        arms, reach, video = checkpoint.arms(), checkpoint.reach(), checkpoint.from_video()
         cells = [show(arms.get(arm)) for arm, _ in MEASURES.values()]
         rows.append([name, *cells, "–" if reach is None else f"{reach:.0f}",
                      "–" if video is None else f"{100 * video:.0f} %"])  # fmt: skip
@@ -179,11 +179,11 @@ _ON = {"distract": "episodes before one's own", "delay": "frames that the clock 
 def effects(findings: Findings) -> str:
     """A bar an arm: the mean change of the chunk; the line is the policy's own spread."""
     arms = findings.arms()
-    with picture((10.4, 3.4)) as (canvas, (axes,)):
-        axes.bar(range(len(arms)), [found.change for found in arms.values()], 0.7, color=COLOURS[0])
+    with figure((10.4, 3.4)) as (canvas, (axes,)):
+        axes.bar(range(len(arms)), [arm_effect.change for arm_effect in arms.values()], 0.7, color=COLOURS[0])
         ends = [(i - 0.42, i + 0.42) for i in range(len(arms))]
-        axes.hlines([found.spread for found in arms.values()], *zip(*ends, strict=True), color=COLOURS[1], lw=2,
-                    label="the policy's own spread")  # fmt: skip
+        axes.hlines([arm_effect.spread for arm_effect in arms.values()], *zip(*ends, strict=True), color=COLOURS[1],
+                    lw=2, label="the policy's own spread")  # fmt: skip
         axes.set_xticks(range(len(arms)), list(arms), rotation=25, ha="right", rotation_mode="anchor")
         axes.set_ylabel("change of the chunk")
         legend(canvas, axes, 3)
@@ -192,17 +192,17 @@ def effects(findings: Findings) -> str:
 
 def decay(findings: Findings) -> str:
     """What an entry matters by its age, those of the video and of the execution."""
-    with picture((5.6, 3.4)) as (canvas, (axes,)):
+    with figure((5.6, 3.4)) as (canvas, (axes,)):
         for name, video, colour in (("video", True, COLOURS[0]), ("execution", False, COLOURS[1])):
             points = findings.decay(video)
             mine = [e for e in findings.entries if e.video == video]
             if mine:
                 axes.scatter([e.age for e in mine], [e.change for e in mine], s=8, color=colour, alpha=0.25, lw=0)
-                means = [found.change for _, found in points]
+                means = [point.change for _, point in points]
                 axes.plot([age for age, _ in points], means, "-o", color=colour, ms=5, label=name)
-        spread = [entry.spread for entry in findings.entries]
-        if spread:
-            axes.axhline(sum(spread) / len(spread), color=FAINT, lw=1, ls="--", label="own spread")
+        stds = [entry.spread for entry in findings.entries]
+        if stds:
+            axes.axhline(sum(stds) / len(stds), color=FAINT, lw=1, ls="--", label="own spread")
         axes.set_xlabel("age of the entry (frames)")
         axes.set_ylabel("change without it")
         legend(canvas, axes, 3)
@@ -211,19 +211,19 @@ def decay(findings: Findings) -> str:
 
 def dials(findings: Findings) -> dict[str, str]:
     """A curve for each intervention of which several places of the dial were probed."""
-    drawn = {}
+    figures = {}
     for name, points in findings.families().items():
-        with picture((5.6, 3.0)) as (canvas, (axes,)):
+        with figure((5.6, 3.0)) as (canvas, (axes,)):
             axes.plot([0, *(x for x, _ in points)], [0, *(f.change for _, f in points)], "-o", color=COLOURS[0], ms=5)
             axes.axhline(points[0][1].spread, color=COLOURS[1], lw=1, ls="--")
             axes.set_xlabel(_ON.get(name, name))
             axes.set_ylabel("change of the chunk")
             axes.tick_params(colors=INK)
-            drawn[name] = svg(canvas)
-    return drawn
+            figures[name] = svg(canvas)
+    return figures
 
 
-PAGE, TABLE, PICTURES = "page.html", "table.md", "remembered"
+PAGE, TABLE, IMAGES = "page.html", "table.md", "remembered"
 VIDEO, EXECUTION, NOW = (122, 162, 205), (233, 148, 62), (200, 40, 40)
 UNITS = (
     "Change: root mean square distance of two chunks of the same noise, in normalised actions (1 is half of what the "
@@ -231,7 +231,7 @@ UNITS = (
 )
 
 
-def remembered_picture(lines: Sequence[EntryLine], recording: Recording) -> "Image":
+def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
     """The frames remembered at a moment, each with its age and how the chunk changes without it; the current one last.
 
     Args:
@@ -246,22 +246,22 @@ def remembered_picture(lines: Sequence[EntryLine], recording: Recording) -> "Ima
     return contact_sheet(tiles, min(len(tiles), 8), title, None)
 
 
-def write_pictures(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
+def write_images(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
     """Draw the moment of each task at which an entry mattered most; entries that are frames alone."""
     by_name = {recording.name: recording for recording in recordings}
-    written = []
+    paths = []
     for task, lines in findings.matters_most().items():
         recording = by_name.get(lines[0].recording)
         if recording is None or lines[0].store != "memory":
             continue
         needed = np.unique([*(line.time for line in lines), lines[0].step])
-        if not recording.source.drawn(recording.episode)[needed].all():
+        if not recording.source.rendered(recording.episode)[needed].all():
             continue
-        (folder / PICTURES).mkdir(parents=True, exist_ok=True)
-        path = folder / PICTURES / f"{task or 'task'}.png"
-        remembered_picture(lines, recording).save(path)
-        written.append(path)
-    return written
+        (folder / IMAGES).mkdir(parents=True, exist_ok=True)
+        path = folder / IMAGES / f"{task or 'task'}.png"
+        remembered_image(lines, recording).save(path)
+        paths.append(path)
+    return paths
 
 
 def write_page(
@@ -276,17 +276,17 @@ def write_page(
         tables = [checkpoints_table({name: findings}), arms_table(findings), phases_table(findings)]
         parts.append(section("In short", html_table(tables[0]), UNITS))
         parts.append(section("Interventions", effects(findings)))
-        curves = [(f"Over the dial: {dial}", drawn, "Dashed: the policy's own spread.")
-                  for dial, drawn in dials(findings).items()]  # fmt: skip
+        curves = [(f"Over the dial: {dial}", figure, "Dashed: the policy's own spread.")
+                  for dial, figure in dials(findings).items()]  # fmt: skip
         if findings.entries:
             curves.insert(0, ("Decay with distance", decay(findings), "Each entry left out by itself."))
         parts += [pair(*curves[i : i + 2]) if i + 1 < len(curves) else section(*curves[i])
                   for i in range(0, len(curves), 2)]  # fmt: skip
         parts += [section(table.title, html_table(table)) for table in tables[1:]]
         texts += [to_markdown(table) for table in tables]
-    drawn = sorted((folder / PICTURES).glob("*.png"))
-    if drawn:
-        parts.append(section("What was remembered", "".join(map(_embedded, drawn)),
+    figure = sorted((folder / IMAGES).glob("*.png"))
+    if figure:
+        parts.append(section("What was remembered", "".join(map(_embedded, figure)),
                              "The moment of each task at which a single entry mattered most."))  # fmt: skip
     if comparisons:
         table = comparison_table(comparisons)

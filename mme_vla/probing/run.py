@@ -24,7 +24,7 @@ from mme_vla.probing.channels import channel_of
 from mme_vla.probing.offline import OfflineSettings, probe_offline
 from mme_vla.probing.online import online_records, paired, probe_online
 from mme_vla.probing.recordings import Recording, all_recordings
-from mme_vla.probing.report import Findings, write_page, write_pictures
+from mme_vla.probing.report import Findings, write_images, write_page
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 
 OFFLINE = "offline"
@@ -36,14 +36,14 @@ NO_DATA = (
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ProbePlan:
     """What is probed.
 
-    given: arms, as `with` says them; None for the usual ones. recordings: episodes to probe; lend: to take from.
+    arms: as `with` says them; None for the usual ones. recordings: episodes to probe; lend: to take from.
     jobs: episodes of the closed loop, none for none. source: where the weights are from.
     """
 
-    given: Any = None
+    arms: Any = None
     recordings: Sequence[Recording] = ()
     lend: Sequence[Recording] = ()
     jobs: Sequence[Job] = ()
@@ -64,14 +64,14 @@ class Probe:
 
 def run_probe(
     policy: Policy,
-    wanted: Wanted,
+    plan: ProbePlan,
     folder: Path,
     facts: RunFacts,
     settings: RolloutSettings,
     *,
     subgoals: SubgoalPredictor | None = None,
     base: Callable[..., Any] = make_env,
-    shown: bool = True,
+    show_progress: bool = True,
 ) -> Probe:
     """Do what is asked for and is not there, and write the page.
 
@@ -79,32 +79,32 @@ def run_probe(
         UserError: an arm that this policy or these data do not allow, or a folder that holds another probe.
     """
     notes: list[str] = []
-    if wanted.recordings:
-        notes += _on_recordings(policy, wanted, folder / OFFLINE, facts, shown)
-    if wanted.jobs:
-        told = base is make_env and settings.env == "mme_vla"
-        arms, left_out = choose_arms(wanted.given, policy, channel_of(policy), len(wanted.lend), boundaries=told)
+    if plan.recordings:
+        notes += _on_recordings(policy, plan, folder / OFFLINE, facts, show_progress)
+    if plan.jobs:
+        has_boundaries = base is make_env and settings.env == "mme_vla"
+        arms, left_out = choose_arms(plan.arms, policy, channel_of(policy), len(plan.lend), boundaries=has_boundaries)
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
         probe_online(
-            policy, arms, wanted.jobs, folder, facts, settings, lend=wanted.lend, subgoals=subgoals,
-            shard=wanted.shard, source=wanted.source, base=base, shown=shown,
+            policy, arms, plan.jobs, folder, facts, settings, lend=plan.lend, subgoals=subgoals,
+            shard=plan.shard, source=plan.source, base=base, show_progress=show_progress,
         )  # fmt: skip
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     comparisons = paired(online_records(folder), facts.split, facts.model)
-    write_pictures(findings, wanted.recordings, folder)
+    write_images(findings, plan.recordings, folder)
     return Probe(findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes))
 
 
-def _on_recordings(policy: Policy, wanted: Wanted, folder: Path, facts: RunFacts, shown: bool) -> list[str]:
+def _on_recordings(policy: Policy, plan: ProbePlan, folder: Path, facts: RunFacts, show_progress: bool) -> list[str]:
     policy.require_processor().require_stats()
-    told = all(recording.tells_subtasks for recording in wanted.recordings)
-    arms, notes = choose_arms(wanted.given, policy, channel_of(policy), _to_take_from(wanted), boundaries=told)
-    claim_run(folder, _settings(policy, wanted, facts, arms))
-    shard = wanted.shard
-    mine = list(wanted.recordings)[shard.index :: shard.count]
+    has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
+    arms, notes = choose_arms(plan.arms, policy, channel_of(policy), _to_take_from(plan), boundaries=has_boundaries)
+    claim_run(folder, _settings(policy, plan, facts, arms))
+    shard = plan.shard
+    mine = list(plan.recordings)[shard.index :: shard.count]
     name = "offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl"
-    with progress("probe", len(mine), unit="episodes") if shown else nullcontext(_silent) as advance:
-        probe_offline(policy, arms, mine, wanted.lend, folder / name, wanted.offline, advance)
+    with progress("probe", len(mine), unit="episodes") if show_progress else nullcontext(_silent) as advance:
+        probe_offline(policy, arms, mine, plan.lend, folder / name, plan.offline, advance)
     return notes
 
 
@@ -112,23 +112,23 @@ def _silent(steps: int) -> None:
     """Nobody is told."""
 
 
-def _to_take_from(wanted: Wanted) -> int:
+def _to_take_from(plan: ProbePlan) -> int:
     """Recorded episodes that are there for every one that is probed: not itself."""
-    names = {recording.name for recording in wanted.lend}
-    return len(names) - any(recording.name in names for recording in wanted.recordings)
+    names = {recording.name for recording in plan.lend}
+    return len(names) - any(recording.name in names for recording in plan.recordings)
 
 
-def _settings(policy: Policy, wanted: Wanted, facts: RunFacts, arms: Sequence[Arm]) -> dict[str, Any]:
+def _settings(policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[Arm]) -> dict[str, Any]:
     """What decides the lines, as `run.json` keeps it."""
-    sources = {id(r.source): r.source for r in [*wanted.recordings, *wanted.lend]}
+    sources = {id(r.source): r.source for r in [*plan.recordings, *plan.lend]}
     return {
         "model": facts.model,
         "checkpoint": facts.checkpoint,
         "policy": fingerprint(dict(policy.config)),
         "arms": {arm.name: options_of(arm) for arm in arms},
         "data": {source.name: source.fingerprint for source in sources.values()},
-        "recordings": [recording.name for recording in wanted.recordings],
-        **asdict(wanted.offline),
+        "recordings": [recording.name for recording in plan.recordings],
+        **asdict(plan.offline),
     }
 
 
@@ -138,10 +138,10 @@ def probed_folder(folder: Path) -> Findings:
     Raises:
         UserError: it holds none.
     """
-    found = Findings.of(lines.read_all(folder / OFFLINE))
-    if not found.moments:
+    findings = Findings.of(lines.read_all(folder / OFFLINE))
+    if not findings.moments:
         raise UserError(f"{folder} holds no probe on recorded episodes: no {OFFLINE}/offline.jsonl with lines in it.")
-    return found
+    return findings
 
 
 def probe(
@@ -158,7 +158,7 @@ def probe(
     subgoal: str | SubgoalPredictor | None = None,
     name: str | None = None,
     base: Callable[..., Any] = make_env,
-    shown: bool = True,
+    show_progress: bool = True,
     **settings: Any,
 ) -> Probe:
     """Ask what a policy takes from its memory; what `output` holds already is not asked again.
@@ -173,7 +173,7 @@ def probe(
         draws: chunks sampled at each moment. moments: most of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
-        shown: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
+        show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
 
     Returns:
         Its findings, the paired comparisons of the closed loop, notes, and the path of the page.
@@ -188,17 +188,19 @@ def probe(
         raise UserError(f"probe() has no setting {unknown[0]!r}. {did_you_mean(unknown[0], known)}")
     if recordings is None and tasks is None:
         raise UserError(f"probe() needs recordings=…, tasks=…, or both. {NO_DATA}")
-    chosen = RolloutSettings(seed=seed, **settings)
+    run_settings = RolloutSettings(seed=seed, **settings)
     loaded, source = load(policy)
     recorded = [] if recordings is None else all_recordings(open_sources(recordings, loaded.embodiment))
-    jobs = [] if tasks is None else choose_episodes(tasks, episodes, chosen.split)
-    if jobs and base is make_env and chosen.env == "mme_vla":
+    jobs = [] if tasks is None else choose_episodes(tasks, episodes, run_settings.split)
+    if jobs and base is make_env and run_settings.env == "mme_vla":
         require_simulator()
     predictor = build_predictor({"name": subgoal}) if isinstance(subgoal, str) else subgoal
     facts = RunFacts(
-        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, chosen.split,
-        chosen.max_steps, subgoal if isinstance(subgoal, str) else None, memory_budget(loaded),
+        name or str(loaded.config.get("name", "policy")), checkpoint_label(source), seed, run_settings.split,
+        run_settings.max_steps, subgoal if isinstance(subgoal, str) else None, memory_budget(loaded),
     )  # fmt: skip
-    wanted = Wanted(arms, recorded, recorded, jobs, OfflineSettings(seed, draws, moments), source=source)
+    plan = ProbePlan(arms, recorded, recorded, jobs, OfflineSettings(seed, draws, moments), source=source)
     folder = Path(output).expanduser()
-    return run_probe(loaded.eval(), wanted, folder, facts, chosen, subgoals=predictor, base=base, shown=shown)
+    return run_probe(
+        loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress
+    )

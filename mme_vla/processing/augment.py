@@ -55,8 +55,8 @@ def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -
     views = list(pixels.unbind(1))
     base = [i for i, kind in enumerate(augmentations) if kind == "all"]
     if base:
-        moved = crop_and_rotate(torch.stack([views[i] for i in base], 1), offset, angle)
-        for i, view in zip(base, moved.unbind(1), strict=True):
+        warped = crop_and_rotate(torch.stack([views[i] for i in base], 1), offset, angle)
+        for i, view in zip(base, warped.unbind(1), strict=True):
             views[i] = view
     coloured = jitter_colours(torch.stack(views, 1), brightness, contrast, hue)
     for i, kind in enumerate(augmentations):
@@ -80,8 +80,8 @@ def crop_and_rotate(pixels: Tensor, offset: Tensor, angle: Tensor) -> Tensor:
     rows = torch.stack([torch.stack([cos, -sin, shift[:, 0]], 1), torch.stack([sin, cos, shift[:, 1]], 1)], 1)
     grid = functional.affine_grid(rows, [batch, 1, size, size], align_corners=False)
     stacked = pixels.flatten(1, 2)  # the views of a sample move together: as channels they share one grid
-    moved = functional.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
-    return moved.unflatten(1, (views, 3))
+    warped = functional.grid_sample(stacked, grid, mode="bilinear", padding_mode="zeros", align_corners=False)
+    return warped.unflatten(1, (views, 3))
 
 
 def jitter_colours(pixels: Tensor, brightness: Tensor, contrast: Tensor, hue: Tensor) -> Tensor:

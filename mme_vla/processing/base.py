@@ -163,7 +163,7 @@ class PolicyProcessor:
         raise NotImplementedError
 
     @property
-    def memory_pictures(self) -> str:
+    def memory_image_format(self) -> str:
         """What a setting lets memory pictures go through besides, which a cache of their tokens depends on."""
         return ""
 
@@ -196,11 +196,11 @@ class PolicyProcessor:
             UserError: there are no statistics.
         """
         stats = self.require_stats()
-        felt = torch.from_numpy(np.asarray(states, np.float32))
+        proprio = torch.from_numpy(np.asarray(states, np.float32))
         done = torch.from_numpy(np.asarray(actions, np.float32))
-        own = torch.from_numpy(np.asarray(known, np.float32))[:, None]
-        relative = self.embodiment.action.to_relative(done[:, None], felt)[:, 0]
-        return torch.cat([normalize(felt, stats.state), normalize(relative, stats.actions) * own, own], 1)
+        is_known = torch.from_numpy(np.asarray(known, np.float32))[:, None]
+        relative = self.embodiment.action.to_relative(done[:, None], proprio)[:, 0]
+        return torch.cat([normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known], 1)
 
     # Batches
 

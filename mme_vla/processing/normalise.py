@@ -64,8 +64,8 @@ class QuantileStats:
             if data.get(field.name) is None:
                 if field.name in ("min", "max"):
                     continue
-                held = listed(sorted(data))
-                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {held}.")
+                keys = listed(sorted(data))
+                raise UserError(f"Normalisation statistics for {name!r} lack {field.name!r}; they hold {keys}.")
             try:
                 array = np.asarray(data[field.name], dtype=np.float64)
             except (TypeError, ValueError, OverflowError):

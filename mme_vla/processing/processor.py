@@ -59,7 +59,7 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
     return {**settings, "tokenizer": tokenizer, "stats": stats}
 
 
-def own_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
+def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
     """What `processor.json` of a checkpoint says, its files found in the folder and compared with their checksums.
 
     Args:
@@ -71,13 +71,13 @@ def own_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
     config = read_settings(folder)
     named, stats = config.get("tokenizer", ""), config.get("stats")
     if tokenizer is None:
-        tokenizer = own_tokenizer(folder, named)
+        tokenizer = saved_tokenizer(folder, named)
     if stats is not None:
-        stats = own_file(folder, stats, "statistics")
+        stats = saved_file(folder, stats, "statistics")
     return {**config, "tokenizer": tokenizer, "stats": stats}
 
 
-def own_file(folder: Path, name: Any, what: str) -> Path:
+def saved_file(folder: Path, name: Any, what: str) -> Path:
     """The path of a file that a checkpoint names in itself, compared with its checksum where there is one."""
     if not isinstance(name, str):
         raise UserError(f"{folder / CONFIG_FILE}: {what}={brief(name)} must be the name of a file.")
@@ -86,7 +86,7 @@ def own_file(folder: Path, name: Any, what: str) -> Path:
     return path
 
 
-def own_tokenizer(folder: Path, name: Any) -> str | Path:
+def saved_tokenizer(folder: Path, name: Any) -> str | Path:
     """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address.
 
     Raises:
@@ -96,13 +96,13 @@ def own_tokenizer(folder: Path, name: Any) -> str | Path:
         return str(name)
     if isinstance(name, str) and name.startswith(HUB):
         if (folder / TOKENIZER_FILE).is_file():
-            return own_file(folder, TOKENIZER_FILE, "tokenizer")
+            return saved_file(folder, TOKENIZER_FILE, "tokenizer")
         raise UserError(
             f"{folder} takes its tokenizer from the network, at {brief(name, 200)}, which is not fetched on a "
             f"checkpoint's word. If you trust it: from_pretrained(…, tokenizer={brief(name, 200)}), or download that "
             f"file into the folder as {TOKENIZER_FILE}."
         )
-    return own_file(folder, name, "tokenizer")
+    return saved_file(folder, name, "tokenizer")
 
 
 LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would take memory
@@ -173,11 +173,11 @@ class Processor(PolicyProcessor):
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
         processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
-        room = backbone.vocab_size
-        if room is not None and processor.tokenizer.vocab_size > room:
+        vocab_size = backbone.vocab_size
+        if vocab_size is not None and processor.tokenizer.vocab_size > vocab_size:
             raise UserError(
                 f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
-                f"backbone.vocab_size={room}: choose the processor that goes with the backbone."
+                f"backbone.vocab_size={vocab_size}: choose the processor that goes with the backbone."
             )
         return processor
 
@@ -258,14 +258,14 @@ class Processor(PolicyProcessor):
         normalised, past = None, None
         if state is not None and self.prompt_format.reads_state:
             normalised = normalize(_float(state), self.require_stats().state).numpy()
-        wanted = self.prompt_format.past_actions
-        if wanted and state is not None and past_actions is not None:
-            recent = self.embodiment.action.to_relative(_float(past_actions)[-wanted:], _float(state))
+        count = self.prompt_format.past_actions
+        if count and state is not None and past_actions is not None:
+            recent = self.embodiment.action.to_relative(_float(past_actions)[-count:], _float(state))
             past = normalize(recent, self.require_stats().actions).numpy()
         if subgoal is not None and self.prompt_format.reads_subgoal:
             subgoal = shorten(subgoal, self.tokenizer, self.subgoal_length)
-        given = PromptInput(goal, subgoal, normalised, past)
-        return encode_prompt(self.prompt_format, self.tokenizer, given, self.longest_prompt)
+        inputs = PromptInput(goal, subgoal, normalised, past)
+        return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
         """Turn recorded actions into what the network should answer.
@@ -356,11 +356,11 @@ class Processor(PolicyProcessor):
 
     def save(self, folder: Path | str) -> list[str]:
         """Write `processor.json`, the statistics, and the tokenizer unless it is on the hub; the names of the files."""
-        written = super().save(folder)
+        saved = super().save(folder)
         if self.to_config()["tokenizer"] == TOKENIZER_FILE:
             self.tokenizer.save(Path(folder) / TOKENIZER_FILE)
-            written.append(TOKENIZER_FILE)
-        return written
+            saved.append(TOKENIZER_FILE)
+        return saved
 
     @classmethod
     def load(cls, folder: Path | str, tokenizer: Path | str | None = None) -> Self:
@@ -373,7 +373,7 @@ class Processor(PolicyProcessor):
         Raises:
             UserError: `folder` holds no processor, a damaged one, or one that names files elsewhere.
         """
-        config = own_settings(Path(folder), tokenizer)
+        config = saved_settings(Path(folder), tokenizer)
         try:
             return cls.from_config(config)
         except UserError as error:

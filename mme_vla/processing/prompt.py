@@ -49,7 +49,7 @@ class PromptFormat:
     reads_state: bool = False
     past_actions: int = 0  # how many executed actions it reads
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return the texts in order; each is tokenised by itself."""
         raise NotImplementedError
 
@@ -58,12 +58,12 @@ PROMPTS: Registry[type[PromptFormat]] = Registry("prompt format")
 
 
 @PROMPTS.register("plain")
-class Plain(PromptFormat):
+class GoalPrompt(PromptFormat):
     """The goal and a newline: π0.5 without state in the prompt, and every policy with a neural memory."""
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return the goal, then the newline, which is tokenised apart."""
-        return [(_one_line(given.goal), True), ("\n", False)]
+        return [(_one_line(inputs.goal), True), ("\n", False)]
 
 
 @PROMPTS.register("state")
@@ -72,18 +72,18 @@ class State(PromptFormat):
 
     reads_state = True
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text.
 
         Raises:
             UserError: there is no state.
         """
-        if given.state is None:
+        if inputs.state is None:
             raise UserError(
                 "The prompt format 'state' needs the robot's state; give one, or choose the format 'plain'."
             )
-        levels = " ".join(map(str, discretize(given.state)))
-        return [(f"Task: {_one_line(given.goal)}; State: {levels};\nAction: ", True)]
+        levels = " ".join(map(str, discretize(inputs.state)))
+        return [(f"Task: {_one_line(inputs.goal)}; State: {levels};\nAction: ", True)]
 
 
 @PROMPTS.register("subgoal")
@@ -95,23 +95,23 @@ class Subgoal(PromptFormat):
 
     reads_subgoal = True
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
-        if given.subgoal is None:
+        if inputs.subgoal is None:
             _warn_once("The prompt format 'subgoal' got no subgoal: such steps use the plain prompt, as released.")
-            return Plain().pieces(given)
-        return [(f"Task: {_one_line(given.goal)};\nCurrent Subgoal: {_one_line(given.subgoal)};\nAction: ", True)]
+            return GoalPrompt().pieces(inputs)
+        return [(f"Task: {_one_line(inputs.goal)};\nCurrent Subgoal: {_one_line(inputs.subgoal)};\nAction: ", True)]
 
 
 @PROMPTS.register("subgoal_sentence")
 class SubgoalSentence(Subgoal):
     """The goal and the subgoal with the punctuation of the real-robot release, which has a state but leaves it out."""
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text, or the plain pieces if there is no subgoal."""
-        if given.subgoal is None:
-            return super().pieces(given)
-        return [(f"Task: {_one_line(given.goal)}\nCurrent Subgoal: {_one_line(given.subgoal)}.\nAction: ", True)]
+        if inputs.subgoal is None:
+            return super().pieces(inputs)
+        return [(f"Task: {_one_line(inputs.goal)}\nCurrent Subgoal: {_one_line(inputs.subgoal)}.\nAction: ", True)]
 
 
 @PROMPTS.register("past_actions")
@@ -124,31 +124,31 @@ class PastActions(PromptFormat):
 
     past_actions = 16
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text.
 
         Raises:
             UserError: it was not told which actions were executed.
         """
-        if given.past_actions is None:
+        if inputs.past_actions is None:
             raise UserError(
                 "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, w])."
             )
-        levels = " ".join(map(str, discretize(given.past_actions.reshape(-1))))
-        return [(f"Task: {_one_line(given.goal)}; Past actions: {levels};\nAction: ", True)]
+        levels = " ".join(map(str, discretize(inputs.past_actions.reshape(-1))))
+        return [(f"Task: {_one_line(inputs.goal)}; Past actions: {levels};\nAction: ", True)]
 
 
 @PROMPTS.register("openvla")
 class OpenVla(PromptFormat):
     """The question that OpenVLA was trained on, the goal in lower case."""
 
-    def pieces(self, given: PromptInput) -> list[Piece]:
+    def pieces(self, inputs: PromptInput) -> list[Piece]:
         """Return one text."""
-        return [(f"In: What action should the robot take to {self.language(given)}?\nOut:", True)]
+        return [(f"In: What action should the robot take to {self.language(inputs)}?\nOut:", True)]
 
-    def language(self, given: PromptInput) -> str:
+    def language(self, inputs: PromptInput) -> str:
         """What the robot is asked to do."""
-        return given.goal.strip().lower()
+        return inputs.goal.strip().lower()
 
 
 @PROMPTS.register("openvla_subgoal")
@@ -157,13 +157,13 @@ class OpenVlaSubgoal(OpenVla):
 
     reads_subgoal = True
 
-    def language(self, given: PromptInput) -> str:
+    def language(self, inputs: PromptInput) -> str:
         """The goal without its full stop, and the subgoal."""
-        if given.subgoal is None:
+        if inputs.subgoal is None:
             _warn_once("The prompt format 'openvla_subgoal' got no subgoal: such steps use the plain prompt.")
-            return super().language(given)
-        goal = given.goal.strip().removesuffix(".")
-        return f"{goal}; current subgoal: {given.subgoal.strip()}".lower()
+            return super().language(inputs)
+        goal = inputs.goal.strip().removesuffix(".")
+        return f"{goal}; current subgoal: {inputs.subgoal.strip()}".lower()
 
 
 def discretize(values: np.ndarray) -> list[int]:
@@ -186,25 +186,25 @@ def checked_text(text: object, what: str) -> str:
 
 
 def encode_prompt(
-    prompt_format: PromptFormat, tokenizer: Tokenizer, given: PromptInput, max_length: int
+    prompt_format: PromptFormat, tokenizer: Tokenizer, inputs: PromptInput, max_length: int
 ) -> tuple[Tensor, Tensor]:
     """Turn a prompt into token ids.
 
     Args:
         prompt_format: which texts to build (`PROMPTS[name]()`).
         tokenizer: its ids.
-        given: what the texts are made of.
+        inputs: what the texts are made of.
         max_length: l; a longer prompt loses its end, and a warning says so once.
 
     Returns:
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.
     """
-    checked_text(given.goal, "the goal")
-    tokens = [token for text, bos in prompt_format.pieces(given) for token in tokenizer.encode(text, bos=bos)]
+    checked_text(inputs.goal, "the goal")
+    tokens = [token for text, bos in prompt_format.pieces(inputs) for token in tokenizer.encode(text, bos=bos)]
     if len(tokens) > max_length:
         _warn_once(
             f"A prompt has more tokens than prompt_length={max_length} and loses its end; raise prompt_length. "
-            f"The first one, {len(tokens)} tokens long: {brief(given.goal, 200)}.",
+            f"The first one, {len(tokens)} tokens long: {brief(inputs.goal, 200)}.",
             key=("truncated", max_length),
         )
         tokens = tokens[:max_length]
@@ -287,11 +287,11 @@ def perturb_point(text: str, limit: int, rng: np.random.Generator) -> str:
         return text
     shift = np.clip(rng.normal(0, limit * STD_PER_LIMIT, 2), -limit, limit).round().astype(int)
 
-    def moved(match: re.Match[str]) -> str:
+    def shifted(match: re.Match[str]) -> str:
         y, x = (int(match[i + 1]) + int(shift[i]) for i in range(2))
         return f"at <{y}, {x}>"
 
-    return POINT.sub(moved, text)
+    return POINT.sub(shifted, text)
 
 
 def subgoal_kind(policy: Any) -> str | None:

@@ -73,10 +73,10 @@ class Tokenizer:
         Raises:
             UserError: the model has no such piece.
         """
-        found = self._processor.piece_to_id(text)
-        if found == self._processor.unk_id():
+        index = self._processor.piece_to_id(text)
+        if index == self._processor.unk_id():
             raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
-        return found
+        return index
 
     @property
     def end(self) -> int:
@@ -102,8 +102,8 @@ def _download(spec: str) -> Path:
     from huggingface_hub import hf_hub_download
     from huggingface_hub.errors import HfHubHTTPError, HFValidationError, LocalEntryNotFoundError
 
-    owner, _, rest = spec.removeprefix(HUB).partition("/")
-    name, _, filename = rest.partition("/")
+    owner, _, remaining = spec.removeprefix(HUB).partition("/")
+    name, _, filename = remaining.partition("/")
     if not (owner and name and filename):
         raise UserError(f"Tokenizer {spec!r} should read {HUB}owner/repository/path/in/it.model.")
     try:

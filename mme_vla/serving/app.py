@@ -21,13 +21,13 @@ from mme_vla.errors import UserError
 from mme_vla.serving.codec import pack
 from mme_vla.serving.connections import Connection, Connections
 from mme_vla.serving.engine import Engine
-from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session, read_request, said
+from mme_vla.serving.session import BusyError, HttpSessions, NoEpisodeError, Session, error_text, read_request
 from mme_vla.serving.settings import ServeSettings
 
 logger = logging.getLogger("mme_vla.serving")
 
 
-class Visit:
+class ServedConnection:
     """Speaks first (`metadata`, packed), then answers one request after the other.
 
     Reading goes on while the policy computes, so that pings are answered and a client that goes is noticed.
@@ -45,13 +45,13 @@ class Visit:
         try:
             await self._socket.accept()
             await self._socket.send_bytes(self._metadata)
-            self._rest()
+            self._await_request()
             while (message := await self._next()) is not None:
                 self._connection.work(busy=True)
                 if not await self._serve_one(session, message):
                     return
                 del message  # hundreds of megabytes that need not wait for the next request
-                self._rest()
+                self._await_request()
             await self._close(*self._connection.dismissed.result())
         except WebSocketDisconnect as gone:
             if gone.code == 1009:
@@ -62,7 +62,7 @@ class Visit:
             if self._coming is not None:
                 self._coming.cancel()
 
-    def _rest(self) -> None:
+    def _await_request(self) -> None:
         self._connection.work(busy=False)
         if not self._connection.dismissed.done():
             self._connection.wait(self._settings.limits.idle_s)
@@ -90,26 +90,26 @@ class Visit:
         try:
             if isinstance(message, str):
                 raise UserError("Requests are binary msgpack messages; this one is text.")
-            answer = await self._while_connected(self._answer(session, message))
-            await self._socket.send_bytes(pack(answer))
+            reply = await self._while_connected(self._reply(session, message))
+            await self._socket.send_bytes(pack(reply))
             return True
         except WebSocketDisconnect:
             raise
         except UserError as error:
             self._engine.stats.count("refused")
             logger.info("%s: refused: %s", self._peer, error)
-            reason = said(error)
+            reason = error_text(error)
         except Exception as error:
             self._engine.stats.count("failed")
             logger.exception("%s: failed", self._peer)
-            reason = said(error)
+            reason = error_text(error)
         await self._socket.send_text(reason)
         await self._close(1011, reason)
         return False
 
-    async def _answer(self, session: Session, message: bytes) -> dict[str, Any]:
+    async def _reply(self, session: Session, message: bytes) -> dict[str, Any]:
         begun = time.perf_counter()
-        return await session.answer(await read_request(self._engine, self._settings, message), begun)
+        return await session.respond(await read_request(self._engine, self._settings, message), begun)
 
     async def _while_connected[T](self, work: Awaitable[T]) -> T:
         """The result of `work`, which is given up when the client goes first."""
@@ -154,30 +154,30 @@ def make_app(
     async def stats(_: Request) -> Response:
         return JSONResponse(engine.stats.snapshot())
 
-    async def answer(request: Request) -> Response:
+    async def infer(request: Request) -> Response:
         name = (request.client.host if request.client else "", request.headers.get("x-session", ""))
         body = await read_body(request, settings)
         begun = time.perf_counter()
         try:
             try:
-                asked = await read_request(engine, settings, body)
+                parsed = await read_request(engine, settings, body)
             except UserError:
                 sessions.drop(name)
                 raise
             del body
-            return Response(pack(await sessions.answer(name, asked, begun)), media_type=MSGPACK)
+            return Response(pack(await sessions.respond(name, parsed, begun)), media_type=MSGPACK)
         except NoEpisodeError as error:
             engine.stats.count("refused")
-            return PlainTextResponse(f"{said(error)}\n", 409)
+            return PlainTextResponse(f"{error_text(error)}\n", 409)
         except BusyError as error:
-            raise HTTPException(503, said(error)) from None
+            raise HTTPException(503, error_text(error)) from None
         except UserError as error:
             logger.info("%s: refused: %s", name[0], error)
-            raise HTTPException(400, said(error)) from None
+            raise HTTPException(400, error_text(error)) from None
         except Exception as error:
             engine.stats.count("failed")
             logger.exception("%s: failed", name[0])
-            return PlainTextResponse(f"{said(error)}\n", 500)
+            return PlainTextResponse(f"{error_text(error)}\n", 500)
 
     async def refuse(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
@@ -190,13 +190,13 @@ def make_app(
         return PlainTextResponse(f"{known.get(error.status_code, error.detail)}\n", error.status_code, error.headers)
 
     async def websocket(socket: WebSocket) -> None:
-        await Visit(socket, engine, settings, metadata).run()
+        await ServedConnection(socket, engine, settings, metadata).run()
 
     @asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[dict[str, Any]]:
         yield {"connections": connections}
 
-    handlers = {"/healthz": healthz, "/metadata": describe, "/stats": stats, "/reset": answer, "/infer": answer}
+    handlers = {"/healthz": healthz, "/metadata": describe, "/stats": stats, "/reset": infer, "/infer": infer}
     app = Starlette(
         routes=[
             *(Route(path, handler, methods=[METHODS[path]]) for path, handler in handlers.items()),
@@ -205,7 +205,7 @@ def make_app(
         exception_handlers={HTTPException: refuse},
         lifespan=lifespan,
     )
-    return Door(app, settings, connections, engine)
+    return RequestGuard(app, settings, connections, engine)
 
 
 async def read_body(request: Request, settings: ServeSettings) -> bytearray:
@@ -235,7 +235,7 @@ async def read_body(request: Request, settings: ServeSettings) -> bytearray:
     return body
 
 
-class Door:
+class RequestGuard:
     """Decides who comes in before anything is read, and ends connections whose body nobody wanted."""
 
     def __init__(self, app: ASGIApp, settings: ServeSettings, connections: Connections, engine: Engine) -> None:
@@ -265,8 +265,8 @@ class Door:
             return PlainTextResponse("Pages in a browser are not served.\n", 403)
         if unlocked:
             return None
-        given = headers.getlist("authorization")
-        if not self._allowed(given[0] if len(given) == 1 else ""):
+        tokens = headers.getlist("authorization")
+        if not self._allowed(tokens[0] if len(tokens) == 1 else ""):
             return PlainTextResponse("Send the header Authorization: Api-Key <key>.\n", 401)
         connection: Connection = scope["state"]["connection"]
         if not self._connections.admit(connection):
@@ -281,7 +281,7 @@ class Door:
         right = hmac.compare_digest(key.strip().encode(), self._settings.api_key.encode())
         return right and scheme.lower() == "api-key"
 
-    async def _http(self, answer: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _http(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer; where the body was not read whole, throw the rest away for a moment and hang up."""
         headers = Headers(scope=scope)
         unread = "transfer-encoding" in headers or headers.get("content-length", "0").strip("0") != ""
@@ -301,7 +301,7 @@ class Door:
                 message = {"type": "http.response.body", "body": b""}
             await send(message)
 
-        await answer(scope, reading, sending)
+        await app(scope, reading, sending)
 
     async def _throw_away(self, reading: Receive, more: Any) -> None:
         try:

@@ -72,8 +72,8 @@ class Client:
             raise UserError(f"{self.url!r} is not an address such as ws://127.0.0.1:8001: {error}") from None
         except InvalidHandshake as error:
             reply = getattr(getattr(error, "response", None), "body", b"") or b""
-            said = bytes(reply).decode(errors="replace").strip()
-            raise UserError(f"The server at {self.url} refuses the connection: {said or error}") from None
+            message = bytes(reply).decode(errors="replace").strip()
+            raise UserError(f"The server at {self.url} refuses the connection: {message or error}") from None
         except (OSError, TimeoutError, EOFError) as error:
             raise ConnectionError(f"No policy server answers at {self.url}: {error}") from error
         self.metadata = self._receive(self.open_timeout)
@@ -136,15 +136,15 @@ class Client:
 
     def _receive(self, timeout: float) -> dict[str, Any]:
         try:
-            answer = self._socket.recv(timeout)
+            response = self._socket.recv(timeout)
         except ConnectionClosed as error:
             self.close()
             raise ConnectionError(f"The server at {self.url} closed the connection: {error}") from None
         except TimeoutError:
             self.close()  # an answer that came later would be taken for that of the next request
             raise TimeoutError(f"No answer from {self.url} within {timeout:g} s; call reconnect().") from None
-        if isinstance(answer, str):
+        if isinstance(response, str):
             self.close()
-            raise UserError(f"The server refuses this request: {answer}")
-        found: dict[str, Any] = unpack(answer)
-        return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in found.items()}
+            raise UserError(f"The server refuses this request: {response}")
+        fields: dict[str, Any] = unpack(response)
+        return {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in fields.items()}

@@ -17,7 +17,7 @@ from mme_vla.serving.settings import Limits
 
 HEAD_S = 10  # seconds from a request's first byte (or the connection) to the end of its headers
 GOODBYE_S = 10  # seconds a client gets to answer a goodbye
-STRANGERS = 64  # most connections that have not yet made a request the key allows
+MAX_UNAUTHENTICATED = 64  # most connections that have not yet made a request the key allows
 MOST_PIECES = 2**16  # most frames one websocket message may be cut into
 FULL = "The server is full and this connection was silent longest; connect and begin the episode again."
 IDLE = "This connection was silent for limits.idle_s; connect and begin the episode again."
@@ -36,7 +36,7 @@ class Connection:
 
     def __init__(self, transport: asyncio.Transport) -> None:
         self.transport = transport
-        self.guest = self.websocket = self.busy = False
+        self.admitted = self.websocket = self.busy = False
         self.silent_since = time.monotonic()
         self.dismissed: asyncio.Future[tuple[int, str]] = asyncio.get_running_loop().create_future()
         self.until: float | None = None
@@ -50,7 +50,7 @@ class Connection:
         """Note that a request begins, or that it is answered."""
         self.busy, self.silent_since = busy, time.monotonic()
 
-    def let_go(self, code: int, reason: str) -> None:
+    def close(self, code: int, reason: str) -> None:
         """End it as soon as nothing is being answered: a websocket with a goodbye, HTTP at once."""
         if not self.websocket:
             self.transport.close()
@@ -74,9 +74,9 @@ class Connections:
 
     def arrive(self, transport: asyncio.Transport) -> Connection:
         """Note a new connection."""
-        strangers = [known for known in self.open if not (known.guest or known.busy)]
-        if len(strangers) >= STRANGERS:
-            self._forget(min(strangers, key=_silence)).transport.abort()
+        unauthenticated = [known for known in self.open if not (known.admitted or known.busy)]
+        if len(unauthenticated) >= MAX_UNAUTHENTICATED:
+            self._forget(min(unauthenticated, key=_silence)).transport.abort()
         connection = Connection(transport)
         connection.wait(HEAD_S)
         self.open.add(connection)
@@ -86,33 +86,33 @@ class Connections:
         """Give a connection a place, if there is one or can be made one."""
         if self.stopping:
             return False
-        guests = [known for known in self.open if known.guest and known is not connection]
+        guests = [known for known in self.open if known.admitted and known is not connection]
         if len(guests) >= self.limits.connections:
-            silent = [guest for guest in guests if not guest.busy]
+            silent = [connected for connected in guests if not connected.busy]
             if not silent:
                 return False
-            first = min(silent, key=lambda guest: (guest.websocket, _silence(guest)))
-            first.guest = False
-            first.let_go(1001, FULL)
+            first = min(silent, key=lambda connected: (connected.websocket, _silence(connected)))
+            first.admitted = False
+            first.close(1001, FULL)
             self._stats.count("let_go")
-        connection.guest = True
+        connection.admitted = True
         self._count()
         return True
 
     def leave(self, connection: Connection) -> None:
         """Free the place of a connection, gone or about to go."""
-        connection.guest = False
+        connection.admitted = False
         self._count()
 
     def gone(self, connection: Connection) -> None:
         """Forget a connection that is closed."""
         self._forget(connection)
 
-    def let_idle_go(self, code: int, reason: str) -> None:
+    def close_idle(self, code: int, reason: str) -> None:
         """End all that wait for no answer; the others end after theirs."""
         for connection in list(self.open):
             if connection.websocket or not connection.busy:
-                connection.let_go(code, reason)
+                connection.close(code, reason)
 
     def abort(self) -> None:
         """Cut what is left."""
@@ -127,9 +127,9 @@ class Connections:
             await asyncio.sleep(every)
             now = time.monotonic()
             for connection in list(self.open):
-                self._look_after(connection, now)
+                self._supervise(connection, now)
 
-    def _look_after(self, connection: Connection, now: float) -> None:
+    def _supervise(self, connection: Connection, now: float) -> None:
         if connection.transport.get_write_buffer_size() == 0:
             connection.unsent_since = None
         elif connection.unsent_since is None:
@@ -141,7 +141,7 @@ class Connections:
             return
         silent = connection.websocket and now - connection.silent_since >= self.limits.idle_s
         if silent and not connection.dismissed.done():
-            connection.let_go(1001, IDLE)
+            connection.close(1001, IDLE)
         else:
             connection.transport.abort()
 
@@ -151,7 +151,7 @@ class Connections:
         return connection
 
     def _count(self) -> None:
-        self._stats.connections = sum(connection.guest for connection in self.open)
+        self._stats.connections = sum(connection.admitted for connection in self.open)
 
 
 def _silence(connection: Connection) -> float:

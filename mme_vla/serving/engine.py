@@ -14,7 +14,7 @@ import numpy as np
 
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.scheduler import Act, Read, Turns
+from mme_vla.policy.scheduler import Act, Read, Scheduler
 
 WINDOW = 2048  # latest durations kept of each kind
 
@@ -100,7 +100,7 @@ class Engine:
         self.policy = policy
         self.flow_steps = flow_steps
         self.stats = stats or ServerStats()
-        self.turns: Turns[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Turns(max_batch)
+        self.scheduler: Scheduler[_Waiting[Iterator[None]], _Waiting[Episode], Episode] = Scheduler(max_batch)
         self._wake = asyncio.Event()
         self._thread = ThreadPoolExecutor(1, "policy")
         self._readers = ThreadPoolExecutor(2, "decode")
@@ -116,19 +116,19 @@ class Engine:
             self._task.cancel()
             with suppress(asyncio.CancelledError):
                 await self._task
-        for future in [*(w.future for w in self.turns.acting), *(w.future for w in self.turns.reading)]:
+        for future in [*(w.future for w in self.scheduler.acting), *(w.future for w in self.scheduler.reading)]:
             future.cancel()
         self._readers.shutdown(wait=False)
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
         """The next chunk [h, w] of an episode, chosen in one batch with whoever waits at the same time."""
-        chunk: np.ndarray = await self._join(self.turns.acting, episode)
+        chunk: np.ndarray = await self._join(self.scheduler.acting, episode)
         return chunk
 
     async def run(self, steps: Iterator[None], pieces: int = 1) -> None:
         """Run an iterator that pauses between its `pieces` in the policy's thread, with others' work in the pauses."""
-        await self._join(self.turns.reading, steps, pieces)
+        await self._join(self.scheduler.reading, steps, pieces)
 
     async def call[T](self, function: Callable[[], T]) -> T:
         """Run something short in the policy's thread, at once."""
@@ -148,11 +148,11 @@ class Engine:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            while self.turns:
-                await self._turn()
+            while self.scheduler:
+                await self._run_scheduler()
 
-    async def _turn(self) -> None:
-        for step in self.turns.turn():
+    async def _run_scheduler(self) -> None:
+        for step in self.scheduler.next_steps():
             if isinstance(step, Read):
                 await self._piece(step.work)
                 await asyncio.sleep(0)  # those whose frames are in now ask for actions
@@ -165,15 +165,15 @@ class Engine:
         if not batch:
             return
         begun = time.perf_counter()
-        chosen = await self.call(lambda: self._act([waiting.work for waiting in batch]))
+        chunks = await self.call(lambda: self._act([waiting.work for waiting in batch]))
         self.stats.took("batch", time.perf_counter() - begun)
         self.stats.count("batched", len(batch))
-        for waiting, chunk in zip(batch, chosen, strict=True):
+        for waiting, chunk in zip(batch, chunks, strict=True):
             if isinstance(chunk, Exception):
                 _fail(waiting.future, chunk)
             elif not waiting.future.done():
                 waiting.future.set_result(chunk)
-                self.turns.later[waiting.work] = None
+                self.scheduler.later[waiting.work] = None
 
     async def _prepare(self, episode: Episode) -> None:
         """A piece of what a client's next request will need, while its robot moves."""
@@ -183,7 +183,7 @@ class Engine:
             logger.exception("preparing an episode's next chunk failed; it will be computed when it is asked for")
             return
         if left:
-            self.turns.later[episode] = None
+            self.scheduler.later[episode] = None
 
     def _act(self, episodes: list[Episode]) -> list[np.ndarray | Exception]:
         """Chunks [h, w], or why there is none. Where a batch fails each is tried alone, so that none fails another."""

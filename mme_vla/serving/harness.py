@@ -40,7 +40,7 @@ class Running:
     """One session's episode, and the observations since its last chunk: pictures by camera, and states."""
 
     episode: Episode
-    pictures: list[dict[str, np.ndarray]] = field(default_factory=list)
+    images: list[dict[str, np.ndarray]] = field(default_factory=list)
     states: list[np.ndarray] = field(default_factory=list)
 
 
@@ -100,11 +100,11 @@ class MMEVLAModelServer(PredictModelServer):
     def get_observation_params(self) -> dict[str, Any]:
         """What the benchmark is to send."""
         robot = self.policy.embodiment
-        wanted: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
-        wanted["send_wrist_image"] = CAMERAS[1] in robot.camera_names
+        params: dict[str, Any] = {"send_state": True, "send_video_history": True, "action_space": robot.action.space}
+        params["send_wrist_image"] = CAMERAS[1] in robot.camera_names
         if self.subgoal is not None:
-            wanted |= {"send_subgoal": True, "subgoal_mode": self.subgoal.removesuffix("_subgoal")}
-        return wanted
+            params |= {"send_subgoal": True, "subgoal_mode": self.subgoal.removesuffix("_subgoal")}
+        return params
 
     def get_action_spec(self) -> dict[str, DimSpec]:
         """One action, as the benchmark's action space has it."""
@@ -112,9 +112,9 @@ class MMEVLAModelServer(PredictModelServer):
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
         """The pictures, the state and the words that are read."""
-        pictures = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
+        images = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
         words = {"language": LANGUAGE} | ({} if self.subgoal is None else {"subgoal": LANGUAGE})
-        return {**pictures, "state": RAW, **words}
+        return {**images, "state": RAW, **words}
 
     async def on_episode_start(self, config: dict[str, Any], ctx: SessionContext) -> None:
         """Begin a session's episode; its goal comes with the first observation."""
@@ -135,15 +135,15 @@ class MMEVLAModelServer(PredictModelServer):
         running = self.sessions.get(ctx.session_id)
         if running is None:
             raise UserError("an observation came before the start of an episode.")
-        pictures, state = obs.get("images") or {}, obs.get("states", obs.get("state"))
+        images, state = obs.get("images") or {}, obs.get("states", obs.get("state"))
         names = self.policy.embodiment.camera_names
-        lacking = [VIEWS[name] for name in names if pictures.get(VIEWS[name]) is None]
+        lacking = [VIEWS[name] for name in names if images.get(VIEWS[name]) is None]
         if lacking or state is None:
             raise UserError(
                 f"the observation lacks {', '.join([*lacking, *(['states'] if state is None else [])])}: the "
                 "environment failed, or the benchmark does not send what get_observation_params() asks for."
             )
-        running.pictures.append({name: np.asarray(pictures[VIEWS[name]]) for name in names})
+        running.images.append({name: np.asarray(images[VIEWS[name]]) for name in names})
         running.states.append(np.asarray(state, np.float32))
         await super().on_observation(obs, ctx)
 
@@ -157,13 +157,13 @@ class MMEVLAModelServer(PredictModelServer):
     def _caught_up(self, obs: dict[str, Any], ctx: SessionContext) -> Episode:
         """A session's episode, after it has taken the frames since its last chunk."""
         running = self.sessions[ctx.session_id]
-        episode, pictures, states = running.episode, running.pictures, running.states
-        running.pictures, running.states = [], []
+        episode, images, states = running.episode, running.images, running.states
+        running.images, running.states = [], []
         episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
             episode.remember(np.stack(video), is_demo=True)
-        episode.observe({name: np.stack([p[name] for p in pictures]) for name in pictures[0]}, np.stack(states))
+        episode.observe({name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states))
         return episode
 
 

@@ -32,12 +32,12 @@ def warm_up(policy: Policy, settings: ServeSettings) -> None:
 
 def _nothing(robot: Embodiment, count: int) -> dict[str, np.ndarray]:
     """Black pictures of every camera, and a wall at no distance where it reads depth."""
-    seen: dict[str, np.ndarray] = {}
+    frames: dict[str, np.ndarray] = {}
     for camera in robot.cameras:
-        seen[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
+        frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)
         beside = (np.zeros((count, SIDE, SIDE, 1), np.float32), np.tile(np.eye(3, 4, dtype=np.float32), (count, 1, 1)))
-        seen |= dict(zip(camera.readings, beside, strict=False))
-    return seen
+        frames |= dict(zip(camera.readings, beside, strict=False))
+    return frames
 
 
 try:
@@ -129,14 +129,14 @@ class PolicyServer:
         if server is not None:
             for listener in server.servers:
                 listener.close()
-            connections.let_idle_go(1001, STOPPING)
+            connections.close_idle(1001, STOPPING)
             with suppress(TimeoutError):
                 async with asyncio.timeout(self.settings.limits.stop_s):
                     while connections.open:
                         await asyncio.sleep(0.02)
             connections.abort()
             await server.shutdown()
-        self.sessions.kept.clear()
+        self.sessions.entries.clear()
         await self.engine.stop()
 
     async def _log_regularly(self) -> None:
@@ -163,7 +163,7 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "state_dim": policy.embodiment.state.width,
         "action_space": policy.embodiment.action.answers,
         "action_dim": policy.embodiment.action.width,
-        "horizon": policy.horizon - policy.skipped,
+        "horizon": policy.horizon - policy.n_past_steps,
         "execute": settings.executed(policy.embodiment),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),

@@ -99,13 +99,13 @@ class ServeSettings:
             )
         if not isinstance(self.port, int) or not 0 <= self.port < 65536:
             raise UserError(f"port={self.port!r} must be 0 … 65535 (0: any free port).")
-        given = [name for name in ("execute", "flow_steps") if getattr(self, name) is not None]
-        for name in ("max_batch", "encode_chunk", *given):
-            _positive(name, getattr(self, name), whole=True)
+        overrides = [name for name in ("execute", "flow_steps") if getattr(self, name) is not None]
+        for name in ("max_batch", "encode_chunk", *overrides):
+            _positive(name, getattr(self, name), integer=True)
         _positive("log_every_s", self.log_every_s)
         for spec in fields(self.limits):
-            whole = spec.name in ("frames", "connections")
-            _positive(f"limits.{spec.name}", getattr(self.limits, spec.name), whole)
+            integer = spec.name in ("frames", "connections")
+            _positive(f"limits.{spec.name}", getattr(self.limits, spec.name), integer)
 
     @classmethod
     def from_dict(cls, config: Mapping[str, Any]) -> Self:
@@ -140,7 +140,7 @@ class ServeSettings:
         return is_local(self.host)
 
 
-def _positive(name: str, value: Any, whole: bool = False) -> None:
-    kinds = int if whole else (int, float)
+def _positive(name: str, value: Any, integer: bool = False) -> None:
+    kinds = int if integer else (int, float)
     if isinstance(value, bool) or not isinstance(value, kinds) or not value > 0:
-        raise UserError(f"{name}={value!r} must be a positive {'whole ' if whole else ''}number.")
+        raise UserError(f"{name}={value!r} must be a positive {'whole ' if integer else ''}number.")

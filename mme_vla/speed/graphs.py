@@ -50,15 +50,15 @@ class GraphSampler:
     @torch.no_grad()
     def __call__(self, inputs: Inputs) -> Tensor:
         """The chunks [b, h, a] of a batch, on the GPU."""
-        given = _tensors(inputs)
-        rows = len(given[0])
-        room = 1 << (rows - 1).bit_length()
-        key = (room, *((tuple(x.shape[1:]), x.dtype) for x in given))
+        tensors = _tensors(inputs)
+        rows = len(tensors[0])
+        capacity = 1 << (rows - 1).bit_length()
+        key = (capacity, *((tuple(x.shape[1:]), x.dtype) for x in tensors))
         if key not in self._captured:
-            self._captured[key] = self._capture(_map(inputs, lambda x: _filled(x, room)))
+            self._captured[key] = self._capture(_map(inputs, lambda x: _filled(x, capacity)))
         captured = self._captured[key]
-        for held, x in zip(_tensors(captured.inputs), given, strict=True):
-            held[:rows].copy_(x)
+        for static, x in zip(_tensors(captured.inputs), tensors, strict=True):
+            static[:rows].copy_(x)
         captured.graph.replay()
         return captured.chunks[:rows].clone()
 
@@ -109,7 +109,7 @@ class CapturedSampling:
         if (stamp := self._stamp()) != self._captured_at:
             self._graphs, self._captured_at = {}, stamp
         if steps not in self._graphs:
-            self._graphs[steps] = GraphSampler(lambda given: self._run(given, steps))
+            self._graphs[steps] = GraphSampler(lambda inputs: self._run(inputs, steps))
         inputs: dict[str, Tensor | TensorStruct] = {
             "batch": replace(batch, history=None, actions=None, action_mask=None), **draws,
         }  # fmt: skip
@@ -117,6 +117,6 @@ class CapturedSampling:
             inputs["memory"] = replace(memory, metrics={})
         return self._graphs[steps](inputs)
 
-    def _run(self, given: Inputs, steps: int) -> Tensor:
-        draws = {name: value for name, value in given.items() if isinstance(value, Tensor)}
-        return self._sample(given["batch"], given.get("memory"), draws, steps)
+    def _run(self, inputs: Inputs, steps: int) -> Tensor:
+        draws = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
+        return self._sample(inputs["batch"], inputs.get("memory"), draws, steps)

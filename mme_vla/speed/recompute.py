@@ -13,7 +13,7 @@ ALL, SELECTIVE = "all", "selective"
 """Everything inside a layer; or all of it but the results of matrix products and of attention, which are kept."""
 
 _ATEN = torch.ops.aten
-KEPT: list[Any] = [
+SAVED_OPS: list[Any] = [
     _ATEN.mm.default, _ATEN.addmm.default, _ATEN.bmm.default, _ATEN.convolution.default,
     _ATEN._scaled_dot_product_flash_attention.default, _ATEN._scaled_dot_product_efficient_attention.default,
     _ATEN._scaled_dot_product_cudnn_attention.default, _ATEN._scaled_dot_product_flash_attention_for_cpu.default,
@@ -23,7 +23,7 @@ KEPT: list[Any] = [
 
 def checkpoint_options(how: Recompute) -> dict[str, Any]:
     """What `torch.utils.checkpoint` and transformers take besides the layer."""
-    contexts = {"context_fn": partial(create_selective_checkpoint_contexts, KEPT)} if how == SELECTIVE else {}
+    contexts = {"context_fn": partial(create_selective_checkpoint_contexts, SAVED_OPS)} if how == SELECTIVE else {}
     return {"use_reentrant": False, **contexts}
 
 

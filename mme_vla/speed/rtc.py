@@ -24,16 +24,16 @@ def overlap_weights(delay: int, count: int, horizon: int) -> Tensor:
     The first `delay`, which are executed before the new chunk is there, count in full; the others less and less, as the
     paper's equation 5 has it; what nothing was promised of not at all.
     """
-    rest = (count - torch.arange(horizon, dtype=torch.float32)) / (count - delay + 1)
-    weights = rest * torch.expm1(rest) / (math.e - 1)
+    decay = (count - torch.arange(horizon, dtype=torch.float32)) / (count - delay + 1)
+    weights = decay * torch.expm1(decay) / (math.e - 1)
     weights[:delay], weights[count:] = 1.0, 0.0
     return weights
 
 
 def strength(time: Tensor) -> Tensor:
     """How strong the pull is at flow time τ: τ / ((1 − τ) r²) with r² = τ² / (τ² + (1 − τ)²), at most `STRONGEST`."""
-    rest = 1 - time
-    return ((rest.square() + time.square()) / (rest * time)).nan_to_num(posinf=STRONGEST).clamp(max=STRONGEST)
+    remaining = 1 - time
+    return ((remaining.square() + time.square()) / (remaining * time)).nan_to_num(posinf=STRONGEST).clamp(max=STRONGEST)
 
 
 def agreeing(velocity: Velocity, overlap: Overlap | None, times: Tensor) -> Velocity:

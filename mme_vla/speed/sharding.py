@@ -38,7 +38,7 @@ def float32_modules(group: nn.Module) -> list[nn.Module]:
     if getattr(group, "keeps_float32", False):
         return [group]
     children = list(group.children())
-    own = list(group.parameters(recurse=False))
+    local = list(group.parameters(recurse=False))
     if not children:
-        return [group] if own and all(parameter.ndim < 2 for parameter in own) else []
+        return [group] if local and all(parameter.ndim < 2 for parameter in local) else []
     return [module for child in children for module in float32_modules(child)]

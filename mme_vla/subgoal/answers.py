@@ -57,11 +57,11 @@ def merge_keyframes(frames: Sequence[int], distance: int = 8) -> list[int]:
     return [group[len(group) // 2] for group in groups]
 
 
-def recent_frames(newest: int, asked_before: bool, count: int = 8, stride: int = 2) -> list[int]:
+def recent_frames(newest: int, queried_before: bool, count: int = 8, stride: int = 2) -> list[int]:
     """Indices of MemER's recent frames: `count` of them, `stride` apart, ending at `newest`; one at the first call.
 
     Before the episode is long enough the list is shorter, never padded.
     """
-    if not asked_before:
+    if not queried_before:
         return [newest]
     return [i for i in range(newest - (count - 1) * stride, newest + 1, stride) if i >= 0]

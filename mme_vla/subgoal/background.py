@@ -55,7 +55,7 @@ class BackgroundPredictor(SubgoalPredictor):
         super().__init__(inner.kind, inner.interval)
         self.inner, self.usage, self.settings = inner, inner.usage, inner.settings
         self.sees_video, self.sees_passing = inner.sees_video, inner.sees_passing
-        self._asked: list[BackgroundEpisode] = []
+        self._queried_episodes: list[BackgroundEpisode] = []
         self._answers: Future[list[Subgoal]] | None = None
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> BackgroundEpisode:
@@ -90,10 +90,10 @@ class BackgroundPredictor(SubgoalPredictor):
         if self._answers is not None:
             return
         # What was answered just now for the current frame need not be asked again.
-        moved = [e for e in episodes if not e.answered or e.inner.frames_seen < e.frames_seen]
-        due = [episode for episode in moved if self.inner.due(episode.catch_up()) or not episode.answered]
+        advanced = [e for e in episodes if not e.answered or e.inner.n_observed_frames < e.n_observed_frames]
+        due = [episode for episode in advanced if self.inner.due(episode.catch_up()) or not episode.answered]
         if due:
-            self._asked = due
+            self._queried_episodes = due
             inner = [episode.inner for episode in due]
             self._answers = start(lambda: self.inner.predict(inner))
 
@@ -101,7 +101,7 @@ class BackgroundPredictor(SubgoalPredictor):
         if self._answers is None or not (wait or self._answers.done()):
             return
         answers, self._answers = self._answers.result(), None
-        for episode, subgoal in zip(self._asked, answers, strict=True):
+        for episode, subgoal in zip(self._queried_episodes, answers, strict=True):
             episode.subgoal, episode.answered, episode.fresh = subgoal, True, True
-            episode.asked_step = episode.inner.asked_step
-        self._asked = []
+            episode.query_step = episode.inner.query_step
+        self._queried_episodes = []

@@ -58,9 +58,9 @@ class Clip:
         with decoding(require_file(path, "a video"), "a video", _REMEDY), av.open(str(path)) as container:
             length = container.streams.video[0].frames
             indices = sample_video(length)
-            wanted = set(indices.tolist())
+            required = set(indices.tolist())
             decoded = enumerate(container.decode(video=0))
-            frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in wanted]
+            frames = [frame.to_ndarray(format="rgb24") for i, frame in decoded if i in required]
         if len(frames) != len(indices) or len({frame.shape for frame in frames}) != 1:
             raise UserError(f"{path} is damaged: it announces {length} frames. {_REMEDY}")
         return cls(np.stack(frames), indices, length)

@@ -11,8 +11,8 @@ from mme_vla.processing.prompt import POINT
 from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.models.api import ApiFailure, Reply, make_api, side_by_side
-from mme_vla.subgoal.models.connection import Shown
-from mme_vla.subgoal.text import MalformedAnswer, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.subgoal.models.connection import MediaPart
+from mme_vla.subgoal.text import MalformedReply, parse_gemini, pixels_of_pairs, says_done
 
 AT = " at <y, x>"
 
@@ -79,8 +79,8 @@ VOCABULARY: dict[str, tuple[str, ...]] = {
         "move forward-left", "move forward-right", "move backward-left", "move backward-right",
     ),
     "RouteStick": tuple(
-        f"move to the nearest {side} target by circling around the stick {turn}"
-        for side in ("left", "right") for turn in ("clockwise", "counterclockwise")
+        f"move to the nearest {side} target by circling around the stick {direction}"
+        for side in ("left", "right") for direction in ("clockwise", "counterclockwise")
     ),
 }  # fmt: skip
 
@@ -136,12 +136,12 @@ def what_there_is(task: str, kind: str) -> list[str]:
     Args:
         task: its name; for an unknown one the subgoals of all tasks are listed. kind: `simple` or `grounded`.
     """
-    written = _subgoals(task, kind)
+    templates = _subgoals(task, kind)
     parts = [
         "Subgoals of this task, to be used word for word ([ordinal] is first, second, third, …; [colour] is red, blue "
-        "or green):\n" + "\n".join(f"- {text}" for text in written),
+        "or green):\n" + "\n".join(f"- {text}" for text in templates),
     ]
-    if kind == "grounded" and any(AT in text for text in written):
+    if kind == "grounded" and any(AT in text for text in templates):
         parts.append(
             "<y, x> is a point in the latest picture: y is its row and x its column, whole numbers from 0 (top, left) "
             "to 1000 (bottom, right). Point at the middle of the object that is meant."
@@ -158,26 +158,26 @@ def example_of(task: str, kind: str) -> str:
 
 def _subgoals(task: str, kind: str) -> list[str]:
     templates = VOCABULARY.get(task) or tuple(dict.fromkeys(t for one in VOCABULARY.values() for t in one))
-    return [_written(template, kind) for template in templates]
+    return [_filled(template, kind) for template in templates]
 
 
 def first_query(goal: str, video: bool) -> str:
     """The first question; its pictures come before it, the demonstration video first."""
-    shown = (
+    context = (
         "The video shows what happened before the robot's turn, the picture shows the scene now."
         if video
         else "The picture shows the scene at the start."
     )
-    return f"The task: {goal}\n{shown} Plan the subgoals, and name the first one."
+    return f"The task: {goal}\n{context} Plan the subgoals, and name the first one."
 
 
 def next_query(clip: bool) -> str:
     """A later question; its video, or the single picture of a very short stretch, comes before it."""
-    shown = "This video shows what the robot did since." if clip else "This picture shows the scene now."
-    return f"{shown} Describe what happened, and name the current subgoal."
+    context = "This video shows what the robot did since." if clip else "This picture shows the scene now."
+    return f"{context} Describe what happened, and name the current subgoal."
 
 
-def _written(template: str, kind: str) -> str:
+def _filled(template: str, kind: str) -> str:
     return template.replace("@", AT if kind == "grounded" else "")
 
 
@@ -193,13 +193,13 @@ CLIP = 4  # frames: fewer are not worth a video
 class GeminiEpisode(SubgoalEpisode):
     """An episode, its conversation, and the frames the model has not seen.
 
-    turns: what was asked and answered, each a role and parts; a part is a text, or a picture [H, W, 3] or video
+    messages: what was asked and answered, each a role and parts; a part is a text, or a picture [H, W, 3] or video
     [t, H, W, 3], which is encoded once for all questions that show it.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str) -> None:
         super().__init__(goal, video, task)
-        self.turns: list[tuple[str, list[Any]]] = []
+        self.messages: list[tuple[str, list[Any]]] = []
         self.unseen: list[np.ndarray] = []
         self.again = False
 
@@ -208,18 +208,18 @@ class GeminiEpisode(SubgoalEpisode):
         super().observe(frames, info)
         self.unseen += list(frames)
 
-    def next_turn(self) -> list[Any]:
+    def next_message(self) -> list[Any]:
         """The parts of the next question."""
-        if self.turns:
+        if self.messages:
             return self._since(self.unseen)
-        video = [Shown(self.video)] if len(self.video) else []
-        picture = Shown(self.unseen[0] if self.unseen else self.frame)
-        opening: list[Any] = [*video, picture, first_query(self.goal, bool(video))]
+        video = [MediaPart(self.video)] if len(self.video) else []
+        image = MediaPart(self.unseen[0] if self.unseen else self.frame)
+        opening: list[Any] = [*video, image, first_query(self.goal, bool(video))]
         return opening + (self._since(self.unseen[1:]) if len(self.unseen) > 1 else [])
 
     def _since(self, frames: list[np.ndarray]) -> list[Any]:
         clip = len(frames) >= CLIP
-        return [Shown(np.stack(frames) if clip else self.frame), next_query(clip)]
+        return [MediaPart(np.stack(frames) if clip else self.frame), next_query(clip)]
 
 
 @SUBGOALS.register("gemini")
@@ -264,24 +264,24 @@ class Gemini(SubgoalPredictor):
     def due(self, episode: SubgoalEpisode) -> bool:
         """Whether to ask now; a question that failed is repeated at the next opportunity."""
         assert isinstance(episode, GeminiEpisode)
-        if episode.again or episode.asked_step is None:
+        if episode.again or episode.query_step is None:
             return True
         return super().due(episode) and not (episode.task in LATE and self.due_step(episode) < self.wait)
 
-    def answer(self, episodes: Sequence[GeminiEpisode]) -> list[Subgoal]:
+    def predict_due(self, episodes: Sequence[GeminiEpisode]) -> list[Subgoal]:
         """Ask for all of them, some at a time."""
         return side_by_side(self._ask, episodes, self.workers)
 
     def _ask(self, episode: GeminiEpisode) -> Subgoal:
-        turn = ("user", episode.next_turn())
+        message = ("user", episode.next_message())
         try:
-            reply = self.api.ask(gemini_system(episode.task, self.kind), [*episode.turns, turn])
+            reply = self.api.ask(gemini_system(episode.task, self.kind), [*episode.messages, message])
         except ApiFailure as failure:
             episode.again = True
             with self._lock:
-                return self.kept(episode, failure.problem, reason=str(failure))
+                return self.unchanged(episode, failure.problem, reason=str(failure))
         episode.again = False
-        episode.turns += [turn, ("model", [reply.text])]
+        episode.messages += [message, ("model", [reply.text])]
         episode.unseen = []
         with self._lock:
             return self._read(episode, reply)
@@ -290,10 +290,10 @@ class Gemini(SubgoalPredictor):
         try:
             text = parse_gemini(reply.text).lower()
             if says_done(text):
-                return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=reply.text)
+                return Subgoal(episode.subgoal.text, episode.subgoal.points, queried=True, reply=reply.text)
             return self.accepted(pixels_of_pairs(text), reply.text)
-        except MalformedAnswer as error:
-            return self.kept(episode, "malformed", reply.text, str(error))
+        except MalformedReply as error:
+            return self.unchanged(episode, "malformed", reply.text, str(error))
 
 
 @SUBGOALS.register("openai")

@@ -12,8 +12,8 @@ from mme_vla.registry import SUBGOALS
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode, SubgoalPredictor
 from mme_vla.subgoal.gemini import example_of, what_there_is
 from mme_vla.subgoal.models.api import ApiFailure, make_api, side_by_side
-from mme_vla.subgoal.models.connection import Shown
-from mme_vla.subgoal.text import MalformedAnswer, json_object, parse_gemini, pixels_of_pairs, says_done
+from mme_vla.subgoal.models.connection import MediaPart
+from mme_vla.subgoal.text import MalformedReply, json_object, parse_gemini, pixels_of_pairs, says_done
 from mme_vla.utils import is_text
 
 MONITOR = (
@@ -51,34 +51,34 @@ def planner_system(task: str, kind: str) -> str:
 
 def opening_query(goal: str, video: bool) -> str:
     """The planner's first question; its pictures come before it, the demonstration video first."""
-    shown = (
+    context = (
         "The video shows what happened before the robot's turn, the picture shows the scene now. Note what has to be "
         "remembered of the video."
         if video
         else "The picture shows the scene at the start."
     )
-    return f"The task: {goal}\n{shown} Name the first subgoal."
+    return f"The task: {goal}\n{context} Name the first subgoal."
 
 
 def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
     """A later question to the planner; the video of the finished subgoal, if it has frames, comes before it."""
-    shown = "The picture shows the scene now."
+    context = "The picture shows the scene now."
     if clip:
-        shown = "The video shows how it was done, the picture the scene now."
+        context = "The video shows how it was done, the picture the scene now."
     return (
-        f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete. {shown} Bring the notebook "
-        "up to date, and name the next subgoal."
+        f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete. {context} Bring the "
+        "notebook up to date, and name the next subgoal."
     )
 
 
 def monitor_query(goal: str, subgoal: str, clip: bool) -> str:
     """A question to the monitor; its pictures come before it."""
-    shown = (
+    context = (
         "The video shows what the robot did since it was given the subgoal, the picture the scene now."
         if clip
         else "The picture shows the scene now."
     )
-    return f"The task: {goal}\nThe subgoal: {subgoal}\n{shown} Is the subgoal complete?"
+    return f"The task: {goal}\nThe subgoal: {subgoal}\n{context} Is the subgoal complete?"
 
 
 MOST_NOTES, MOST_STEPS, MOST_WORDS, MOST_COUNT = 16, 32, 200, 99
@@ -97,7 +97,7 @@ class Count:
     def check(self, before: "Count | None", finished: bool) -> None:
         """See `Notebook.written`."""
         if before is not None and not before.value <= self.value <= before.value + finished:
-            raise MalformedAnswer(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
+            raise MalformedReply(f"a count goes from {before.value} to {self.value}; it may stay or grow by one")
 
 
 @dataclass(frozen=True)
@@ -128,11 +128,11 @@ class Route:
     def check(self, before: "Route | None", finished: bool) -> None:
         """See `Notebook.written`."""
         if self.done > len(self.steps):
-            raise MalformedAnswer(f"{self.done} of {len(self.steps)} steps cannot be done")
+            raise MalformedReply(f"{self.done} of {len(self.steps)} steps cannot be done")
         if before is not None and before.steps != self.steps:
-            raise MalformedAnswer("the steps of a route were changed")
+            raise MalformedReply("the steps of a route were changed")
         if before is not None and not before.done <= self.done <= before.done + finished:
-            raise MalformedAnswer(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
+            raise MalformedReply(f"done goes from {before.done} to {self.done}; it may stay or grow by one")
 
 
 Note = Count | Identity | Route
@@ -145,7 +145,7 @@ class Notebook:
     notes: Mapping[str, Note] = field(default_factory=dict)
     finished: tuple[str, ...] = ()
 
-    def written(self, entries: Sequence[tuple[str, Note]], finished: str | None) -> "Notebook":
+    def with_entries(self, entries: Sequence[tuple[str, Note]], finished: str | None) -> "Notebook":
         """The notebook with these entries.
 
         Args:
@@ -158,11 +158,11 @@ class Notebook:
         for name, note in entries:
             before = self.notes.get(name)
             if before is not None and type(before) is not type(note):
-                raise MalformedAnswer(f"{brief(name)} was another kind of note before")
+                raise MalformedReply(f"{brief(name)} was another kind of note before")
             note.check(before, finished is not None)  # type: ignore[arg-type]
             notes[name] = note
         if len(notes) > MOST_NOTES:
-            raise MalformedAnswer(f"the notebook has room for {MOST_NOTES} notes")
+            raise MalformedReply(f"the notebook has room for {MOST_NOTES} notes")
         return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
 
     def in_words(self) -> str:
@@ -180,43 +180,43 @@ class Notebook:
         return "\n".join(lines) or "- nothing yet"
 
 
-def read_notes(given: Any) -> list[tuple[str, Note]]:
+def read_notes(entries: Any) -> list[tuple[str, Note]]:
     """Entries that a model proposes: a list of maps with `name`, `kind` and what the kind has.
 
     Raises:
         MalformedAnswer: something else.
     """
-    if not isinstance(given, list) or not all(isinstance(entry, dict) for entry in given):
-        raise MalformedAnswer("notes is not a list of objects")
-    return [(_words(entry.get("name"), "name"), _read(entry)) for entry in given[: MOST_NOTES + 1]]
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise MalformedReply("notes is not a list of objects")
+    return [(_words(entry.get("name"), "name"), _read(entry)) for entry in entries[: MOST_NOTES + 1]]
 
 
 def _read(entry: dict[str, Any]) -> Note:
     kind = entry.get("kind")
     if kind == "count":
-        return Count(_whole(entry.get("value"), "value", MOST_COUNT))
+        return Count(_integer(entry.get("value"), "value", MOST_COUNT))
     if kind == "identity":
         return Identity(_words(entry.get("words"), "words"))
     if kind == "route":
         steps = entry.get("steps")
         if not isinstance(steps, list) or not 1 <= len(steps) <= MOST_STEPS:
-            raise MalformedAnswer(f"steps is not a list of 1 to {MOST_STEPS} texts")
-        return Route(tuple(_words(step, "steps") for step in steps), _whole(entry.get("done", 0), "done", MOST_STEPS))
-    raise MalformedAnswer(f"there are notes of the kinds count, identity and route, not {brief(kind)}")
+            raise MalformedReply(f"steps is not a list of 1 to {MOST_STEPS} texts")
+        return Route(tuple(_words(step, "steps") for step in steps), _integer(entry.get("done", 0), "done", MOST_STEPS))
+    raise MalformedReply(f"there are notes of the kinds count, identity and route, not {brief(kind)}")
 
 
-def _words(given: Any, what: str) -> str:
-    if not isinstance(given, str) or not is_text(given) or not (text := " ".join(given.split())):
-        raise MalformedAnswer(f"the {what} of a note is no text")
+def _words(value: Any, what: str) -> str:
+    if not isinstance(value, str) or not is_text(value) or not (text := " ".join(value.split())):
+        raise MalformedReply(f"the {what} of a note is no text")
     if len(text) > MOST_WORDS:
-        raise MalformedAnswer(f"the {what} of a note has more than {MOST_WORDS} characters")
+        raise MalformedReply(f"the {what} of a note has more than {MOST_WORDS} characters")
     return text
 
 
-def _whole(given: Any, what: str, most: int) -> int:
-    if isinstance(given, bool) or not isinstance(given, int) or not 0 <= given <= most:
-        raise MalformedAnswer(f"the {what} of a note is no whole number from 0 to {most}")
-    return given
+def _integer(value: Any, what: str, most: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+        raise MalformedReply(f"the {what} of a note is no whole number from 0 to {most}")
+    return value
 
 
 CLIP = 4  # frames: fewer are not worth a video
@@ -240,10 +240,10 @@ class NotebookEpisode(SubgoalEpisode):
         super().observe(frames, info)
         self.since = [*self.since, *frames][-LONGEST:]
 
-    def pictures(self) -> list[Shown]:
+    def images(self) -> list[MediaPart]:
         """The video of the current subgoal, if it is worth one, and the present picture."""
-        clip = [Shown(np.stack(self.since))] if len(self.since) >= CLIP else []
-        return [*clip, Shown(self.frame)]
+        clip = [MediaPart(np.stack(self.since))] if len(self.since) >= CLIP else []
+        return [*clip, MediaPart(self.frame)]
 
 
 @SUBGOALS.register("notebook")
@@ -281,50 +281,50 @@ class NotebookPredictor(SubgoalPredictor):
         """Begin an episode, see `SubgoalPredictor`."""
         return NotebookEpisode(goal, video, task)
 
-    def answer(self, episodes: Sequence[NotebookEpisode]) -> list[Subgoal]:
+    def predict_due(self, episodes: Sequence[NotebookEpisode]) -> list[Subgoal]:
         """Ask for all of them, some at a time."""
         return side_by_side(self._ask, episodes, self.workers)
 
     def _ask(self, episode: NotebookEpisode) -> Subgoal:
-        said: list[str] = []
+        replies: list[str] = []
         try:
-            if episode.subgoal.text is not None and not self._complete(episode, said):
-                return Subgoal(episode.subgoal.text, episode.subgoal.points, asked=True, answer=said[0])
-            return self._next(episode, said)
+            if episode.subgoal.text is not None and not self._complete(episode, replies):
+                return Subgoal(episode.subgoal.text, episode.subgoal.points, queried=True, reply=replies[0])
+            return self._next(episode, replies)
         except ApiFailure as failure:
             problem, reason = failure.problem, str(failure)
-        except MalformedAnswer as error:
+        except MalformedReply as error:
             problem, reason = "malformed", str(error)
         with self._lock:
-            return self.kept(episode, problem, "\n".join(said), reason)
+            return self.unchanged(episode, problem, "\n".join(replies), reason)
 
-    def _complete(self, episode: NotebookEpisode, said: list[str]) -> bool:
-        """Whether the monitor has seen the current subgoal complete, now or before; its answer is added to `said`."""
+    def _complete(self, episode: NotebookEpisode, replies: list[str]) -> bool:
+        """Whether the monitor has seen the current subgoal complete, now or before; its answer goes into `replies`."""
         if not episode.agreed:
-            pictures = episode.pictures()
-            query = monitor_query(episode.goal, str(episode.subgoal.text), len(pictures) > 1)
-            said.append(self.api.ask(MONITOR, [("user", [*pictures, query])]).text)
-            done = json_object(said[-1]).get("done")
+            images = episode.images()
+            query = monitor_query(episode.goal, str(episode.subgoal.text), len(images) > 1)
+            replies.append(self.api.ask(MONITOR, [("user", [*images, query])]).text)
+            done = json_object(replies[-1]).get("done")
             if not isinstance(done, bool):
-                raise MalformedAnswer("the monitor's answer does not say whether it is done")
+                raise MalformedReply("the monitor's answer does not say whether it is done")
             episode.agreed = done
         return episode.agreed
 
-    def _next(self, episode: NotebookEpisode, said: list[str]) -> Subgoal:
-        """The planner's next subgoal, its notes written; its answer is added to `said`."""
-        finished, parts = episode.subgoal.text, episode.pictures()
+    def _next(self, episode: NotebookEpisode, replies: list[str]) -> Subgoal:
+        """The planner's next subgoal, its notes written; its answer is added to `replies`."""
+        finished, parts = episode.subgoal.text, episode.images()
         if finished is None:
-            video = [Shown(episode.video)] if len(episode.video) else []
-            parts = [*video, Shown(episode.frame)]
+            video = [MediaPart(episode.video)] if len(episode.video) else []
+            parts = [*video, MediaPart(episode.frame)]
             query = opening_query(episode.goal, bool(video))
         else:
             query = next_query(episode.goal, finished, episode.notebook.in_words(), len(parts) > 1)
-        said.append(self.api.ask(planner_system(episode.task, self.kind), [("user", [*parts, query])]).text)
-        text = parse_gemini(said[-1]).lower()
-        notebook = episode.notebook.written(read_notes(json_object(said[-1]).get("notes", [])), finished)
+        replies.append(self.api.ask(planner_system(episode.task, self.kind), [("user", [*parts, query])]).text)
+        text = parse_gemini(replies[-1]).lower()
+        notebook = episode.notebook.with_entries(read_notes(json_object(replies[-1]).get("notes", [])), finished)
         if says_done(text):
-            subgoal = Subgoal(finished, episode.subgoal.points, asked=True, answer="\n".join(said))
+            subgoal = Subgoal(finished, episode.subgoal.points, queried=True, reply="\n".join(replies))
         else:
-            subgoal = self.accepted(pixels_of_pairs(text), "\n".join(said))
+            subgoal = self.accepted(pixels_of_pairs(text), "\n".join(replies))
         episode.notebook, episode.since, episode.agreed = notebook, [], False
         return subgoal

@@ -19,7 +19,7 @@ class Oracle(SubgoalPredictor):
 
     sees_video = sees_passing = False
 
-    def answer(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
+    def predict_due(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
         """Look the texts up.
 
         Raises:

@@ -75,13 +75,13 @@ def memer_user(goal: str, keyframes: int, recent: int, video: bool) -> str:
     return (
         f"{setup}The task goal is: {goal}\n"
         "Here are the selected frames from the entirety of the full execution that are of particular importance:"
-        f"{_pictures(keyframes)}\n"
-        f"Here is current input image list from the front-view camera: {_pictures(recent)}\n\n"
+        f"{_image_tags(keyframes)}\n"
+        f"Here is current input image list from the front-view camera: {_image_tags(recent)}\n\n"
         "What subtask should the robot execute and what is the keyframe position?"
     )
 
 
-def memer_answer(subtask: str, positions: Sequence[int]) -> str:
+def memer_reply(subtask: str, positions: Sequence[int]) -> str:
     """MemER's answer; without keyframes there is no space after the first colon, as in the released training set."""
     space = " " if positions else ""
     return f'{{"current_subtask":{space}"{subtask}", "keyframe_positions": {list(positions)}}}'
@@ -92,7 +92,7 @@ def split_media(text: str) -> list[str]:
     return [piece for piece in re.split(f"({IMAGE}|{VIDEO})", text) if piece]
 
 
-def _pictures(count: int) -> str:
+def _image_tags(count: int) -> str:
     return f"[{', '.join([IMAGE] * count)}]"
 
 
@@ -109,7 +109,7 @@ _QUOTED = re.compile(r'"((?:[^"\\]|\\.)*)"')
 _DONE = ("is complete", "is finished")
 
 
-class MalformedAnswer(ValueError):  # noqa: N818  (what the model gave, not a mistake of the program)
+class MalformedReply(ValueError):  # noqa: N818  (what the model gave, not a mistake of the program)
     """An answer that holds no usable subgoal; the message says why."""
 
 
@@ -150,31 +150,31 @@ def write_boxes(text: str, points: Sequence[Point], side: int = SIDE) -> str:
     return "".join(piece + box for piece, box in zip(pieces, [*boxes, ""], strict=True))
 
 
-def parse_subgoal(answer: str, side: int = SIDE) -> Parsed:
+def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
     """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points.
 
     Raises:
         MalformedAnswer: nothing in it, a damaged point, or one outside the picture.
     """
-    text = " ".join(answer.split())
+    text = " ".join(reply.split())
     if not text:
-        raise MalformedAnswer("the answer is empty")
-    found = [(int(y), int(x)) for y, x in _BOX.findall(text)]
-    if any(value > THOUSAND for point in found for value in point):
-        raise MalformedAnswer("a point lies outside 0…1000")
+        raise MalformedReply("the answer is empty")
+    pixels = [(int(y), int(x)) for y, x in _BOX.findall(text)]
+    if any(value > THOUSAND for point in pixels for value in point):
+        raise MalformedReply("a point lies outside 0…1000")
     if _BOX_MARK.search(_BOX.sub("", text)):
-        raise MalformedAnswer("a point is not of the form <|box_start|>(a,b)<|box_end|>")
-    points = tuple((to_pixels(y, side), to_pixels(x, side)) for y, x in found)
+        raise MalformedReply("a point is not of the form <|box_start|>(a,b)<|box_end|>")
+    points = tuple((to_pixels(y, side), to_pixels(x, side)) for y, x in pixels)
     values = iter(points)
-    spoken = _BOX.sub(lambda _: "<{}, {}>".format(*next(values)), text)
-    return Parsed(spoken, _BOX.sub(BBOX, text), points)
+    display_text = _BOX.sub(lambda _: "<{}, {}>".format(*next(values)), text)
+    return Parsed(display_text, _BOX.sub(BBOX, text), points)
 
 
-def parse_memer(answer: str, recent: int, side: int = SIDE) -> tuple[Parsed, list[int]]:
+def parse_memer(reply: str, recent: int, side: int = SIDE) -> tuple[Parsed, list[int]]:
     """Read MemER's answer.
 
     Args:
-        answer: JSON with `current_subtask` and `keyframe_positions`, possibly in a code fence.
+        reply: JSON with `current_subtask` and `keyframe_positions`, possibly in a code fence.
         recent: how many recent frames were shown; positions outside 1…recent are left out.
 
     Returns:
@@ -183,30 +183,30 @@ def parse_memer(answer: str, recent: int, side: int = SIDE) -> tuple[Parsed, lis
     Raises:
         MalformedAnswer: no JSON object, no subtask, or positions that are no list of whole numbers.
     """
-    found = json_object(answer)
-    subtask, positions = found.get("current_subtask"), found.get("keyframe_positions", [])
+    fields = json_object(reply)
+    subtask, positions = fields.get("current_subtask"), fields.get("keyframe_positions", [])
     if not isinstance(subtask, str):
-        raise MalformedAnswer("the answer has no current_subtask")
+        raise MalformedReply("the answer has no current_subtask")
     if not isinstance(positions, list) or any(isinstance(p, bool) or not isinstance(p, int) for p in positions):
-        raise MalformedAnswer("keyframe_positions is not a list of whole numbers")
+        raise MalformedReply("keyframe_positions is not a list of whole numbers")
     return parse_subgoal(_writable(subtask), side), sorted({p for p in positions if 1 <= p <= recent})
 
 
-def parse_gemini(answer: str) -> str:
-    """Return the subgoal of a prompted model's answer, points still in thousandths.
+def parse_gemini(reply: str) -> str:
+    """Return the subgoal of a prompted model's reply, points still in thousandths.
 
     The first quoted string after a `"subgoal"` key on that line counts; failing that, the answer read as JSON.
 
     Raises:
         MalformedAnswer: there is none.
     """
-    for rest in _SUBGOAL_KEY.findall(answer):
-        quoted = _QUOTED.search(rest)
+    for remainder in _SUBGOAL_KEY.findall(reply):
+        quoted = _QUOTED.search(remainder)
         if quoted and quoted[1].strip():
             return _writable(quoted[1].strip().replace('\\"', '"'))
-    text = json_object(answer).get("subgoal")
+    text = json_object(reply).get("subgoal")
     if not isinstance(text, str) or not text.strip():
-        raise MalformedAnswer("the answer names no subgoal")
+        raise MalformedReply("the answer names no subgoal")
     return _writable(text.strip())
 
 
@@ -222,7 +222,7 @@ def pixels_of_pairs(text: str, side: int = SIDE) -> Parsed:
         try:
             y, x = (min(max(to_pixels(float(match[i]), side), 0), side) for i in (1, 2))
         except (ValueError, OverflowError):
-            raise MalformedAnswer("a point's number is too long") from None
+            raise MalformedReply("a point's number is too long") from None
         points.append((y, x))
         return f"<{y}, {x}>"
 
@@ -245,24 +245,24 @@ def points_of(text: str) -> tuple[Point, ...]:
     return tuple((int(y), int(x)) for y, x in _PIXELS.findall(text))
 
 
-def json_object(answer: str) -> dict[str, object]:
+def json_object(reply: str) -> dict[str, object]:
     """The outermost braces of an answer as JSON.
 
     Raises:
         MalformedAnswer: there are none, or something else between them.
     """
-    start, stop = answer.find("{"), answer.rfind("}")
+    start, stop = reply.find("{"), reply.rfind("}")
     if start < 0 or stop < start:
-        raise MalformedAnswer("the answer holds no JSON object")
+        raise MalformedReply("the answer holds no JSON object")
     try:
-        found: dict[str, object] = parse_json(answer[start : stop + 1], "the answer", finite=False)
+        fields: dict[str, object] = parse_json(reply[start : stop + 1], "the answer", finite=False)
     except UserError as error:
-        raise MalformedAnswer(f"the answer is not JSON: {error}") from None
-    return found
+        raise MalformedReply(f"the answer is not JSON: {error}") from None
+    return fields
 
 
 def _writable(text: str) -> str:
     """The text, unless it holds half a character (JSON's escapes allow that), which no file or tokenizer takes."""
     if not is_text(text):
-        raise MalformedAnswer("the answer holds half a character")
+        raise MalformedReply("the answer holds half a character")
     return text

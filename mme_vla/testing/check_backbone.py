@@ -51,7 +51,7 @@ def _batch(backbone: Backbone) -> Batch:
     )
 
 
-def _plain(visible: Any) -> Any:
+def _without_names(visible: Any) -> Any:
     """An integration that adds nothing: every block of the observation sees the observation, actions see all."""
     return lambda blocks: Injection(list(blocks), visible)
 
@@ -76,7 +76,7 @@ def check_tokens(backbone: Backbone, images: torch.Tensor) -> None:
 @torch.no_grad()
 def check_loss(backbone: Backbone, batch: Batch, images: torch.Tensor) -> None:
     """The loss is one number a step, repeats with the same draws, and does not read padding."""
-    inject = _plain(_table(backbone.observation_blocks(batch, images)))
+    inject = _without_names(_table(backbone.observation_blocks(batch, images)))
     draws = backbone.loss_draws(2, torch.Generator().manual_seed(0))
     assert all(len(value) == 2 for value in draws.values()), "every value of loss_draws(n) must have n rows."
     again = backbone.loss_draws(2, torch.Generator().manual_seed(0))
@@ -93,7 +93,7 @@ def check_loss(backbone: Backbone, batch: Batch, images: torch.Tensor) -> None:
 @torch.no_grad()
 def check_sample(backbone: Backbone, batch: Batch, images: torch.Tensor) -> None:
     """A sample is a chunk, repeats with the same draws, and depends on the observation."""
-    inject = _plain(_table(backbone.observation_blocks(batch, images)))
+    inject = _without_names(_table(backbone.observation_blocks(batch, images)))
     one = backbone.sample_draws(torch.Generator().manual_seed(0))
     draws = {key: torch.stack([value, value]) for key, value in one.items()}
     chunk = backbone.sample(batch, images, inject, draws)
@@ -107,12 +107,12 @@ def check_parts(backbone: Backbone) -> None:
     """Every parameter belongs to a part, and the parts fine-tuning freezes have parameters."""
     import re
 
-    found = set()
+    parts = set()
     for name, _ in backbone.named_parameters():
         part = next((part for part, pattern in backbone.parts().items() if re.match(pattern, name)), None)
         assert part is not None, f"no part of parts() holds {name!r}; its last pattern must match the rest."
-        found.add(part)
-    assert {"vision", "action"} <= found, f"parts() must name 'vision' and 'action'; parameters fall into {found}."
+        parts.add(part)
+    assert {"vision", "action"} <= parts, f"parts() must name 'vision' and 'action'; parameters fall into {parts}."
     names = [name for name, _ in backbone.named_modules()]
-    for end in (*backbone.adapted, *backbone.heads):
+    for end in (*backbone.lora_targets, *backbone.heads):
         assert any(f".{name}".endswith(f".{end}") for name in names), f"{end!r} ends no module's name."

@@ -55,9 +55,9 @@ def small_policy(name: str, seed: int = 42, **overrides: Any) -> MMEPolicy:
 
 def tiny_sections(model: str, backbone: str = "tiny") -> dict[str, Any]:
     """The plain sections of a model at a small backbone's size, for `MMEPolicy.from_config`."""
-    plain = OmegaConf.to_container(_composed(*policy_words(model, {"backbone": backbone})), resolve=True)
-    assert isinstance(plain, dict)
-    return {str(key): plain[key] for key in ("backbone", "memory", "integration", "policy")}
+    sections = OmegaConf.to_container(_composed(*policy_words(model, {"backbone": backbone})), resolve=True)
+    assert isinstance(sections, dict)
+    return {str(key): sections[key] for key in ("backbone", "memory", "integration", "policy")}
 
 
 @cache
@@ -114,7 +114,7 @@ def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | Non
     if policy.memory is None:
         return None
     views = len(policy.embodiment.cameras)
-    past = full_past(policy.memory.looks_back, views, policy.backbone.image_size, "cpu")
+    past = full_past(policy.memory.past_view_spec, views, policy.backbone.image_size, "cpu")
     if past is None:
         return None
     generator = torch.Generator().manual_seed(seed + 1)
@@ -139,8 +139,8 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
     """What a cache of this whole episode would hold, encoded in one go."""
     memory = policy.require_memory()
     spec, scorer = memory.storage, memory.make_scorer()
-    kept = spec.kept_frames(len(frames))
-    tokens = policy.encode_frames(frames[kept])
+    stored_frames = spec.stored_frames(len(frames))
+    tokens = policy.encode_frames(frames[stored_frames])
     rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
     scored = [(t, values) for t, values in rows if values is not None]
     scores = (
@@ -149,7 +149,7 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
         else None
     )
     stored = tokens.view(torch.uint16).numpy() if tokens.dtype == torch.bfloat16 else tokens.numpy()
-    return CachedHistory(spec, stored, kept, len(frames), scores, exec_start)
+    return CachedHistory(spec, stored, stored_frames, len(frames), scores, exec_start)
 
 
 def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
@@ -158,5 +158,5 @@ def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start
     history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
     for start in range(0, len(frames), chunk):
         part = frames[start : start + chunk]
-        history.append(part, policy.encode_frames(part[history.wanted(len(part))]))
+        history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))
     return history

@@ -86,7 +86,7 @@ def prepare_data(
     def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
         if processor.samples == "keyframes":
             return KeyframeDataset(
-                sources, processor, policy.keyframes, episodes=episodes, seed=seed, drawn=not held_out
+                sources, processor, policy.keyframes, episodes=episodes, seed=seed, sampled=not held_out
             )
         kind = GroupDataset if processor.group_size > 1 else TrainingDataset
         return kind(

@@ -93,11 +93,11 @@ class Window:
 class ProgressLine:
     """Shows the step and the latest numbers. Without a terminal it prints a line whenever numbers arrive."""
 
-    def __init__(self, total: int, done: int, shown: bool = True) -> None:
-        self.console = Console(quiet=not shown, highlight=False, soft_wrap=True)
+    def __init__(self, total: int, done: int, visible: bool = True) -> None:
+        self.console = Console(quiet=not visible, highlight=False, soft_wrap=True)
         self._total = total
         self._bar: Progress | None = None
-        if self.console.is_terminal and shown:
+        if self.console.is_terminal and visible:
             columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), TimeRemainingColumn())
             self._bar = Progress(*columns, console=self.console, transient=True)
             self._task = self._bar.add_task("starting", total=total, completed=done)
@@ -162,7 +162,7 @@ class Logger(Protocol):
         """Record values after `step` updates."""
         ...
 
-    def picture(self, step: int, name: str, path: Path) -> None:
+    def log_image(self, step: int, name: str, path: Path) -> None:
         """Record a picture file."""
         ...
 
@@ -176,15 +176,15 @@ class JsonLines:
 
     def __init__(self, folder: Path, first_step: int) -> None:
         path = folder / METRICS
-        kept = [line for line in read_metrics(folder) if line["step"] <= first_step]
+        lines = [line for line in read_metrics(folder) if line["step"] <= first_step]
         with write_atomically(path) as draft:
-            draft.write_text("".join(json.dumps(line) + "\n" for line in kept))
+            draft.write_text("".join(json.dumps(line) + "\n" for line in lines))
         self._file = path.open("a", buffering=1)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         self._file.write(json.dumps({"step": step, **values}) + "\n")
 
-    def picture(self, step: int, name: str, path: Path) -> None:
+    def log_image(self, step: int, name: str, path: Path) -> None:
         """Pictures lie in the run folder already."""
 
     def close(self) -> None:
@@ -207,7 +207,7 @@ class TensorBoard:
         for name, value in values.items():
             self._writer.add_scalar(name, value, step)
 
-    def picture(self, step: int, name: str, path: Path) -> None:
+    def log_image(self, step: int, name: str, path: Path) -> None:
         import numpy as np
         from PIL import Image
 
@@ -262,7 +262,7 @@ class WeightsAndBiases:
     def write(self, step: int, values: Mapping[str, float]) -> None:
         self._run.log(dict(values), step=step)
 
-    def picture(self, step: int, name: str, path: Path) -> None:
+    def log_image(self, step: int, name: str, path: Path) -> None:
         self._run.log({name: self._wandb.Image(str(path))}, step=step)
 
     def close(self) -> None:
@@ -279,9 +279,9 @@ class Loggers:
         for logger in self._loggers:
             logger.write(step, values)
 
-    def picture(self, step: int, name: str, path: Path) -> None:
+    def log_image(self, step: int, name: str, path: Path) -> None:
         for logger in self._loggers:
-            logger.picture(step, name, path)
+            logger.log_image(step, name, path)
 
     def close(self) -> None:
         for logger in self._loggers:

@@ -28,11 +28,11 @@ from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, 
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
 from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
 from mme_vla.training.order import BatchOrder, generator_for, readers, seed_of, size_of
-from mme_vla.training.parallel import gathered, reshard, shard, whole_number
+from mme_vla.training.parallel import full_value, gathered, reshard, shard
 from mme_vla.training.runs import PLOT, SUMMARY, Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
-from mme_vla.training.stopping import leave_signals_alone, stop_asked
+from mme_vla.training.stopping import leave_signals_alone, stop_requests
 from mme_vla.training.validation import Collate, Samples, Validation
 from mme_vla.types import send
 from mme_vla.utils import write_atomically
@@ -139,13 +139,13 @@ class Trainer:
                 tidy(self.run_info.checkpoints, settings.keep)
             return True
         batches = iter(self.loader)
-        with stop_asked() as asked:
+        with stop_requests() as stop:
             for step in range(self.run_info.step, settings.steps):
                 done = step + 1
                 with _reporting(self.policy.memory, self._due(done)):
                     window.add(self.update(step, batches, window))
                 line.advance()
-                stopping = asked() and done < settings.steps
+                stopping = stop() and done < settings.steps
                 saving = stopping or done == settings.steps or done % settings.save_every == 0
                 # A window ends with every checkpoint, so that a resumed run has the same windows.
                 if saving or self._due(done):
@@ -156,7 +156,7 @@ class Trainer:
                     if saving:
                         self.save(done, stopping)
                 if stopping:
-                    self.stopped_by = asked.signal
+                    self.stopped_by = stop.signal
                     line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
                     return False
         return True
@@ -169,8 +169,8 @@ class Trainer:
             group["lr"] = rate
         draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
         # Of the whole update: the pictures of a sample depend neither on the number of processes nor of pieces.
-        pictures = generator_for(settings.seed, "model", step, 0, 0)
-        draws = {**draws, **self.policy.picture_draws(settings.batch_size, pictures)}
+        generator = generator_for(settings.seed, "model", step, 0, 0)
+        draws = {**draws, **self.policy.image_draws(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():
@@ -186,7 +186,7 @@ class Trainer:
                 part = value.detach().float() / settings.accumulate
                 sums[name] = sums[name] + part if name in sums else part
         gradients = [p.grad for p in self._parameters if p.grad is not None]
-        norm = whole_number(clip_gradients(gradients, settings.clip_norm))
+        norm = full_value(clip_gradients(gradients, settings.clip_norm))
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.ema.update(step)
@@ -221,12 +221,12 @@ class Trainer:
             stopping: the process may be killed before long: what resuming needs comes first.
         """
         folder, keep = self.run_info.checkpoints, self.settings.keep
-        held = (self.policy, self.ema, self.optimizer, self.config, keep)
+        saved = (self.policy, self.ema, self.optimizer, self.config, keep)
         if self._shard_writer is not None:
-            save_shards(self._shard_writer, folder, step, *held, hurry=stopping)
+            save_shards(self._shard_writer, folder, step, *saved, hurry=stopping)
         else:
             if self.accelerator.is_main_process:
-                save_checkpoint(folder, step, *held)
+                save_checkpoint(folder, step, *saved)
             self.accelerator.wait_for_everyone()
         self.last_checkpoint = folder / checkpoint_name(step)
         return self.last_checkpoint
@@ -250,9 +250,9 @@ class Trainer:
 
 
 @contextmanager
-def _reporting(memory: Memory | None, wanted: bool) -> Iterator[None]:
+def _reporting(memory: Memory | None, enabled: bool) -> Iterator[None]:
     """Let the memory report numbers about its inside while this is open."""
-    if memory is None or not wanted:
+    if memory is None or not enabled:
         yield
         return
     memory.reporting = True
@@ -285,7 +285,7 @@ def finish(trainer: Trainer, data: SplitData, seconds: float, line: ProgressLine
     summary: dict[str, Any] = {"steps": settings.steps, **loss_change(read_metrics(folder))}
     if result is not None:
         plot_open_loop(result, folder / PLOT, trainer.config["name"])
-        loggers.picture(settings.steps, "open_loop", folder / PLOT)
+        loggers.log_image(settings.steps, "open_loop", folder / PLOT)
         summary["open_loop"] = result.summary()
         line.say("\n".join([f"open loop on {result.title}", *error_lines(summary["open_loop"])]))
         if verdict := worse_than_still(summary["open_loop"], settings.steps):
@@ -332,8 +332,8 @@ def loss_change(lines: Sequence[Mapping[str, Any]], share: float = 0.05) -> dict
     before = [0, *(step for step, _ in losses[:-1])]
     spans = [(begun, step, loss) for begun, (step, loss) in zip(before, losses, strict=True)]
 
-    def mean(chosen: list[tuple[int, int, float]]) -> float:
-        return sum((end - begun) * loss for begun, end, loss in chosen) / sum(end - begun for begun, end, _ in chosen)
+    def mean(entries: list[tuple[int, int, float]]) -> float:
+        return sum((end - begun) * loss for begun, end, loss in entries) / sum(end - begun for begun, end, _ in entries)
 
     first = [span for span in spans if span[0] < max(share * total, 1)]
     last = [span for span in spans if span[1] > min((1 - share) * total, total - 1)]

@@ -45,8 +45,8 @@ class OpenLoop:
         physical = self.error()
         still = {}
         if self.still is not None:
-            held = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
-            still = {"mean_abs_error_holding_still": held.round(5).tolist()}
+            still_error = self.error(np.broadcast_to(self.still[:, None], self.recorded.shape))
+            still = {"mean_abs_error_holding_still": still_error.round(5).tolist()}
         return {
             "names": list(self.space.names),
             "mean_abs_error": physical.round(5).tolist(),
@@ -91,12 +91,12 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
         recorded=np.stack([step.actions for step in recorded]),
         valid=np.stack([step.recorded for step in recorded]),
         scale=np.where(half_range > 0, half_range, 1),
-        still=np.stack([step.state for step in recorded]) if _held_by_state(processor.embodiment) else None,
+        still=np.stack([step.state for step in recorded]) if _state_is_command(processor.embodiment) else None,
         space=data.robot.action,
     )
 
 
-def _held_by_state(robot: Embodiment) -> bool:
+def _state_is_command(robot: Embodiment) -> bool:
     """Whether the state, given as the action, holds the robot still."""
     return bool(robot.action.relative) and robot.action.width == robot.state.width
 

@@ -70,9 +70,9 @@ def make_optimizer(parameters: Iterable[nn.Parameter], settings: TrainSettings) 
     LAMB scales each tensor's update down to that tensor's norm, never up. Parameters of fewer than `decay_min_dim`
     dimensions (biases, norms) are a group of their own, without weight decay.
     """
-    found, least = list(parameters), settings.decay_min_dim
-    decayed: dict[str, Any] = {"params": [p for p in found if p.ndim >= least]}
-    others: dict[str, Any] = {"params": [p for p in found if p.ndim < least], "weight_decay": 0.0}
+    parameters_list, least = list(parameters), settings.decay_min_dim
+    decayed: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim >= least]}
+    others: dict[str, Any] = {"params": [p for p in parameters_list if p.ndim < least], "weight_decay": 0.0}
     groups = [group for group in (decayed, others) if group["params"]]
     if settings.optimizer == "lamb":
         return ClippedLamb(
@@ -156,10 +156,10 @@ class EMA:
         for i, parameter in enumerate(self._parameters.values()):
             average = self._average[i]
             if isinstance(parameter, DTensor) and isinstance(average, DTensor):
-                own, other = parameter.to_local(), average.to_local()
-                kept = own.clone()
-                own.copy_(other)
-                other.copy_(kept)
+                local, other = parameter.to_local(), average.to_local()
+                copy = local.clone()
+                local.copy_(other)
+                other.copy_(copy)
             else:
                 parameter.data, self._average[i] = average, parameter.data
         self._reshard()

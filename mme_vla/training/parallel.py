@@ -23,7 +23,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.speed.sharding import float32_modules
 
 STRATEGIES = ("auto", "ddp", "fsdp")
-WHOLE = StateDictOptions(full_state_dict=True, cpu_offload=True)
+FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
 FROM_FIRST = StateDictOptions(full_state_dict=True, broadcast_from_rank0=True)
 
 
@@ -81,8 +81,8 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
             float32: groups that say so, norms, and all that stands in no group.
         compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are in `dtype` too.
     """
-    whole = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
-    whole = {name: tensor.detach().cpu() for name, tensor in whole.items()}
+    full = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
+    full = {name: tensor.detach().cpu() for name, tensor in full.items()}
     if distributed.get_rank() != 0:
         policy.compute_unsaved()
     low = None if dtype == torch.float32 else dtype
@@ -100,7 +100,7 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
             cast(FSDPModule, group.module).set_unshard_in_backward(False)
     wrap(policy, None)
     _materialise(policy, mesh)
-    set_model_state_dict(policy, whole, options=FROM_FIRST)
+    set_model_state_dict(policy, full, options=FROM_FIRST)
 
 
 def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
@@ -122,11 +122,11 @@ def is_sharded(module: nn.Module) -> bool:
     return isinstance(module, FSDPModule)
 
 
-def whole_state(policy: Policy) -> dict[str, Tensor]:
+def full_state(policy: Policy) -> dict[str, Tensor]:
     """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All processes call it."""
-    whole = cast(dict[str, Tensor], get_model_state_dict(policy, options=WHOLE))
+    full = cast(dict[str, Tensor], get_model_state_dict(policy, options=FULL_STATE))
     # Trained on the CPU they may lie in what training goes on with, or in the middle of what was gathered.
-    return {name: tensor.clone() for name, tensor in whole.items()} if policy.device.type == "cpu" else whole
+    return {name: tensor.clone() for name, tensor in full.items()} if policy.device.type == "cpu" else full
 
 
 def reshard(module: nn.Module) -> None:
@@ -159,17 +159,17 @@ def gathered(policy: Policy) -> Iterator[None]:
         reshard(policy)
 
 
-def like(tensor: Tensor, whole: Tensor) -> Tensor:
+def like(tensor: Tensor, full: Tensor) -> Tensor:
     """Of a whole tensor the part that this process keeps, laid out as `tensor` is; nothing is sent."""
-    if not isinstance(tensor, DTensor) or isinstance(whole, DTensor):
-        return whole
+    if not isinstance(tensor, DTensor) or isinstance(full, DTensor):
+        return full
     from torch.distributed.tensor import distribute_tensor
 
-    own = whole.to(tensor.to_local().device)
-    return distribute_tensor(own, tensor.device_mesh, tensor.placements, src_data_rank=None)
+    local = full.to(tensor.to_local().device)
+    return distribute_tensor(local, tensor.device_mesh, tensor.placements, src_data_rank=None)
 
 
-def whole_number(value: Tensor) -> Tensor:
+def full_value(value: Tensor) -> Tensor:
     """A number that processes hold parts of (a norm over shards) as the number itself."""
     return value.full_tensor() if isinstance(value, DTensor) else value
 

@@ -15,7 +15,7 @@ from mme_vla.policy.saving import policy_name
 from mme_vla.registry import INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
-from mme_vla.utils import FolderLock, plain
+from mme_vla.utils import FolderLock, to_json
 from mme_vla.utils.locks import LOCK
 from mme_vla.weights import transfer
 
@@ -145,7 +145,7 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
 
 def differing_keys(old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Dotted keys whose values differ and must not, with both values."""
-    before, after = (_flat(plain(values)) for values in (old, new))
+    before, after = (_flat(to_json(values)) for values in (old, new))
     return {
         key: (before.get(key), after.get(key))
         for key in sorted(before.keys() | after.keys())
@@ -197,9 +197,9 @@ def _newest_unfinished(folder: Path) -> Path | None:
     beside = [path for path in folder.parent.glob("*") if (path / CHECKPOINTS).is_dir()]
     runs = [folder, *sorted(beside, key=lambda path: (path / CHECKPOINTS).stat().st_mtime, reverse=True)]
     for run in runs:
-        found = checkpoints_in(run / CHECKPOINTS)
-        if found:
-            return None if (run / SUMMARY).is_file() and run != folder else found[-1]
+        checkpoints = checkpoints_in(run / CHECKPOINTS)
+        if checkpoints:
+            return None if (run / SUMMARY).is_file() and run != folder else checkpoints[-1]
     return None
 
 
@@ -234,6 +234,6 @@ def start_from(policy: Policy, source: str) -> str:
         UserError: no checkpoint, another tokenizer, a weight of another shape, or weights missing that are not the
             memory's.
     """
-    found = newest_checkpoint(Path(source))
-    source = source if found == Path(source) else str(found)
+    newest = newest_checkpoint(Path(source))
+    source = source if newest == Path(source) else str(newest)
     return f"weights from {source}: {transfer(policy, source)}"

@@ -81,8 +81,8 @@ class TrainSettings:
         if self.schedule_steps is not None:
             fits = self.schedule_steps >= max(self.warmup, 1)
             _check("schedule_steps", self.schedule_steps, fits, f"no fewer than train.warmup={self.warmup}, or null")
-        whole = all(isinstance(step, int) and step >= 1 for step in self.milestones)
-        _check("milestones", list(self.milestones), whole and list(self.milestones) == sorted(self.milestones),
+        valid = all(isinstance(step, int) and step >= 1 for step in self.milestones)
+        _check("milestones", list(self.milestones), valid and list(self.milestones) == sorted(self.milestones),
                "updates in ascending order, such as [1000, 2000]")  # fmt: skip
         _check("gamma", self.gamma, 0 < self.gamma <= 1, "above 0 and at most 1")
         for name in ("warmup", "decay_min_dim", "workers", "val_samples", "open_loop_chunks", "weight_decay"):

@@ -134,9 +134,9 @@ def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
     Raises:
         UserError: a damaged file, or tensors that do not fit this policy.
     """
-    found = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
-    _load(checkpoint, found, alone=True, others=True)
-    return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in found.items()}
+    tensors = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
+    _load(checkpoint, tensors, alone=True, others=True)
+    return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in tensors.items()}
 
 
 def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: bool = False) -> None:
@@ -149,9 +149,9 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     reader = dcp.HuggingFaceStorageReader(str(folder))
     with _decoding(folder):
         stored = {name: about.size for name, about in reader.read_metadata().state_dict_metadata.items()}  # type: ignore[union-attr]
-    wanted = {name: tensor.shape for name, tensor in tensors.items()}
-    names = set(wanted) - set(stored) if others else set(wanted) ^ set(stored)
-    wrong = sorted(names | {name for name in wanted.keys() & stored.keys() if wanted[name] != stored[name]})
+    shapes = {name: tensor.shape for name, tensor in tensors.items()}
+    names = set(shapes) - set(stored) if others else set(shapes) ^ set(stored)
+    wrong = sorted(names | {name for name in shapes.keys() & stored.keys() if shapes[name] != stored[name]})
     if wrong:
         raise UserError(
             f"{folder} does not fit this policy: {len(wrong):,} tensors differ, such as {listed(wrong, 4)}. "
@@ -163,8 +163,8 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
     except CheckpointException as error:  # what the processes met with, by their numbers
         with _decoding(folder):
             raise next(iter(error.failures.values()))[0] from error
-    own = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
-    check_values(own, str(folder))
+    local = {name: t.to_local() if isinstance(t, DTensor) else t for name, t in tensors.items()}
+    check_values(local, str(folder))
 
 
 def _sums_of(checkpoint: Path, file: Path) -> Sums:

@@ -35,11 +35,11 @@ def write_sums(folder: Path, names: Iterable[str] | None = None, keep: bool = Fa
     Files are read once more for it, in blocks and several at a time. With `keep`, the sums that are there of other
     files stay.
     """
-    found = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
-    chosen = sorted(set(names) if names is not None else {name for name in found if name != SUMS})
+    files = (path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+    listed = sorted(set(names) if names is not None else {name for name in files if name != SUMS})
     table = _read_sums(folder / SUMS) if keep and (folder / SUMS).exists() else {}
     with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-        table |= zip(chosen, pool.map(lambda name: file_sum(folder / name), chosen), strict=True)
+        table |= zip(listed, pool.map(lambda name: file_sum(folder / name), listed), strict=True)
     with write_atomically(folder / SUMS) as draft:
         draft.write_text("".join(f"{table[name]}  {name}\n" for name in sorted(table)))
 
@@ -78,8 +78,8 @@ class Sums:
                     f"{path} is missing, though {self.folder / self.name} lists it. Copy the whole folder again."
                 )
         with ThreadPoolExecutor(_AT_ONCE) as pool:  # hashing lets other threads run
-            for (name, path), found in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
-                if found != self.table[name]:
+            for (name, path), checksum in zip(paths.items(), pool.map(file_sum, paths.values()), strict=True):
+                if checksum != self.table[name]:
                     raise UserError(
                         f"{path} is damaged: its content is not what was written (SHA-256 differs from {self.name}). "
                         f"{self.remedy}; if you changed it on purpose, delete {self.name}."
@@ -121,17 +121,17 @@ def _read_sums(sums: Path) -> dict[str, str]:
 SEAL = "crc32"
 
 
-def plain(value: Any) -> Any:
+def to_json(value: Any) -> Any:
     """`value` as JSON gives it back: tuples are lists, keys are texts."""
     return json.loads(json.dumps(value))
 
 
-def sealed(values: Mapping[str, Any]) -> dict[str, Any]:
+def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
     """`values` and, under `crc32`, a checksum of them that does not depend on the order of keys."""
     return {**values, SEAL: _sum(values)}
 
 
-def unsealed(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
     """`values` without their seal; those that were written without one, by hand or long ago, are taken as they are.
 
     Raises:

@@ -40,19 +40,19 @@ def disk_trouble(error: BaseException) -> str | None:
 
     Libraries wrap such errors in their own: the number is looked for in their texts and in what they were raised from.
     """
-    found, place, seen = None, None, set[int]()
+    number, place, visited = None, None, set[int]()
     current: BaseException | None = error
-    while current is not None and id(current) not in seen:
-        seen.add(id(current))
-        found = _number(current) if found is None else found
+    while current is not None and id(current) not in visited:
+        visited.add(id(current))
+        number = _number(current) if number is None else number
         place = getattr(current, "filename", None) or place
-        if place is None and found is not None and (named := _NAME.search(str(current))):
+        if place is None and number is not None and (named := _NAME.search(str(current))):
             place = named[1]
         current = current.__cause__ or current.__context__
-    if found is None or (place is None and found in (errno.EACCES, errno.EPERM)):  # a port, not a file
+    if number is None or (place is None and number in (errno.EACCES, errno.EPERM)):  # a port, not a file
         return None
-    reason, advice = _ADVICE[found]
-    return f"{place or Path.cwd()} cannot be written or opened: {reason} ({os.strerror(found)}). {advice}"
+    reason, advice = _ADVICE[number]
+    return f"{place or Path.cwd()} cannot be written or opened: {reason} ({os.strerror(number)}). {advice}"
 
 
 def name_place(error: BaseException | None, place: Path) -> None:
@@ -85,16 +85,16 @@ def require_file(path: Path, what: str = "a file") -> Path:
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
-        raise UserError(f"{_shown(path)} is missing; expected {what}.") from None
+        raise UserError(f"{_short_path(path)} is missing; expected {what}.") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise UserError(f"{_shown(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
+        raise UserError(f"{_short_path(path)} cannot be read as {what}: {brief(reason, 300, quote=False)}.") from None
     if not stat.S_ISREG(mode):
-        raise UserError(f"{_shown(path)} is not a file; expected {what}.")
+        raise UserError(f"{_short_path(path)} is not a file; expected {what}.")
     return path
 
 
-def _shown(path: Path) -> str:
+def _short_path(path: Path) -> str:
     """A path in a message; a stranger's file may have given it a name of any length."""
     return brief(str(path), 300, quote=False)
 
@@ -113,8 +113,10 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     except UserError:
         raise
     except Exception as error:
-        said = " ".join(str(error.__cause__ or error).split())  # some wrap what happened in a sentence without content
-        reason = f"{type(error).__name__}: {brief(said, 200, quote=False)}" if said else type(error).__name__
+        message = " ".join(
+            str(error.__cause__ or error).split()
+        )  # some wrap what happened in a sentence without content
+        reason = f"{type(error).__name__}: {brief(message, 200, quote=False)}" if message else type(error).__name__
         raise UserError(f"{path} is damaged: it cannot be read as {what} ({reason}). {remedy}") from error
 
 
@@ -129,11 +131,11 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
     """
     place, root = folder / name, folder.resolve()
     try:
-        found = place.resolve()
+        resolved = place.resolve()
     except (OSError, ValueError, RuntimeError):  # a null character, a loop of links
-        found = Path("/")
-    within = found.is_relative_to(root) and found != root
-    linked = ".." not in Path(name).parts and any(found.is_relative_to(blobs) for blobs in _blobs_of(root))
+        resolved = Path("/")
+    within = resolved.is_relative_to(root) and resolved != root
+    linked = ".." not in Path(name).parts and any(resolved.is_relative_to(blobs) for blobs in _blobs_of(root))
     if not name or Path(name).is_absolute() or not (within or linked):
         raise UserError(
             f"{folder} names the {what} {brief(name)}, which lies outside of it. Nothing outside a checkpoint's or "
@@ -189,12 +191,12 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
         # A pipe without a writer would block in open(); a device would never end.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         with os.fdopen(descriptor, "rb") as file:
-            found = os.fstat(file.fileno())
-            if not stat.S_ISREG(found.st_mode):
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode):
                 raise UserError(f"{path} is not a file; expected {what}.")
-            if found.st_size > limit:
-                raise UserError(f"{path} has {found.st_size:,} bytes; {what} has at most {limit:,}.")
-            return file.read(found.st_size + 1)  # reading `limit` would allocate it, whatever the size
+            if status.st_size > limit:
+                raise UserError(f"{path} has {status.st_size:,} bytes; {what} has at most {limit:,}.")
+            return file.read(status.st_size + 1)  # reading `limit` would allocate it, whatever the size
     except FileNotFoundError:
         raise UserError(f"{path} does not exist; expected {what}.") from None
     except (OSError, ValueError) as error:  # ValueError: a null character in the path
@@ -251,8 +253,8 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
         raise UserError(f"{source} is not valid JSON: {brief(str(error), 200, quote=False)}.") from None
     if not isinstance(value, kind):
         kinds = kind if isinstance(kind, tuple) else (kind,)
-        wanted = " or ".join(_KINDS.get(k, k.__name__) for k in kinds)
-        raise UserError(f"{source} must hold {wanted}, not {brief(value)}.")
+        expected = " or ".join(_KINDS.get(k, k.__name__) for k in kinds)
+        raise UserError(f"{source} must hold {expected}, not {brief(value)}.")
     return value
 
 

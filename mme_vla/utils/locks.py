@@ -14,16 +14,16 @@ from mme_vla.errors import UserError
 from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
 
 LOCK = ".lock"
-_held: set[int] = set()  # descriptors
+_locked: set[int] = set()  # descriptors
 
 
-def _let_go() -> None:
+def _release_all() -> None:
     """A forked process holds nothing: it would go on holding the folder when this process is gone."""
-    while _held:
-        os.close(_held.pop())
+    while _locked:
+        os.close(_locked.pop())
 
 
-os.register_at_fork(after_in_child=_let_go)
+os.register_at_fork(after_in_child=_release_all)
 
 
 class FolderLock:
@@ -66,7 +66,7 @@ class FolderLock:
                     "Wait until it has ended, stop it, or write to another folder."
                 ) from None
             self._descriptor = descriptor
-            _held.add(descriptor)
+            _locked.add(descriptor)
             if self._in_place():
                 break
             self._forget()  # what we hold was removed by its last holder between our opening and our locking it
@@ -79,7 +79,7 @@ class FolderLock:
 
     def release(self) -> None:
         """Let go of the folder; harmless if it is not held."""
-        if self._descriptor not in _held:
+        if self._descriptor not in _locked:
             return
         with suppress(OSError):  # the folder may have been moved or removed by its holder
             if self._in_place():
@@ -96,8 +96,8 @@ class FolderLock:
             return False
 
     def _forget(self) -> None:
-        if self._descriptor in _held:  # not so in a forked process
-            _held.remove(self._descriptor)
+        if self._descriptor in _locked:  # not so in a forked process
+            _locked.remove(self._descriptor)
             os.close(self._descriptor)
         self._descriptor = None
 

@@ -23,7 +23,7 @@ INK, FAINT = (40, 40, 40), (150, 150, 150)
 TILE, GAP, MARGIN, LABEL = 160, 12, 20, 20  # pixels of a contact sheet
 
 
-class Film:
+class VideoWriter:
     """An H.264 mp4 that is compressed as its frames come, so that no film is held in memory.
 
     A context manager: the film ends with the block.
@@ -41,12 +41,12 @@ class Film:
         self._stream: Any = None
         self.frames = 0
 
-    def add(self, picture: np.ndarray) -> None:
+    def add(self, image: np.ndarray) -> None:
         """Append a frame; the first says how large all are."""
         import av
 
         if self._stream is None:
-            height, width = picture.shape[:2]
+            height, width = image.shape[:2]
             self._stream = self._container.add_stream("libx264", rate=self._rate)
             self._stream.height, self._stream.width = height, width
             # Colours at half the resolution, which every player takes, need even sides.
@@ -54,13 +54,13 @@ class Film:
             # One thread: the file does not depend on how threads were scheduled.
             self._stream.codec_context.thread_count = 1
             self._stream.options = self._options
-        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
         self._container.mux(self._stream.encode(frame))
         self.frames += 1
 
-    def close(self, whole: bool = True) -> None:
+    def close(self, complete: bool = True) -> None:
         """End the film; with `whole=False` what the encoder still holds is dropped, for a file that is thrown away."""
-        if whole and self._stream is not None:
+        if complete and self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._container.close()
 
@@ -68,10 +68,10 @@ class Film:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self.close(whole=kind is None)
+        self.close(complete=kind is None)
 
 
-def write_film(frames: Iterable[np.ndarray], path: Path, **options: Any) -> int:
+def write_video(frames: Iterable[np.ndarray], path: Path, **options: Any) -> int:
     """Write frames of one size as a film that appears only when it is whole; return their number.
 
     Args:
@@ -80,36 +80,36 @@ def write_film(frames: Iterable[np.ndarray], path: Path, **options: Any) -> int:
     Raises:
         ValueError: there is no frame.
     """
-    with write_atomically(path) as draft, Film(draft, **options) as film:
-        return _fill(film, frames)
+    with write_atomically(path) as draft, VideoWriter(draft, **options) as video:
+        return _fill(video, frames)
 
 
-def film_bytes(frames: Iterable[np.ndarray], **options: Any) -> bytes:
+def video_bytes(frames: Iterable[np.ndarray], **options: Any) -> bytes:
     """The same in memory."""
     buffer = BytesIO()
-    with Film(buffer, **options) as film:
-        _fill(film, frames)
+    with VideoWriter(buffer, **options) as video:
+        _fill(video, frames)
     return buffer.getvalue()
 
 
-def png_bytes(picture: np.ndarray) -> bytes:
+def png_bytes(image: np.ndarray) -> bytes:
     """A picture as PNG."""
     from PIL import Image
 
     buffer = BytesIO()
-    Image.fromarray(picture).save(buffer, "PNG")
+    Image.fromarray(image).save(buffer, "PNG")
     return buffer.getvalue()
 
 
-def bordered(picture: np.ndarray, pixels: int = BORDER) -> np.ndarray:
+def bordered(image: np.ndarray, pixels: int = BORDER) -> np.ndarray:
     """The picture in a red border: it belongs to a conditioning video."""
-    framed = picture.copy()
+    framed = image.copy()
     for edge in (np.s_[:pixels], np.s_[-pixels:], np.s_[:, :pixels], np.s_[:, -pixels:]):
         framed[edge] = RED
     return framed
 
 
-def film_frame(views: Sequence[np.ndarray], caption: str | None = None, video: bool = False) -> np.ndarray:
+def video_frame(views: Sequence[np.ndarray], caption: str | None = None, video: bool = False) -> np.ndarray:
     """One frame [H + 24, W, 3] of a robot's views of one moment.
 
     Args:
@@ -136,14 +136,14 @@ def film_frame(views: Sequence[np.ndarray], caption: str | None = None, video: b
     return np.asarray(image)
 
 
-def of_one_size(pictures: Sequence["Image"]) -> Iterator[np.ndarray]:
+def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
     """Pictures of any sizes as frames of a film: each at the top left of a white one that holds the largest."""
     from PIL import Image
 
-    width, height = (-(-max(picture.size[axis] for picture in pictures) // 2) * 2 for axis in (0, 1))
-    for picture in pictures:
+    width, height = (-(-max(image.size[axis] for image in images) // 2) * 2 for axis in (0, 1))
+    for image in images:
         canvas = Image.new("RGB", (width, height), "white")
-        canvas.paste(picture)
+        canvas.paste(image)
         yield np.asarray(canvas)
 
 
@@ -151,7 +151,7 @@ def of_one_size(pictures: Sequence["Image"]) -> Iterator[np.ndarray]:
 class Tile:
     """One picture of a contact sheet. outline: a colour around it; None for none."""
 
-    picture: np.ndarray
+    image: np.ndarray
     label: str
     outline: tuple[int, int, int] | None = None
 
@@ -177,24 +177,24 @@ def contact_sheet(
         sheet.paste(header, (MARGIN, top - header.height))
     for place, tile in enumerate(tiles):
         x, y = MARGIN + place % columns * (side + GAP), top + place // columns * (side + LABEL + GAP)
-        sheet.paste(thumbnail(tile.picture, side), (x, y))
+        sheet.paste(thumbnail(tile.image, side), (x, y))
         if tile.outline is not None:
             draw.rectangle((x - 2, y - 2, x + side + 1, y + side + 1), outline=tile.outline, width=2)
         draw.text((x, y + side + 3), fitted(tile.label, side, 13), INK, font(13))
     return sheet
 
 
-def spread(count: int, wanted: int) -> list[int]:
-    """At most `wanted` places of a list of `count`, evenly from the first to the last."""
-    places: list[int] = np.unique(np.linspace(0, count - 1, wanted).round().astype(int)).tolist()
+def evenly_spaced(count: int, limit: int) -> list[int]:
+    """At most `limit` places of a list of `count`, evenly from the first to the last."""
+    places: list[int] = np.unique(np.linspace(0, count - 1, limit).round().astype(int)).tolist()
     return places
 
 
-def thumbnail(picture: np.ndarray, side: int = TILE) -> "Image":
+def thumbnail(image: np.ndarray, side: int = TILE) -> "Image":
     """The picture as a square of `side` pixels."""
     from PIL import Image
 
-    return Image.fromarray(picture).resize((side, side), Image.Resampling.LANCZOS)
+    return Image.fromarray(image).resize((side, side), Image.Resampling.LANCZOS)
 
 
 def font(size: int) -> "FreeTypeFont | ImageFont":
@@ -223,9 +223,9 @@ def _routines() -> dict[str, str]:
     return {"x264-params": "asm=MMX2,SSE2Fast,SSSE3,SSE4.2,AVX,FMA3,BMI2,AVX2"}
 
 
-def _fill(film: Film, frames: Iterable[np.ndarray]) -> int:
+def _fill(video: VideoWriter, frames: Iterable[np.ndarray]) -> int:
     for frame in frames:
-        film.add(frame)
-    if not film.frames:
+        video.add(frame)
+    if not video.frames:
         raise ValueError("A film needs at least one frame.")
-    return film.frames
+    return video.frames

@@ -32,7 +32,7 @@ def end_with_parent() -> None:
 
 
 @contextmanager
-def signals_held() -> Iterator[None]:
+def signals_deferred() -> Iterator[None]:
     """While this is open, Ctrl-C waits; processes that are started meanwhile never see it, so that they can be young.
 
     A process that is still importing would otherwise answer with a traceback.
@@ -47,12 +47,12 @@ def signals_held() -> Iterator[None]:
 _OTHERS = 256  # descriptors that libraries, workers and sockets need besides
 
 
-def files_to_hold(wanted: int) -> int:
-    """How many of `wanted` files may be held open: all, where the system lets this process raise its own limit."""
+def files_to_hold(limit: int) -> int:
+    """How many of `limit` files may be held open: all, where the system lets this process raise its own limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    needed = wanted + _OTHERS
+    needed = limit + _OTHERS
     if soft != resource.RLIM_INFINITY and soft < needed:
         raised = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, raised), hard))
         soft = max(soft, raised)
-    return wanted if soft == resource.RLIM_INFINITY else min(wanted, max(soft - _OTHERS, 8))
+    return limit if soft == resource.RLIM_INFINITY else min(limit, max(soft - _OTHERS, 8))

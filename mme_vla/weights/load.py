@@ -65,23 +65,23 @@ def load_weights(
             or misshapen is listed, and nothing is changed.
     """
     kind = dtype_of(dtype)
-    found = open_source(source, revision, token, base)
-    if found.format == "openpi" and policy.memory is not None:
+    checkpoint = open_source(source, revision, token, base)
+    if checkpoint.format == "openpi" and policy.memory is not None:
         raise UserError(
             f"{source} is memoryless π0.5 and this policy has a memory, whose weights would stay unset. "
             "To begin training from it use start_from() (on the command line: init_from=…)."
         )
-    stats, datasets = None, list(stats_files(found.folder))
-    if policy.processor is not None and found.format != "lerobot" and len(datasets) < 2:
-        stats = read_stats(found.folder)
-    assign_tensors(policy, read_as(policy, found), str(source), kind)
+    stats, datasets = None, list(stats_files(checkpoint.folder))
+    if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
+        stats = read_stats(checkpoint.folder)
+    assign_tensors(policy, read_as(policy, checkpoint), str(source), kind)
     policy.compute_unsaved()
     if stats is not None and policy.processor is not None:
         policy.processor.stats = stats
     elif len(datasets) > 1:
         warnings.warn(
             f"{source} holds normalisation statistics of {', '.join(datasets)}; none were taken. Choose one: "
-            f"policy.processor.stats = read_stats({str(found.folder)!r}, {datasets[0]!r})",
+            f"policy.processor.stats = read_stats({str(checkpoint.folder)!r}, {datasets[0]!r})",
             stacklevel=2,
         )
     return policy
@@ -98,8 +98,8 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
     if source.format == "lerobot":
         check_window(policy, source.config, str(source.folder))
     adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
-    tensors = source.tensors(lambda found: adapter.check_fit(found, state, source.shown))
-    return adapter.translate(tensors, state, source.shown)
+    tensors = source.tensors(lambda values: adapter.check_fit(values, state, source.label))
+    return adapter.translate(tensors, state, source.label)
 
 
 @dataclass(frozen=True)
@@ -135,39 +135,41 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
     """Do what `start_from` says, and tell in full what was taken, what is new and what was left behind."""
     if policy.device.type == "meta":
         raise UserError("Build the policy on a real device to start from a checkpoint: its memory needs fresh values.")
-    found = open_source(source, revision)
-    own, state = memory_parameters(policy), policy.state_dict()
-    if found.format == "ours":
-        theirs = merge_state(found.tensors(), found.config.get("adapters"))
-        _check_tokenizer(policy, found.folder)
-        strange = set(theirs) - set(state)
+    checkpoint = open_source(source, revision)
+    memory_names, state = memory_parameters(policy), policy.state_dict()
+    if checkpoint.format == "ours":
+        source_tensors = merge_state(checkpoint.tensors(), checkpoint.config.get("adapters"))
+        _check_tokenizer(policy, checkpoint.folder)
+        strange = set(source_tensors) - set(state)
         left = sorted(name for name in strange if _OF_MEMORY.search(name) or _part(policy, name) == "memory")
-        ours = {name: tensor for name, tensor in theirs.items() if name not in left}
-        check_fit(ours, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=own)
+        matched = {name: tensor for name, tensor in source_tensors.items() if name not in left}
+        check_fit(
+            matched, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=memory_names
+        )
     else:
-        of_format = partial_adapter(policy) if found.format == "released" else ADAPTERS[found.format](policy)
-        own |= of_format.fresh
+        of_format = partial_adapter(policy) if checkpoint.format == "released" else ADAPTERS[checkpoint.format](policy)
+        memory_names |= of_format.fresh
         members = [place for place, _ in members_of(policy.memory)]
 
-        def behind(theirs: Mapping[str, Tensor]) -> list[str]:
+        def behind(tensors: Mapping[str, Tensor]) -> list[str]:
             known = {constant.path for constant in of_format.derived}
-            known |= set(_reduced(of_format, own, members, theirs).shapes(state))
-            return sorted(name for name in set(theirs) - known if _MEMORY_LEAF.search(name))
+            known |= set(_reduced(of_format, memory_names, members, tensors).shapes(state))
+            return sorted(name for name in set(tensors) - known if _MEMORY_LEAF.search(name))
 
-        def fits(theirs: Mapping[str, Tensor]) -> None:
-            left = set(behind(theirs))
-            here = {name: tensor for name, tensor in theirs.items() if name not in left}
-            _reduced(of_format, own, members, theirs).check_fit(here, state, str(source))
+        def fits(tensors: Mapping[str, Tensor]) -> None:
+            left = set(behind(tensors))
+            here = {name: tensor for name, tensor in tensors.items() if name not in left}
+            _reduced(of_format, memory_names, members, tensors).check_fit(here, state, str(source))
 
-        theirs = found.tensors(fits)
-        left = behind(theirs)
-        adapter = _reduced(of_format, own, members, theirs)
-        theirs = {name: tensor for name, tensor in theirs.items() if name not in left}
-        ours = adapter.translate(theirs, state, str(source))
-    check_kinds(ours, state, str(source))
-    check_values(ours, str(source))
-    policy.load_state_dict(ours, strict=False)
-    return Start(sorted(ours), sorted(set(state) - set(ours)), left)
+        source_tensors = checkpoint.tensors(fits)
+        left = behind(source_tensors)
+        adapter = _reduced(of_format, memory_names, members, source_tensors)
+        source_tensors = {name: tensor for name, tensor in source_tensors.items() if name not in left}
+        matched = adapter.translate(source_tensors, state, str(source))
+    check_kinds(matched, state, str(source))
+    check_values(matched, str(source))
+    policy.load_state_dict(matched, strict=False)
+    return Start(sorted(matched), sorted(set(state) - set(matched)), left)
 
 
 def _part(policy: Policy, name: str) -> str | None:
@@ -180,23 +182,27 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     file = folder / CONFIG_FILE
     if policy.processor is None or not file.is_file():
         return
-    theirs = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
-    processor, ours = policy.processor, policy.processor.words_fingerprint
-    if theirs is not None and ours is not None and theirs != ours:
+    source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
+    processor, target_fingerprint = policy.processor, policy.processor.words_fingerprint
+    if source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(theirs)}) than {processor.words_from!r} ({ours}): "
-            "its ids would mean other words. Set processor.tokenizer to that one."
+            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than {processor.words_from!r} "
+            f"({target_fingerprint}): its ids would mean other words. Set processor.tokenizer to that one."
         )
 
 
-def _reduced(adapter: Adapter, own: set[str], members: Sequence[str], theirs: Mapping[str, Tensor]) -> Adapter:
+def _reduced(
+    adapter: Adapter, local: set[str], members: Sequence[str], source_tensors: Mapping[str, Tensor]
+) -> Adapter:
     """Leave out the memory's parameters that the checkpoint does not hold, and members that it does not hold whole."""
-    absent = {name for name, pieces in adapter.table.items() if not all(piece.path in theirs for piece in pieces)}
+    absent = {
+        name for name, pieces in adapter.table.items() if not all(piece.path in source_tensors for piece in pieces)
+    }
     torn = tuple(f"{place}." for place in members if any(name.startswith(f"{place}.") for name in absent))
     table = {
         name: pieces
         for name, pieces in adapter.table.items()
-        if name not in own or (name not in absent and not name.startswith(torn))
+        if name not in local or (name not in absent and not name.startswith(torn))
     }
     return replace(adapter, table=table)
 

@@ -69,8 +69,8 @@ def variant_of(folders: Sequence[Path]) -> str | None:
     for folder in folders:
         note = folder / VARIANT_FILE
         if note.is_file():
-            said = read_text(inside(folder, note.name), "the name of a variant", limit=4096)
-            return Path(said.strip()).name.removesuffix(".yaml")
+            text = read_text(inside(folder, note.name), "the name of a variant", limit=4096)
+            return Path(text.strip()).name.removesuffix(".yaml")
     return None
 
 
@@ -162,8 +162,8 @@ def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
         )
         for path, array in arrays.items()
     ]  # fmt: skip
-    writes = [store.result().write(array) for store, array in zip(opened, arrays.values(), strict=True)]
-    for write in writes:
+    futures = [store.result().write(array) for store, array in zip(opened, arrays.values(), strict=True)]
+    for write in futures:
         write.result()
     about = {"tree_metadata": leaves, "use_ocdbt": True, "use_zarr3": False}
     (params / METADATA).write_text(json.dumps(about))

@@ -68,17 +68,17 @@ def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
         taken = spelled.setdefault(_respell(name), name)
         if taken != name:
             raise UserError(f"{source} holds the same tensor twice, as {taken} and as {name}.")
-    found = {name: tensors[theirs] for name, theirs in spelled.items()}
-    adaptive = any(name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in found)
-    if not adaptive or any(_PI0.match(name) for name in found):
+    renamed = {name: tensors[source_name] for name, source_name in spelled.items()}
+    adaptive = any(name.startswith(names.EXPERTS["action"]) and ".dense." in name for name in renamed)
+    if not adaptive or any(_PI0.match(name) for name in renamed):
         raise UserError(
             f"{source} is not π0.5: its action expert has "
             + ("a state projection" if adaptive else "no time-conditioned norms")
             + ", as π0 has. Only π0.5 checkpoints fit."
         )
-    if names.EMBEDDING not in found and names.HEAD in found:
-        found[names.EMBEDDING] = found[names.HEAD]
-    return found
+    if names.EMBEDDING not in renamed and names.HEAD in renamed:
+        renamed[names.EMBEDDING] = renamed[names.HEAD]
+    return renamed
 
 
 def window_of(policy: Policy) -> dict[str, bool | int]:
@@ -86,9 +86,12 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
     memory = policy.memory
     if not isinstance(memory, SpaceTime):
         return dict.fromkeys(WINDOW_MEMORY, False)
-    look = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
-    seen = {"use_visual_memory": memory.looks_back is not None, "use_proprioceptive_memory": memory.states is not None}
-    return seen | {theirs: look[ours] for theirs, (ours, _) in WINDOW.items()}
+    settings = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
+    memory_settings = {
+        "use_visual_memory": memory.past_view_spec is not None,
+        "use_proprioceptive_memory": memory.states is not None,
+    }
+    return memory_settings | {source_name: settings[target_name] for source_name, (target_name, _) in WINDOW.items()}
 
 
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
@@ -104,7 +107,7 @@ def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None
             "To begin training from it use start_from() (on the command line: init_from=…)."
         )
     if any(has.values()):
-        has |= {theirs: config.get(theirs, usual) for theirs, (_, usual) in WINDOW.items()}
+        has |= {source_name: config.get(source_name, default) for source_name, (_, default) in WINDOW.items()}
     between = getattr(getattr(policy, "integration", None), "mutual", False)
     if any(window_of(policy).get(setting) != value for setting, value in has.items()) or (
         has["use_proprioceptive_memory"] and not between
@@ -114,17 +117,19 @@ def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None
 
 def _other_window(has: Mapping[str, Any], source: str) -> str:
     """What a policy has to be to load a checkpoint with these settings."""
-    seen = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
+    kinds = [what for setting, what in WINDOW_MEMORY.items() if has[setting]]
     views, states = (str(has[setting]).lower() for setting in WINDOW_MEMORY)
     integration = (
         "integration=context integration.mutual=true" if has["use_proprioceptive_memory"] else "integration=none"
     )
-    look = " ".join(f"memory.{ours}={brief(has[theirs])}" for theirs, (ours, _) in WINDOW.items())
+    window = " ".join(
+        f"memory.{target_name}={brief(has[source_name])}" for source_name, (target_name, _) in WINDOW.items()
+    )
     frames, stride = (brief(has[key]) for key in ("memory_frames", "memory_stride"))
     return (
-        f"{source} reads {' and '.join(seen)} (LeRobot's short-window memory: memory_frames={frames}, memory_stride="
+        f"{source} reads {' and '.join(kinds)} (LeRobot's short-window memory: memory_frames={frames}, memory_stride="
         f"{stride}), which this policy does not, or not so: whole, it would act on other things than it was trained "
-        f"with. Build the one that does: memory=spacetime {integration} {look} memory.views={views} "
+        f"with. Build the one that does: memory=spacetime {integration} {window} memory.views={views} "
         f"memory.states={states}. To begin training another from its weights use start_from() (on the command line: "
         "init_from=…)."
     )

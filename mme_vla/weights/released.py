@@ -40,7 +40,7 @@ def partial_adapter(policy: Any) -> Adapter:
         table |= prefixed(place, memory_names.released_names(member))
         unread += memory_names.released_unread(member)
         derived += memory_names.released_derived(member)
-    known = {name: pieces for name, pieces in table.items() if name in state or policy.part_of(name) != "memory"}
+    known = {name: pieces for name, pieces in table.items() if name in state or policy.component_of(name) != "memory"}
     return Adapter(known, unread, derived=derived)
 
 
@@ -58,7 +58,7 @@ def released_table(policy: MMEPolicy) -> NameTable:
         UserError: memory or integration have tensors that no released checkpoint holds.
     """
     table = _table(policy)
-    unnamed = sorted(memory_parameters(policy) ^ {name for name in table if policy.part_of(name) == "memory"})
+    unnamed = sorted(memory_parameters(policy) ^ {name for name in table if policy.component_of(name) == "memory"})
     if unnamed:
         owners = [part for part in (policy.memory, policy.integration) if part is not None]
         raise UserError(

@@ -10,10 +10,10 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.methods.diffusion_policy.weights import is_diffusion_policy, plain_names
+from mme_vla.methods.diffusion_policy.weights import is_diffusion_policy, unwrap_names
 from mme_vla.methods.memoryvla.weights import is_memoryvla, read_names
 from mme_vla.methods.openvla_oft.weights import FOLDER, has_adapters, is_openvla, merged, named_base, with_heads
-from mme_vla.methods.sam2act.weights import is_sam2act, plain_sam2act_names
+from mme_vla.methods.sam2act.weights import is_sam2act, unwrap_sam2act_names
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
 from mme_vla.utils import decoding, safe_name
@@ -115,8 +115,8 @@ def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.Zip
     key = file.resolve(), file.stat().st_mtime_ns
     if key in _facts:
         return Path(_facts[key].name)
-    kept = _facts[key] = tempfile.TemporaryDirectory(prefix="mme-vla-")
-    folder = Path(kept.name)
+    unpacked = _facts[key] = tempfile.TemporaryDirectory(prefix="mme-vla-")
+    folder = Path(unpacked.name)
     for entry in entries:
         *above, last = entry.filename.split("/")
         if last == VARIANT_FILE:
@@ -145,20 +145,20 @@ FORMATS = {
 
 
 @dataclass(frozen=True)
-class OwnNames:
+class NativeFormat:
     """A format of one method, told by its tensors' names.
 
     matches: whether names are its. plain: tensors under the one spelling that its name table knows.
     """
 
     matches: Callable[[Sequence[str]], bool]
-    plain: Callable[[Mapping[str, Tensor], str], dict[str, Tensor]]
+    to_native: Callable[[Mapping[str, Tensor], str], dict[str, Tensor]]
 
 
-OWN_NAMES = {
-    "diffusion_policy": OwnNames(is_diffusion_policy, plain_names),
-    "sam2act_plus": OwnNames(is_sam2act, plain_sam2act_names),
-    "memoryvla": OwnNames(is_memoryvla, read_names),
+NATIVE_FORMATS = {
+    "diffusion_policy": NativeFormat(is_diffusion_policy, unwrap_names),
+    "sam2act_plus": NativeFormat(is_sam2act, unwrap_sam2act_names),
+    "memoryvla": NativeFormat(is_memoryvla, read_names),
 }
 """Formats in files of `torch.save`; each is called as the model it holds."""
 
@@ -203,18 +203,18 @@ class Source:
         """
         if self.params is not None:
             return read_orbax(self.params, fits)
-        if self.format in OWN_NAMES:
-            return OWN_NAMES[self.format].plain(read_torch_file(self.files[0]), str(self.files[0]))
+        if self.format in NATIVE_FORMATS:
+            return NATIVE_FORMATS[self.format].to_native(read_torch_file(self.files[0]), str(self.files[0]))
         if self.base is not None:
-            own = with_heads({}, self.folder)
-            return merged(self.base.tensors(), self.folder) | own
+            heads = with_heads({}, self.folder)
+            return merged(self.base.tensors(), self.folder) | heads
         tensors = read_files(self.folder, self.files)
         if self.format == "openvla":
             return with_heads(tensors, self.folder)
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
-    def shown(self) -> str:
+    def label(self) -> str:
         """Where it is, for messages."""
         return str(self.params if isinstance(self.params, Zipped) else self.folder)
 
@@ -226,24 +226,24 @@ class Source:
     @property
     def model(self) -> str | None:
         """Our name of the variant a checkpoint is, or None where it does not say."""
-        if self.format in OWN_NAMES:
+        if self.format in NATIVE_FORMATS:
             return self.format
         if self.format == "openvla":
             return "openvla_oft"
-        said = None
+        name = None
         if self.params is not None:
             place = self.params.file if isinstance(self.params, Zipped) else self.params
             beside = [place.parent, place.parent.parent]
-            said = variant_of([self.folder, *beside])
-            if said is None:  # published runs lie in folders that are called as they are
-                said = next((folder.name for folder in beside if folder.name in VARIANTS), None)
-        if said is not None and said not in VARIANTS:
+            name = variant_of([self.folder, *beside])
+            if name is None:  # published runs lie in folders that are called as they are
+                name = next((folder.name for folder in beside if folder.name in VARIANTS), None)
+        if name is not None and name not in VARIANTS:
             # The word would become part of a configuration, where it could ask for more than a name.
             raise UserError(
-                f"history_config.txt beside {self.folder} says {brief(said)}, no variant of the released code. "
-                f"{did_you_mean(brief(said), VARIANTS)}"
+                f"history_config.txt beside {self.folder} says {brief(name)}, no variant of the released code. "
+                f"{did_you_mean(brief(name), VARIANTS)}"
             )
-        return None if said is None else VARIANTS[said]
+        return None if name is None else VARIANTS[name]
 
 
 def detect_format(source: str | Path) -> str:
@@ -271,16 +271,18 @@ def open_source(
     path = local_folder(source, revision, token)
     if not path.exists():
         raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
-    whole = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
+    is_local = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
     if base is not None:
-        if whole or not has_adapters(path):
+        if is_local or not has_adapters(path):
             raise UserError(
                 f"base={str(base)!r} is for a run that holds {FOLDER} alone; {path} does not: leave it out."
             )
-        found = open_source(base)
-        if found.format != "openvla":
-            raise UserError(f"base={str(base)!r} is {FORMATS[found.format]}; the adapters in {path} are OpenVLA's.")
-        return Source("openvla", path, base=found)
+        base_source = open_source(base)
+        if base_source.format != "openvla":
+            raise UserError(
+                f"base={str(base)!r} is {FORMATS[base_source.format]}; the adapters in {path} are OpenVLA's."
+            )
+        return Source("openvla", path, base=base_source)
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
     if path.is_file() and path.suffix == SUFFIX:
@@ -309,8 +311,8 @@ def open_source(
 
 
 def _of_archive(file: Path) -> Source:
-    found = open_archive(file)
-    return Source("released", found.folder, params=found.params)
+    archive = open_archive(file)
+    return Source("released", archive.folder, params=archive.params)
 
 
 def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
@@ -334,11 +336,13 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
 
 def _of_torch_file(path: Path) -> Source:
     names = list(read_torch_file(path))
-    for name, of in OWN_NAMES.items():
+    for name, of in NATIVE_FORMATS.items():
         if of.matches(names):
             return Source(name, path.parent, (path,))
     few = listed(sorted(names), 3)
-    raise UserError(f"{path} holds no policy known here: its tensors are called {few}. Known: {', '.join(OWN_NAMES)}.")
+    raise UserError(
+        f"{path} holds no policy known here: its tensors are called {few}. Known: {', '.join(NATIVE_FORMATS)}."
+    )
 
 
 def _names(file: Path) -> list[str]:

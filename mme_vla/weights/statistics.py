@@ -45,11 +45,11 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
                     else "say which: --asset, or read_stats(folder, asset)."
                 )
             )
-        return NormStats.load(_own(folder, files[asset]))
+        return NormStats.load(_local_file(folder, files[asset]))
     if files:
-        return NormStats.load(_own(folder, next(iter(files.values()))))
+        return NormStats.load(_local_file(folder, next(iter(files.values()))))
     if (folder / "norm_stats.json").is_file():
-        return NormStats.load(_own(folder, folder / "norm_stats.json"))
+        return NormStats.load(_local_file(folder, folder / "norm_stats.json"))
     return read_diffusion_stats(folder) or read_dataset_statistics(folder) or next(_lerobot_stats(folder), None)
 
 
@@ -63,7 +63,7 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
     for name in _PROCESSORS:
         if not (folder / name).is_file():
             continue
-        steps = read_json(_own(folder, folder / name), "a LeRobot processor").get("steps")
+        steps = read_json(_local_file(folder, folder / name), "a LeRobot processor").get("steps")
         if not isinstance(steps, list) or not all(isinstance(step, dict) for step in steps):
             raise UserError(f"{folder / name} does not describe a LeRobot processor: `steps` must list objects.")
         for file in (step["state_file"] for step in steps if step.get("state_file")):
@@ -71,10 +71,10 @@ def _lerobot_stats(folder: Path) -> Iterator[NormStats]:
                 raise UserError(f"{folder / name}: state_file={brief(file)} must be the name of a file.")
             tensors = read_safetensors(inside(folder, file, "statistics"))
             if all(f"{feature}.q01" in tensors for feature in _FEATURES.values()):
-                yield NormStats(**{ours: _quantiles(tensors, theirs) for ours, theirs in _FEATURES.items()})
+                yield NormStats(**{target: _quantiles(tensors, source) for target, source in _FEATURES.items()})
 
 
-def _own(folder: Path, file: Path) -> Path:
+def _local_file(folder: Path, file: Path) -> Path:
     """A file of a checkpoint, which must lie in it, compared with its checksum where there is one."""
     name = file.relative_to(folder).as_posix()
     check_sums(folder, [name])

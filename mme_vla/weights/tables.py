@@ -33,16 +33,16 @@ class Piece:
     axes: Mapping[str, int] = field(default_factory=dict)
     layer: int | None = None
 
-    def to_ours(self, theirs: Tensor) -> Tensor:
+    def to_target(self, tensor: Tensor) -> Tensor:
         if self.layer is not None:
-            theirs = theirs[self.layer].clone()  # a tensor of its own, which keeps no other layer in memory
-        return rearrange(theirs, self.pattern, **self.axes) if self.pattern else theirs
+            tensor = tensor[self.layer].clone()  # a tensor of its own, which keeps no other layer in memory
+        return rearrange(tensor, self.pattern, **self.axes) if self.pattern else tensor
 
-    def to_theirs(self, ours: Tensor) -> Tensor:
+    def to_source(self, tensor: Tensor) -> Tensor:
         if not self.pattern:
-            return ours
+            return tensor
         left, right = self.pattern.split("->")
-        return rearrange(ours, f"{right} -> {left}", **self.axes)
+        return rearrange(tensor, f"{right} -> {left}", **self.axes)
 
     def rows(self) -> int:
         """How many rows of our tensor this piece fills; asked only where several pieces share one."""
@@ -94,15 +94,15 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
     if missing:
         raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
-    ours = {}
+    target = {}
     for name, pieces in table.items():
         try:
-            parts = [piece.to_ours(source[piece.path]) for piece in pieces]
+            parts = [piece.to_target(source[piece.path]) for piece in pieces]
         except (RuntimeError, IndexError, ValueError) as error:
             shapes = {piece.path: tuple(source[piece.path].shape) for piece in pieces}
             raise UserError(f"{name} cannot be made of {shapes}: {error}") from error
-        ours[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
-    return ours
+        target[name] = torch.cat(parts) if len(parts) > 1 else parts[0].contiguous()
+    return target
 
 
 def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
@@ -113,38 +113,38 @@ def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
     """
     for constant in derived:
         if constant.path in source:
-            stored, ours = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
-            if stored.shape != ours.shape or not torch.allclose(stored, ours, rtol=1e-2, atol=1e-2):
+            stored, expected = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
+            if stored.shape != expected.shape or not torch.allclose(stored, expected, rtol=1e-2, atol=1e-2):
                 raise UserError(
                     f"The checkpoint's {constant.path} {tuple(stored.shape)} is not the constant this configuration "
-                    f"gives {tuple(ours.shape)}: it was trained with other sizes or rates; set the same here."
+                    f"gives {tuple(expected.shape)}: it was trained with other sizes or rates; set the same here."
                 )
 
 
 def write(
-    table: NameTable, unread: Iterable[Unread], ours: Mapping[str, Tensor], derived: Iterable[Derived] = ()
+    table: NameTable, unread: Iterable[Unread], target: Mapping[str, Tensor], derived: Iterable[Derived] = ()
 ) -> dict[str, Tensor]:
     """Translate our tensors into the foreign names and layouts; what no action reads is written as zeros."""
     layers: dict[str, dict[int, Tensor]] = defaultdict(dict)
-    theirs: dict[str, Tensor] = {}
+    released: dict[str, Tensor] = {}
 
     def put(path: str, layer: int | None, tensor: Tensor) -> None:
         if layer is None:
-            theirs[path] = tensor.contiguous()
+            released[path] = tensor.contiguous()
         else:
             layers[path][layer] = tensor
 
-    example = next(iter(ours.values()))
+    example = next(iter(target.values()))
     for name, pieces in table.items():
-        parts = ours[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [ours[name]]
+        parts = target[name].split([p.rows() for p in pieces]) if len(pieces) > 1 else [target[name]]
         for piece, part in zip(pieces, parts, strict=True):
-            put(piece.path, piece.layer, piece.to_theirs(part))
+            put(piece.path, piece.layer, piece.to_source(part))
     for gap in unread:
         put(gap.path, gap.layer, example.new_zeros(gap.shape))
     for path, by_layer in layers.items():
-        theirs[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
-    theirs |= {constant.path: constant.make() for constant in derived}
-    return theirs
+        released[path] = torch.stack([by_layer[i] for i in sorted(by_layer)])
+    released |= {constant.path: constant.make() for constant in derived}
+    return released
 
 
 @dataclass(frozen=True)
@@ -168,48 +168,48 @@ class Adapter:
         """Foreign names without which the policy cannot be filled."""
         return {piece.path for pieces in self.table.values() for piece in pieces}
 
-    def export(self, ours: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Write our tensors in the foreign names and layouts, the three lists included.
 
         Raises:
             UserError: the policy has tensors that this format has no name for.
         """
-        homeless = sorted(set(ours) - set(self.table))
+        homeless = sorted(set(target) - set(self.table))
         if homeless:
             raise UserError(
                 f"{len(homeless)} tensors have no name in this format: {', '.join(homeless)}. It holds memoryless "
                 "policies without adapters: convert another policy, merge the adapters first, or choose another format."
             )
-        theirs = write(self.table, self.unread, ours, self.derived)
-        return theirs | {name: theirs[original] for name, original in self.tied.items()}
+        released = write(self.table, self.unread, target, self.derived)
+        return released | {name: released[original] for name, original in self.tied.items()}
 
-    def shapes(self, ours: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
-        """Every foreign name but the derived ones, with its shape, where ours have the shapes of `ours`."""
-        on_meta = {name: torch.empty_like(ours[name], device="meta") for name in self.table}
-        theirs = write(self.table, self.unread, on_meta)
-        theirs |= {name: theirs[original] for name, original in self.tied.items()}
-        return {name: tuple(tensor.shape) for name, tensor in theirs.items()}
+    def shapes(self, target: Mapping[str, Tensor]) -> dict[str, tuple[int, ...]]:
+        """Every foreign name but the derived ones, with its shape, where ours have the shapes of `target`."""
+        on_meta = {name: torch.empty_like(target[name], device="meta") for name in self.table}
+        released = write(self.table, self.unread, on_meta)
+        released |= {name: released[original] for name, original in self.tied.items()}
+        return {name: tuple(tensor.shape) for name, tensor in released.items()}
 
-    def translate(self, theirs: Mapping[str, Tensor], ours: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-        """Read foreign tensors into our names; `ours` gives the shapes they must have.
+    def translate(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+        """Read foreign tensors into our names; `target` gives the shapes they must have.
 
         Raises:
             UserError: lists every foreign tensor that is missing, left over or misshapen; or a constant is another.
         """
-        self.check_fit(theirs, ours, source)
-        check(self.derived, theirs)
+        self.check_fit(released, target, source)
+        check(self.derived, released)
         derived = {constant.path for constant in self.derived}
-        return read(self.table, {name: tensor for name, tensor in theirs.items() if name not in derived})
+        return read(self.table, {name: tensor for name, tensor in released.items() if name not in derived})
 
-    def check_fit(self, theirs: Mapping[str, Tensor], ours: Mapping[str, Tensor], source: str) -> None:
+    def check_fit(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> None:
         """Compare names and shapes alone, so that foreign tensors may still be on meta: not read yet.
 
         Raises:
             UserError: as `translate`.
         """
-        shapes, derived = self.shapes(ours), {constant.path for constant in self.derived}
-        found = {name: tensor for name, tensor in theirs.items() if name not in derived}
-        check_fit(found, shapes, source, optional=set(shapes) - self.needed())
+        shapes, derived = self.shapes(target), {constant.path for constant in self.derived}
+        tensors = {name: tensor for name, tensor in released.items() if name not in derived}
+        check_fit(tensors, shapes, source, optional=set(shapes) - self.needed())
 
 
 def pi05_of(policy: Policy) -> Pi05Backbone:
@@ -229,4 +229,4 @@ def pi05_of(policy: Policy) -> Pi05Backbone:
 
 def memory_parameters(policy: Policy) -> set[str]:
     """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the memory's own expert."""
-    return {name for name in policy.state_dict() if policy.part_of(name) == "memory"}
+    return {name for name in policy.state_dict() if policy.component_of(name) == "memory"}

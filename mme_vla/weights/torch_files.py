@@ -25,19 +25,19 @@ def read_torch_file(path: Path) -> dict[str, Tensor]:
         UserError: the file is damaged, holds more than tensors and plain values, or no table of tensors.
     """
     try:
-        found = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
         raise UserError(
             f"{path} cannot be read as weights alone ({brief(str(error).splitlines()[0], 200, quote=False)}): it is "
             "damaged, or holds objects, which are code and are not run."
         ) from error
     for key in MODEL:
-        if isinstance(found, dict) and isinstance(found.get(key), dict):
-            found = found[key]
+        if isinstance(content, dict) and isinstance(content.get(key), dict):
+            content = content[key]
             break
-    if isinstance(found, dict) and found and all(isinstance(part, dict) for part in found.values()):
-        found = {f"{part}.{name}": tensor for part, own in found.items() for name, tensor in own.items()}
-    if not isinstance(found, dict) or not found or not all(isinstance(value, Tensor) for value in found.values()):
-        held = listed(found) if isinstance(found, dict) else type(found).__name__
-        raise UserError(f"{path} holds no table of tensors, but {held}.")
-    return {str(name): tensor for name, tensor in found.items()}
+    if isinstance(content, dict) and content and all(isinstance(part, dict) for part in content.values()):
+        content = {f"{part}.{name}": tensor for part, tensors in content.items() for name, tensor in tensors.items()}
+    if not isinstance(content, dict) or not content or not all(isinstance(value, Tensor) for value in content.values()):
+        description = listed(content) if isinstance(content, dict) else type(content).__name__
+        raise UserError(f"{path} holds no table of tensors, but {description}.")
+    return {str(name): tensor for name, tensor in content.items()}

@@ -20,7 +20,7 @@ from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
 from mme_vla.processing.base import DEFAULT
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.processing.processor import STATS_FILE, Processor
-from mme_vla.processing.prompt import PROMPTS, Plain
+from mme_vla.processing.prompt import PROMPTS, GoalPrompt
 from mme_vla.processing.tokenizer import HUB
 from mme_vla.registry import PROCESSORS
 from mme_vla.weights.names.torch_backbone import EMBEDDING
@@ -46,7 +46,10 @@ def write_pipelines(policy: MMEPolicy, folder: Path, about: dict[str, Any], stat
     tokenizer = str(words.get("tokenizer", ""))
     if stats is None:
         return "there are no normalisation statistics"
-    if PROCESSORS[words.get("name", DEFAULT)] is not Processor or PROMPTS[words.get("prompt", "plain")] is not Plain:
+    if (
+        PROCESSORS[words.get("name", DEFAULT)] is not Processor
+        or PROMPTS[words.get("prompt", "plain")] is not GoalPrompt
+    ):
         return "LeRobot has no step that writes this policy's prompt"
     if not tokenizer.startswith(HUB):
         return f"its tokenizer ({brief(tokenizer)}) is none that LeRobot could fetch from the hub"
@@ -123,7 +126,7 @@ def check_target(policy: Policy, fmt: str) -> None:
         _OF_ONE_METHOD[fmt](policy)
 
 
-def write_ours(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
+def write_native(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """`save_pretrained`; the processor carries the statistics."""
     policy.save_pretrained(folder, dtype=_name(dtype))
 
@@ -180,7 +183,7 @@ def write_openpi(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormSt
 def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
     """A run with one step, 0, as the released JAX code lays it out."""
     policy = mme_of(policy, "The released layout")
-    names = {ours: theirs for theirs, ours in VARIANTS.items()}
+    names = {target: released for released, target in VARIANTS.items()}
     variant = names.get(str(policy.config.get("name")))
     if policy.memory is not None and variant is not None:
         (folder / "history_config.txt").write_text(f"{variant}.yaml\n")
@@ -189,7 +192,7 @@ def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: Norm
 
 
 WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]] = {
-    "ours": write_ours,
+    "ours": write_native,
     "lerobot": write_lerobot,
     "openpi": write_openpi,
     "released": write_released,
@@ -204,12 +207,12 @@ def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch
     """Write one file, as those libraries read it; a tensor under two names is written twice."""
     from safetensors.torch import save_file
 
-    seen: set[int] = set()
+    storages: set[int] = set()
     apart = {}
     for name, tensor in tensors.items():
         tensor = cast(tensor.detach(), dtype).cpu()
-        apart[name] = tensor.clone() if tensor.data_ptr() in seen else tensor
-        seen.add(tensor.data_ptr())
+        apart[name] = tensor.clone() if tensor.data_ptr() in storages else tensor
+        storages.add(tensor.data_ptr())
     save_file(apart, folder / WEIGHTS, metadata={"format": "pt"})
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_motions, known_poses, row_of
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
-from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.render_request import RenderRequest
 from mme_vla.errors import UserError
 from mme_vla.registry import MEMORIES
 
@@ -51,43 +51,43 @@ class FrameChoice:
         if self.memory is not None:
             _build(self.memory)
 
-    def beforehand(self) -> Drawing | None:
+    def beforehand(self) -> RenderRequest | None:
         """What is drawn, where no demonstration has to be seen for it: numbers that no memory adds to; else None."""
         if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
             return None
         numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
-        return Drawing(dict.fromkeys(CAMERAS, numbers), now=())
+        return RenderRequest(dict.fromkeys(CAMERAS, numbers), now=())
 
-    def drawing(self, steps: Sequence["RecordedStep"]) -> Drawing:
+    def render_request(self, steps: Sequence["RecordedStep"]) -> RenderRequest:
         """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
         video = _video(steps)
-        shown = self._shown(steps, video)
-        frames = {camera: frozenset(shown) for camera in CAMERAS}
+        numbers = self._frame_numbers(steps, video)
+        frames = {camera: frozenset(numbers) for camera in CAMERAS}
         if self.memory is not None:
-            read = self.read(np.array(shown, np.int64), video)
-            for camera in CAMERAS if _build(self.memory).looks_back is not None else (MEMORY_CAMERA,):
+            read = self.read(np.array(numbers, np.int64), video)
+            for camera in CAMERAS if _build(self.memory).past_view_spec is not None else (MEMORY_CAMERA,):
                 frames[camera] |= read
-        return Drawing(frames, now=())
+        return RenderRequest(frames, now=())
 
-    def read(self, shown: np.ndarray, exec_start: int) -> frozenset[int]:
+    def read(self, frames: np.ndarray, exec_start: int) -> frozenset[int]:
         """What the memory may read when it is asked at these frames [n], the execution beginning at `exec_start`."""
         if self.memory is None:
             return frozenset()
-        return frozenset(_build(self.memory).frames_read(shown, exec_start).tolist())
+        return frozenset(_build(self.memory).frames_read(frames, exec_start).tolist())
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, fit for JSON."""
         return {"at": self.at if isinstance(self.at, str | int) else list(self.at), "memory": self.memory}
 
-    def _shown(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
+    def _frame_numbers(self, steps: Sequence["RecordedStep"], video: int) -> list[int]:
         if isinstance(self.at, int):
             return list(range(video, len(steps), self.at))
         if self.at == DECISIONS:
-            found: list[int] = motions_of(steps).decisions[:: self.every].tolist()
-            return found
+            decisions: list[int] = motions_of(steps).decisions[:: self.every].tolist()
+            return decisions
         if self.at == CHOICES:
-            chosen: list[int] = choices_of(steps).decisions.tolist()
-            return chosen
+            choices: list[int] = choices_of(steps).decisions.tolist()
+            return choices
         return [k for span in spans(self.at, "frames", GRAMMAR) for k in span if k < len(steps)]
 
 

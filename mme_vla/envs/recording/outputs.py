@@ -117,22 +117,22 @@ class Job:
     @property
     def plan(self) -> dict[str, Any]:
         """What decides the result; plans from before frames could be chosen do not speak of them."""
-        plan = asdict(self) | {"frames": self.drawn_at}
+        plan = asdict(self) | {"frames": self.frame_selection}
         return plan if self.frames is not None else {k: v for k, v in plan.items() if k != "frames"}
 
     @property
-    def drawn_at(self) -> dict[str, Any] | None:
+    def frame_selection(self) -> dict[str, Any] | None:
         """The choice of frames in plain values."""
         return None if self.frames is None else self.frames.to_dict()
 
     def made(self, seed: int | None, difficulty: str | None, frames: Any) -> bool:
         """Whether an episode of this seed and difficulty, drawn at these frames, can be what this job records."""
         right = seed is not None and self.seed <= seed < self.seed + self.retries
-        return right and difficulty == self.difficulty and frames == self.drawn_at
+        return right and difficulty == self.difficulty and frames == self.frame_selection
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RecordingPlan:
     """The results of a recording.
 
     jobs: its episodes. dataset: folder of the LeRobot dataset, if one is wanted. hdf5: folder of the official files,
@@ -213,12 +213,12 @@ class Wanted:
         if not (self.dataset / SIDE_FILE).is_file():
             return False
         side = read_json(self.dataset / SIDE_FILE, "the facts of a recorded dataset")
-        found = side.get("episodes", [])
+        entries = side.get("episodes", [])
         return (
             side.get("plan", {}).get("options") == planned_options(options)
-            and [(e.get("task"), e.get("source_episode")) for e in found] == [(j.task, j.episode) for j in self.jobs]
+            and [(e.get("task"), e.get("source_episode")) for e in entries] == [(j.task, j.episode) for j in self.jobs]
             and all(
                 job.made(e.get("seed"), e.get("difficulty"), e.get("frames"))
-                for job, e in zip(self.jobs, found, strict=True)
+                for job, e in zip(self.jobs, entries, strict=True)
             )
         )

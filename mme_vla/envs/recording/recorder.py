@@ -10,7 +10,7 @@ import numpy as np
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.envs.grounding import Grounding, project
 from mme_vla.envs.observations import AngleTrack, Include, Observer
-from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.render_request import RenderRequest
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.robot.gripper_skills import DOWNWARD_Q
 from mme_vla.envs.robot.stick_skills import Demonstrator
@@ -122,12 +122,12 @@ class Recorder:
         task: "Task",
         render: bool = True,
         on_step: Callable[[RecordedStep], None] | None = None,
-        drawing: Drawing | None = None,
+        render_request: RenderRequest | None = None,
     ) -> None:
-        self._task, self._render, self._on_step, self._drawing = task, render, on_step, drawing
-        pictures = {"include_front_depth": render, "include_wrist_depth": render}
+        self._task, self._render, self._on_step, self._render_request = task, render, on_step, render_request
+        depth = {"include_front_depth": render, "include_wrist_depth": render}
         poses = {"include_front_camera_extrinsic": True, "include_wrist_camera_extrinsic": True}
-        self._observer = Observer(task, Include.from_options(pictures | poses), render)
+        self._observer = Observer(task, Include.from_options(depth | poses), render)
 
     def record(self) -> Recording:
         """Reset the task and demonstrate it once."""
@@ -141,7 +141,7 @@ class Recorder:
         self._waypoint: np.ndarray | None = None
         self._in_video: bool | None = None
         self._last_stored: str | int | None = None
-        self._shown = task.progress.shown
+        self._displayed = task.progress.displayed
         self._result = Recording(success=False, steps=0)
         self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
         task.observe = self._observe
@@ -174,12 +174,12 @@ class Recorder:
         self._observer.follow()
         progress = self._task.progress
         # The text was set before the evaluation moved the pointer: it follows one step later.
-        shown, self._shown = self._shown, progress.shown
+        displayed, self._displayed = self._displayed, progress.displayed
         planned = progress.demonstrated
         self._enter_phase()
         if planned.text == NO_RECORD:
             return
-        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, shown))
+        step = RecordedStep(self._observation(evaluated), self._actions(planned), self._texts(planned, displayed))
         self._result.stored += 1
         self._result.video += planned.video
         if self._on_step is None:
@@ -195,8 +195,8 @@ class Recorder:
         self._in_video = video
 
     def _observation(self, evaluated: dict[str, Any]) -> dict[str, Any]:
-        number, drawing = self._result.stored, self._drawing
-        cameras = CAMERAS if drawing is None else drawing.cameras(number, newest=False)
+        number, request = self._result.stored, self._render_request
+        cameras = CAMERAS if request is None else request.cameras(number, newest=False)
         frame = self._observer.frame(evaluated, cameras)
         frame = {name: value for name, value in frame.items() if value is not None}
         closed = self._task.stick or bool((frame["gripper_state"] < GRIPPER_CLOSED).any())
@@ -210,25 +210,25 @@ class Recorder:
         if self._roll_shift is None:  # a gripper begins straight down, which the official files have at +pi
             self._roll_shift = 2 * np.pi if abs(angles[0] + np.pi) < AT_REST else 0.0
         angles[0] += self._roll_shift
-        shown = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
+        pixel = list(project(planned.targets[0].position)) if planned.choice and planned.targets else []
         return {
             "joint_action": np.append(action[:ARM_JOINTS], gripper),
             "eef_action": np.concatenate([pose.p, angles, [gripper]]).astype(np.float64),
             "waypoint_action": np.full(len(POSE) + 1, np.nan, np.float32) if self._waypoint is None else self._waypoint,
-            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in shown]}),
+            "choice_action": json.dumps({"choice": planned.choice.upper(), "point": [round(float(v)) for v in pixel]}),
         }
 
-    def _texts(self, planned: "SubTask", shown: "SubTask") -> dict[str, Any]:
+    def _texts(self, planned: "SubTask", displayed: "SubTask") -> dict[str, Any]:
         progress = self._task.progress
         completed = progress.succeeded
-        look = self._observer.segmentation if self._render else None
+        segmentation = self._observer.segmentation if self._render else None
         now = "completed" if completed else progress.planned
         boundary, self._last_stored = now != self._last_stored, now
         return {
             "simple_subgoal": COMPLETED if completed else planned.text,
-            "grounded_subgoal": self._planned.update(planned, look),
-            "simple_subgoal_online": shown.text,
-            "grounded_subgoal_online": self._online.update(shown, look),
+            "grounded_subgoal": self._planned.update(planned, segmentation),
+            "simple_subgoal_online": displayed.text,
+            "grounded_subgoal_online": self._online.update(displayed, segmentation),
             "is_video_demo": planned.video,
             "is_subgoal_boundary": boundary,
             "is_completed": completed,

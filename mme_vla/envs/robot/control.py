@@ -145,18 +145,20 @@ class RobotControl:
             if plan is not None and len(plan) <= LONG_DETOUR:
                 break
         if plan is None:
-            place, turn = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
-            raise PlanningError(f"No way to {place}, orientation {turn} (wxyz): out of the arm's reach or blocked.")
+            place, orientation = ([round(float(x), 4) for x in part] for part in (pose.p, pose.q))
+            raise PlanningError(
+                f"No way to {place}, orientation {orientation} (wxyz): out of the arm's reach or blocked."
+            )
         return plan
 
     def _move_gripper(self, command: float) -> None:
         if self.env.stick:
             return
         self.gripper = command
-        held = self.env.qpos
+        qpos = self.env.qpos
         for done in range(1, GRIPPER_STEPS + 1):
             self.left = GRIPPER_STEPS - done
-            self._command(held)
+            self._command(qpos)
 
     def _command(self, joints: np.ndarray) -> None:
         arm = np.asarray(joints, np.float64)[:ARM_JOINTS]

@@ -164,9 +164,9 @@ class GripperPrimitives(RobotControl):
         if mode is not None:
             self._fail_grasp(thing, above, depth, failing_offset(mode, miss, self.env.seed))
         grasp = self._grasp_pose(thing, depth)
-        rest = thing.position[2]
+        initial_height = thing.position[2]
         self._grasp_at(grasp, thing, above)
-        if self.env.second_tries and thing.position[2] - rest < LIFTED:
+        if self.env.second_tries and thing.position[2] - initial_height < LIFTED:
             # A finger was in something's way: once more, across the other sides.
             self.open()
             grasp = self._grasp_pose(thing, depth)

@@ -102,8 +102,8 @@ class Arm:
         return full
 
     def _wrapped(self, arm: np.ndarray) -> np.ndarray:
-        turns = np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
-        return arm - 2 * np.pi * turns
+        revolutions = np.floor((arm - self.lower + LIMIT_TOLERANCE) / (2 * np.pi))
+        return arm - 2 * np.pi * revolutions
 
 
 def pose_distance(a: sapien.Pose, b: sapien.Pose) -> float:

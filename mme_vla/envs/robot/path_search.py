@@ -72,14 +72,14 @@ def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.
 
 def _shortened(path: list[np.ndarray], obstacles: Obstacles) -> list[np.ndarray]:
     """Leave out what a straight line can skip, then space the rest evenly, so that a spline stays near it."""
-    kept, i = [path[0]], 0
+    points, i = [path[0]], 0
     while i < len(path) - 1:
         free = (j for j in range(len(path) - 1, i + 1, -1) if obstacles.clear_between(path[i], path[j]))
         j = next(free, i + 1)
         steps = int(np.ceil(np.linalg.norm(path[j] - path[i]) / REACH))
-        kept += [path[i] + (path[j] - path[i]) * k / steps for k in range(1, steps)] + [path[j]]
+        points += [path[i] + (path[j] - path[i]) * k / steps for k in range(1, steps)] + [path[j]]
         i = j
-    return kept
+    return points
 
 
 class _Tree:

@@ -19,7 +19,7 @@ ABOVE_PEG, ABOVE_DRAG, PEG_DRAGGED, PEG_ON_TABLE = 0.2, 0.12, 0.04, 0.015
 """Heights of the tool over a peg, likewise before it drags one, while it does, and where it lets one go, metres."""
 TIP = 0.012
 """From the middle of a peg's end to where it is taken to be dragged, metres."""
-INSERT_FAR, INSERT_NEAR, INSERT_PAST, INSERT_RAISED = 0.2, 0.15, 0.05, 0.15
+INSERT_START, INSERT_NEAR, INSERT_PAST, INSERT_RAISED = 0.2, 0.15, 0.05, 0.15
 """Stations of an insertion, along the hole from where the end is in the box's middle, and the first one's height."""
 
 
@@ -62,23 +62,23 @@ class PegPrimitives(RobotControl):
         self.announce(end, OPEN)
         self.open()
 
-    def grasp_peg(self, peg: Peg, end: Thing | PegEnd, turn: bool = False) -> None:
+    def grasp_peg(self, peg: Peg, end: Thing | PegEnd, flip: bool = False) -> None:
         """Grasp a peg by one of its ends and lift it.
 
         Args:
             peg: the peg.
             end: `peg.head` or `peg.tail`, or its name.
-            turn: hold the hand the other way round.
+            flip: hold the hand the other way round.
         """
         self.open()
-        grasp = _peg_grasp(getattr(peg, end) if isinstance(end, str) else end, turn)
+        grasp = _peg_grasp(getattr(peg, end) if isinstance(end, str) else end, flip)
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), OPEN)
         self.move_to(grasp, CLOSE)
         self.close()
         self.move_to(self.at([*grasp.p[:2], ABOVE_PEG], grasp.q), CLOSE)
         self.close()
 
-    def insert_peg(self, peg: Peg, held: Thing | PegEnd, side: int, box: Thing) -> None:
+    def insert_peg(self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing) -> None:
         """Put the free end of a held peg into the hole of a box, as the benchmark's demonstrator does.
 
         Held by its tail and inserted from the right, the peg stops short of the hole, now and then too short;
@@ -86,42 +86,44 @@ class PegPrimitives(RobotControl):
 
         Args:
             peg: the peg.
-            held: the end that is held; the other one goes in.
+            grasped_end: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
         """
-        head_first = held in ("tail", peg.tail)
+        head_first = grasped_end in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
         outward = -1 if head_first else 1
-        turn = head_first != (side > 0)
+        flip = head_first != (side > 0)
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
             # The peg may slip: how it is held is looked at before every motion.
             grip = free.pose.inv() * self.env.tcp_pose
             inserted = box.pose * grip
-            if turn:
+            if flip:
                 # The tool is turned where it is, which puts the peg's other end into the box ...
                 inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
                 # ... and only in this case is that made up for.
                 along += grip.p[0] if head_first and along < 0 else 0.0
             return inserted * sapien.Pose([along, 0, -raised])
 
-        self.move_to(station(outward * INSERT_FAR, INSERT_RAISED), CLOSE)
-        self.move_to(station(outward * INSERT_FAR), CLOSE)
+        self.move_to(station(outward * INSERT_START, INSERT_RAISED), CLOSE)
+        self.move_to(station(outward * INSERT_START), CLOSE)
         self.move_to(station(outward * INSERT_NEAR))
         self.move_to(station(-INSERT_PAST), CLOSE)
 
-    def insert_peg_fully(self, peg: Peg, held: Thing | PegEnd, side: int, box: Thing, begun: bool = False) -> None:
+    def insert_peg_fully(
+        self, peg: Peg, grasped_end: Thing | PegEnd, side: int, box: Thing, begun: bool = False
+    ) -> None:
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
             peg: the peg.
-            held: the end that is held; the other one goes in.
+            grasped_end: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
             begun: the peg is in the hole already, and only has to go on.
         """
-        head_first = held in ("tail", peg.tail)
+        head_first = grasped_end in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
         hole = box.pose if head_first == (side > 0) else sapien.Pose(box.pose.p, turned(box.pose.q, "z", np.pi))
         outward = -1 if head_first else 1
@@ -130,15 +132,15 @@ class PegPrimitives(RobotControl):
             return hole * sapien.Pose([outward * along, 0, raised]) * free.pose.inv() * self.env.tcp_pose
 
         if not begun:
-            self.move_to(station(INSERT_FAR, INSERT_RAISED), CLOSE)
-            for distance in (INSERT_FAR, INSERT_NEAR, INSERT_NEAR):
+            self.move_to(station(INSERT_START, INSERT_RAISED), CLOSE)
+            for distance in (INSERT_START, INSERT_NEAR, INSERT_NEAR):
                 self.move_to(station(distance), CLOSE)
         self.move_to(station(0.0), CLOSE)
 
-    def drag_peg(self, peg: Peg, end: PegEnd, way: np.ndarray, turn: bool = False) -> None:
+    def drag_peg(self, peg: Peg, end: PegEnd, way: np.ndarray, flip: bool = False) -> None:
         """Take a peg by one tip and draw it over the table, hardly lifted, along `way` [2] in metres."""
         self.open()
-        grasp = _peg_grasp(getattr(peg, end), turn, outward=TIP if end == "head" else -TIP)
+        grasp = _peg_grasp(getattr(peg, end), flip, outward=TIP if end == "head" else -TIP)
         self.move_to(self.at([*grasp.p[:2], ABOVE_DRAG], grasp.q), OPEN)
         self.move_to(grasp, CLOSE)
         self.close()
@@ -159,11 +161,11 @@ class PegPrimitives(RobotControl):
         self.move_to(self.at([*self.env.tcp_pose.p[:2], ABOVE_PEG]))
 
 
-def _peg_grasp(end: Thing, turn: bool, outward: float = 0.0) -> sapien.Pose:
+def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
     """The tool's pose around one end of a peg, moved along the peg by `outward` metres."""
     q = turned(end.pose.q, "x", np.pi)
     along = end.pose.to_transformation_matrix()[:3, 0]
-    return sapien.Pose(end.position + outward * along, turned(q, "z", np.pi) if turn else q)
+    return sapien.Pose(end.position + outward * along, turned(q, "z", np.pi) if flip else q)
 
 
 def _direction(cube: Thing, goal: Thing) -> np.ndarray:

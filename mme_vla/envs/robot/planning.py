@@ -23,7 +23,7 @@ MOST_STEPS = 200
 """Steps after which a screw motion is given up: at the edge of its reach the arm would swing for ever."""
 _STALLED = 1e-4
 _NO_ROTATION = 3e-5
-_HALF_TURN = 1e-5
+_PI_TOLERANCE = 1e-5
 # The trace of a rotation matrix within these of 3 and of -1: the angle is then below 0.0055, or within 0.0032 of pi.
 
 logging.getLogger("toppra").setLevel(logging.ERROR)
@@ -69,14 +69,14 @@ def plan_screw(
         if length == 0:
             return None
         step *= JOINT_STEP / length
-        moved = jacobian @ step
-        overshoot = np.linalg.norm(moved) / max(np.linalg.norm(remaining), np.finfo(float).tiny)
+        motion = jacobian @ step
+        overshoot = np.linalg.norm(motion) / max(np.linalg.norm(remaining), np.finfo(float).tiny)
         arrived = bool(overshoot > 1)
         if arrived:
-            step, moved = step / overshoot, moved / overshoot
+            step, motion = step / overshoot, motion / overshoot
         joints = joints + step
-        remaining = remaining - moved
-        if np.linalg.norm(moved) < _STALLED or not arm.within_limits(joints):
+        remaining = remaining - motion
+        if np.linalg.norm(motion) < _STALLED or not arm.within_limits(joints):
             return None
         path.append(joints)
         if len(path) > MOST_STEPS:
@@ -147,7 +147,7 @@ def twist_of(transform: np.ndarray) -> np.ndarray | None:
     trace = np.trace(rotation)
     if abs(trace - 3) <= _NO_ROTATION:
         return np.concatenate([translation, np.zeros(3)])
-    if abs(trace + 1) <= _HALF_TURN:
+    if abs(trace + 1) <= _PI_TOLERANCE:
         return None
     angle = np.arccos((trace - 1) / 2)
     axis = np.array(

@@ -14,7 +14,7 @@ STICK_Z = 0.07
 """Height of the tip while it moves from target to target, metres."""
 ARC_OFFSET = 0.2
 """How far the control point of an arc lies beside the middle of its chord, metres."""
-ARC_SAMPLES, ARC_REST = 45, 5
+ARC_SAMPLES, ARC_HOLD = 45, 5
 
 
 class StickPrimitives(RobotControl):
@@ -49,7 +49,7 @@ class StickPrimitives(RobotControl):
             targets.append(solution)
             joints = solution
         middle = len(poses) // 2
-        targets += [targets[-1]] * ARC_REST
+        targets += [targets[-1]] * ARC_HOLD
         self._half(poses[middle], targets[:middle])
         self._half(poses[-1], targets[middle:])
 

@@ -161,16 +161,16 @@ class Mark:
     def __init__(self, disc: Thing, place: np.ndarray, steps: int) -> None:
         self._disc, self._place, self._steps = disc, place - [0, 0, Highlight.DEPTH], steps
         self._until = -1
-        self._shown = False
+        self._visible = False
         self._move(BELOW_TABLE)
 
     def update(self, k: int, touched: bool) -> None:
         """Show or hide the disc after step `k`."""
         if touched:
             self._until = k + self._steps
-        if (k <= self._until) != self._shown:
-            self._shown = not self._shown
-            self._move(self._place if self._shown else BELOW_TABLE)
+        if (k <= self._until) != self._visible:
+            self._visible = not self._visible
+            self._move(self._place if self._visible else BELOW_TABLE)
 
     def _move(self, place: Sequence[float] | np.ndarray) -> None:
         self._disc.move_to(sapien.Pose(place, self._disc.pose.q))

@@ -166,10 +166,10 @@ def draw_cube(
     obstacles = _obstacles([thing for thing in avoid if not isinstance(thing, Disc)], grow=0.0)
     for _ in range(TRIALS):
         xy = region.place(draws, half)
-        turn = 2 * np.pi * draws.uniform() if yaw else 0.0
-        cube = Box2D.square(xy, half + gap, turn)
+        angle = 2 * np.pi * draws.uniform() if yaw else 0.0
+        cube = Box2D.square(xy, half + gap, angle)
         if not any(cube.intersects(obstacle) for obstacle in obstacles):
-            return xy, turn
+            return xy, angle
     return None
 
 
@@ -272,6 +272,6 @@ def shifted_anchors(draws: Draws, count: int) -> list[Point]:
     return square if count == len(square) else line if on_line else triangle
 
 
-def swaps_in_turn(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
+def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
     """One swap after another, the first at step `start`; each initiator's partner is who is nearest then."""
     return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]

@@ -88,13 +88,13 @@ class Stage(BaseEnv):
         self.__dict__.update(scene=None, agent=None, _sensors={}, _human_render_cameras={}, _hidden_objects=[])
 
     def _setup_sensors(self, options: dict) -> None:
-        asked = self._custom_sensor_configs
+        configs = self._custom_sensor_configs
         lit_by_lamps = self.scene.sub_scenes[0].render_system.cubemap is None
-        if not asked and lit_by_lamps and self._render_device.is_cpu():
+        if not configs and lit_by_lamps and self._render_device.is_cpu():
             lean = lean_shaders()
             self._custom_sensor_configs = {} if lean is None else {"shader_config": lean}
         super()._setup_sensors(options)
-        self._custom_sensor_configs = asked
+        self._custom_sensor_configs = configs
 
     def set_up(self) -> None:
         """Put up the table, with nothing on it."""

@@ -60,11 +60,11 @@ class Thing:
         """Draw the object, or leave it out, as its height says: due where its pose was set from outside."""
         self._draw(bool(self.position[2] > UNDER_THE_FLOOR))
 
-    def _draw(self, drawn: bool) -> None:
+    def _draw(self, visible: bool) -> None:
         """Leave out of the pictures what the floor hides anyway: dozens of marks cost a third of the rendering."""
         body = self.entity._objs[0].find_component_by_type(RenderBodyComponent) if self._may_sink else None
-        if body is not None and bool(body.visibility) != drawn:
-            body.visibility = float(drawn)
+        if body is not None and bool(body.visibility) != visible:
+            body.visibility = float(visible)
 
     def displace(self, pose: sapien.Pose) -> None:
         """Teleport the object in the midst of its motion: it keeps its velocity."""

@@ -36,7 +36,7 @@ class BinFill(Task):
     shared_draws = True
     spectator = ((1, 0, 0.4), (0, 0, 0.4))
     latch_failure = True
-    recovery_drawn_per_episode = True
+    recovery_sampled_per_episode = True
 
     def build(self, draws: Draws) -> None:
         self.streaming = draws.integer(0, 2) == 0
@@ -44,10 +44,10 @@ class BinFill(Task):
         x, y = -0.05 + 0.2 * draws.uniform(), -0.2 + 0.4 * draws.uniform()
         self.board = self.add(build_board(self, (x, y), math.radians(-20 + 40 * draws.uniform())))
         self._draw_counts(draws)
-        wanted = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
+        colours = [colour for colour in COLOURS for _ in range(self.spawned[colour])]
         self.cubes: dict[str, list[Cube]] = {colour: [] for colour in COLOURS}
-        for i in draws.permutation(len(wanted)):
-            colour = wanted[i]
+        for i in draws.permutation(len(colours)):
+            colour = colours[i]
             place = draw_cube(draws, TABLE, [self.button, self.board, *self.all_cubes()], gap=H)
             if place is not None:
                 cubes = self.cubes[colour]
@@ -60,11 +60,11 @@ class BinFill(Task):
         """How many cubes of each colour belong into the bin, and how many lie on the table."""
         available = [COLOURS[i] for i in draws.permutation(3)][: AVAILABLE[self.difficulty]]
         low, high = GOAL_COLOURS[self.difficulty]
-        chosen = available[: draws.integer(low, high + 1)]
+        selected = available[: draws.integer(low, high + 1)]
         low, high = GOAL_CUBES[self.difficulty]
         total = draws.integer(low, high + 1)
-        picks = [0] * total if len(chosen) == 1 else [draws.integer(0, len(chosen)) for _ in range(total)]
-        self.goal = Counter(chosen[i] for i in picks)
+        picks = [0] * total if len(selected) == 1 else [draws.integer(0, len(selected)) for _ in range(total)]
+        self.goal = Counter(selected[i] for i in picks)
         low, high = CUBES[self.difficulty]
         cubes = draws.integer(low, high + 1)
         self.spawned = Counter({colour: max(1, self.goal[colour]) for colour in available})

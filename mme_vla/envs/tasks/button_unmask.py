@@ -46,9 +46,9 @@ class ButtonUnmask(Task):
 
     def draw_failed_pick(self, draws: Draws, picks: int) -> int | None:
         # Here alone the stream is one of its own, in which a number without effect comes first.
-        own = Draws(self.seed)
-        own.integer(1, 6)
-        return own.integer(0, picks)
+        local_draws = Draws(self.seed)
+        local_draws.integer(1, 6)
+        return local_draws.integer(0, picks)
 
     def subtasks(self) -> list[SubTask]:
         press = SubTask(
@@ -59,8 +59,8 @@ class ButtonUnmask(Task):
             targets=[self.button],
             choice="a",
         )
-        wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
-        return [press, *container_picks(self, wanted, self.containers, LETTERS)]
+        targets = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
+        return [press, *container_picks(self, targets, self.containers, LETTERS)]
 
     def choices(self) -> list[Choice]:
         press = Choice("a", "press the button", lambda demo, _: demo.press(self.button))

@@ -30,7 +30,7 @@ class ButtonUnmaskSwap(UnmaskSwap):
 
     def subtasks(self) -> list[SubTask]:
         presses = [self._press("first", self.right, "a"), self._press("second", self.left, "b")]
-        return [*presses, *container_picks(self, self.wanted, self.containers, LETTERS)]
+        return [*presses, *container_picks(self, self.targets, self.containers, LETTERS)]
 
     def _press(self, which: str, button: Button, choice: str) -> SubTask:
         """Press the button that is shown, or the other one if it has not been pressed yet."""
@@ -57,4 +57,4 @@ class ButtonUnmaskSwap(UnmaskSwap):
         ]
 
     def goals(self) -> list[str]:
-        return [f"first press both buttons on the table, then {hiding_goal([colour for colour, _ in self.wanted])}"]
+        return [f"first press both buttons on the table, then {hiding_goal([colour for colour, _ in self.targets])}"]

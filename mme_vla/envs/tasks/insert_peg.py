@@ -34,7 +34,7 @@ TRIES = 256
 ENDS: tuple[PegEnd, PegEnd] = ("head", "tail")
 LIFTED_Z = 0.1
 INSERTED = 0.05
-SHOWN_STEPS = 20  # how long the box shows an insertion
+DISPLAY_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
 """How far from the box and from other pegs the hand has room around a peg, metres."""
@@ -76,7 +76,7 @@ class InsertPeg(Task):
         self.side = (-1, 1)[draws.integer(0, 2)]
         below = self.box.position - [0, 0, Highlight.DEPTH]
         self._disc.move_to(sapien.Pose(below, self._disc.pose.q))
-        self.mark = Mark(self._red_disc, self.box.position, SHOWN_STEPS)
+        self.mark = Mark(self._red_disc, self.box.position, DISPLAY_STEPS)
         self._helpful, self._restoring = 0, False
 
     def _draw_place(self, draws: Draws, box: tuple[float, float], others: list) -> tuple[float, float]:
@@ -195,7 +195,7 @@ class InsertPeg(Task):
         for drag in plans[self._helpful :]:
             if drag is not None:
                 with suppress(PlanningError):
-                    demo.drag_peg(self.peg, drag[0], self._way_out(), turn=drag[1])
+                    demo.drag_peg(self.peg, drag[0], self._way_out(), flip=drag[1])
             with suppress(PlanningError):  # out of reach, for instance
                 demo.grasp_peg(self.peg, self.end)
             if self._lifted(self.end):
@@ -211,8 +211,8 @@ class InsertPeg(Task):
         others = [peg.position[:2] for peg in self.pegs[1:]]
 
         def is_open(place: np.ndarray) -> bool:
-            near, far = WORKSPACE
-            reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < far
+            near, farthest = WORKSPACE
+            reached = near < np.linalg.norm(place - ROBOT_BASE[:2]) < farthest
             apart = np.linalg.norm(place - self.box.position[:2]) > OPEN_FROM_BOX
             return bool(reached and apart and all(np.linalg.norm(place - other) > OPEN_FROM_PEG for other in others))
 
@@ -232,19 +232,19 @@ class InsertPeg(Task):
             lambda: demo.insert_peg(*task),
             lambda: demo.insert_peg_fully(*task, begun=True),
             lambda: demo.insert_peg_fully(*task),
-            lambda: self._insert_anew(demo, turn=True),
-            lambda: self._insert_anew(demo, turn=False),
+            lambda: self._insert_anew(demo, flip=True),
+            lambda: self._insert_anew(demo, flip=False),
         ]
         for attempt in tries if self.second_tries else tries[:1]:
             if not self._inserted(self.end, self.side):
                 with suppress(PlanningError):
                     attempt()
 
-    def _insert_anew(self, demo: "Demonstrator", turn: bool) -> None:
+    def _insert_anew(self, demo: "Demonstrator", flip: bool) -> None:
         demo.withdraw()
         if any(self.is_grasping(end) for end in self.ends(self.end)):
             demo.lay_down_peg(self._way_out())
-        demo.grasp_peg(self.peg, self.end, turn)
+        demo.grasp_peg(self.peg, self.end, flip)
         if self._lifted(self.end):
             demo.insert_peg_fully(self.peg, self.end, self.side, self.box)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mme_vla.envs.robot.stick_skills import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
-TOLD = {
+MANNER_TEXTS = {
     "hook": "hook the cube with the peg",
     "push": "push the cube with the closed gripper",
     "grasp": "pick up the cube and place it",
@@ -44,15 +44,15 @@ class MoveCube(Task):
     def build(self, draws: Draws) -> None:
         for _ in range(2):
             draws.uniform()  # part of the official stream, without effect
-        shown_peg, peg = self._draw_peg(draws), self._draw_peg(draws)
+        video_peg, peg = self._draw_peg(draws), self._draw_peg(draws)
         for _ in range(2):
             draws.integer(0, 2)
-        shown_goal, goal = (self._draw_goal(draws, half) for half in (0.15, 0.1))
+        video_goal, goal = (self._draw_goal(draws, half) for half in (0.15, 0.1))
         self.peg = self.add(
-            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, shown_peg[:2], shown_peg[2])
+            build_peg(self, "peg", PEG_LENGTH, PEG_RADIUS, PEG_COLOUR, PEG_COLOUR, video_peg[:2], video_peg[2])
         )
-        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", shown_goal))
-        xy, yaw = self._draw_cube(draws, shown_goal, [])
+        self.target = self.add(build_disc(self, "target", TARGET_RADIUS, 0.005, "purple", video_goal))
+        xy, yaw = self._draw_cube(draws, video_goal, [])
         self.cube = self.add(build_cube(self, "cube", "red", xy, yaw))
         xy, yaw = self._draw_cube(draws, goal, [self.cube])
         self._execution_poses = {
@@ -218,5 +218,5 @@ class MoveCube(Task):
 
     def goals(self) -> list[str]:
         goal = "watch the video carefully, then move the cube to the target in the same manner"
-        told = f": {TOLD[self.manner]}" if self.in_view else ""
-        return [f"{goal} as before{told}", f"{goal} shown in the video{told}"]
+        manner = f": {MANNER_TEXTS[self.manner]}" if self.in_view else ""
+        return [f"{goal} as before{manner}", f"{goal} shown in the video{manner}"]

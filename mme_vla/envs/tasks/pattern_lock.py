@@ -149,7 +149,7 @@ class PatternLock(Task):
         return [goal, f"{goal} shown in the video"]
 
 
-def search(draws: Draws, n: int, node: int, goal: int, seen: set[int]) -> list[int] | None:
+def search(draws: Draws, n: int, node: int, goal: int, visited: set[int]) -> list[int] | None:
     """A path over the 8-neighbourhood of an n × n grid by depth-first search in random order."""
     if node == goal:
         return [node]
@@ -157,9 +157,9 @@ def search(draws: Draws, n: int, node: int, goal: int, seen: set[int]) -> list[i
     places = [(row + r, column + c) for r, c in NEIGHBOURS if 0 <= row + r < n and 0 <= column + c < n]
     for i in draws.permutation(len(places)):
         following = places[i][0] * n + places[i][1]
-        if following not in seen:
-            seen.add(following)
-            path = search(draws, n, following, goal, seen)
+        if following not in visited:
+            visited.add(following)
+            path = search(draws, n, following, goal, visited)
             if path is not None:
                 return [node, *path]
     return None

@@ -57,11 +57,11 @@ class StopCube(Task):
     def _place(self, k: int) -> None:
         """Put the cube where it is after `k` steps."""
         passes = PASSES + self.turned("count")
-        turn, steps = divmod(min(k, self.interval * passes), self.interval)
-        if turn == passes:
-            turn, steps = passes - 1, self.interval
+        pass_index, steps = divmod(min(k, self.interval * passes), self.interval)
+        if pass_index == passes:
+            pass_index, steps = passes - 1, self.interval
         side = 2 * smoothstep(steps / self.interval) - 1
-        xy = self.target.position[:2] + self._reach * (side if turn % 2 == 0 else -side)
+        xy = self.target.position[:2] + self._reach * (side if pass_index % 2 == 0 else -side)
         self.cube.move_to(sapien.Pose([*xy, self.cube.position[2]]))
 
     def cues(self) -> list[Cue]:

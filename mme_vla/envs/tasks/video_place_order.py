@@ -14,7 +14,7 @@ class VideoPlaceOrder(VideoPlace):
     """The video visits some of the targets in random order; a press of the button comes in between."""
 
     shared_draws = True
-    recovery_drawn_per_episode = True
+    recovery_sampled_per_episode = True
     spot_radius = 0.1
     operation = "order"
     target_counts: ClassVar[dict[str, int]] = {"easy": 4, "medium": 4, "hard": 4}

@@ -14,7 +14,7 @@ from mme_vla.envs.scene.placement import (
     draw_button,
     draw_cube,
     rotated_anchors,
-    swaps_in_turn,
+    sequential_swaps,
 )
 from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask, number, ordinal
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes
 GO_HOME_STEPS = 20
-SHOWN_RELEASE_Z, RELEASE_Z = 0.03, 0.01
+VIDEO_RELEASE_Z, RELEASE_Z = 0.03, 0.01
 PRESS_PUNISHED = (50, 500)  # steps since the kind of stage was first entered
 
 
@@ -37,7 +37,7 @@ class VideoRepick(Task):
 
     shared_draws = True
     latch_failure = True
-    recovery_drawn_per_episode = True
+    recovery_sampled_per_episode = True
     dials = frozenset({"count", "delay"})
 
     def plan(self, draws: Draws) -> None:
@@ -76,7 +76,7 @@ class VideoRepick(Task):
 
     def before_physics(self, k: int) -> None:
         if self._swaps_due and not self.swaps:
-            self.swaps = swaps_in_turn(self.initiators, self.cubes, start=k)
+            self.swaps = sequential_swaps(self.initiators, self.cubes, start=k)
         for swap in self.swaps:
             swap.apply(k)
 
@@ -111,7 +111,7 @@ class VideoRepick(Task):
         drop = SubTask(
             "drop the cube on the table",
             done=lambda: dropped(self, cube),
-            run=lambda demo: demo.put_down(SHOWN_RELEASE_Z),
+            run=lambda demo: demo.put_down(VIDEO_RELEASE_Z),
             targets=[cube],
             choice="b",
             video=True,
@@ -121,8 +121,8 @@ class VideoRepick(Task):
             for _ in self.initiators
         ]
         self._swap_stage = swaps[0] if swaps else None
-        rest = GO_HOME_STEPS + self.turned("delay")
-        home = [SubTask("static", StaticFor(self, rest), lambda demo: self._go_home(demo, rest), video=True)]
+        steps = GO_HOME_STEPS + self.turned("delay")
+        home = [SubTask("static", StaticFor(self, steps), lambda demo: self._go_home(demo, steps), video=True)]
         home = home if swaps or self.turned("delay") else []
         back = SubTask(
             NO_RECORD,

@@ -44,8 +44,8 @@ class VideoUnmask(Task):
     def subtasks(self) -> list[SubTask]:
         watched = COVER_STEPS + self.turned("delay")
         static = StaticFor(self, watched)
-        wanted = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
-        picks = container_picks(self, wanted, self.containers)
+        targets = list(zip(self.colours, self.containers, strict=False))[: PICKS[self.difficulty]]
+        picks = container_picks(self, targets, self.containers)
         return [SubTask("static", static, lambda demo: demo.hold(watched), video=True), *picks]
 
     def choices(self) -> list[Choice]:

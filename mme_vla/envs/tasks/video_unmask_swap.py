@@ -23,10 +23,10 @@ class VideoUnmaskSwap(UnmaskSwap):
         watched = self.swapped_after + self.turned("delay")
         static = StaticFor(self, watched)
         watch = SubTask("static", static, lambda demo: demo.hold(watched), video=True)
-        return [watch, *container_picks(self, self.wanted, self.containers)]
+        return [watch, *container_picks(self, self.targets, self.containers)]
 
     def choices(self) -> list[Choice]:
         return container_choices(self.containers)
 
     def goals(self) -> list[str]:
-        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.wanted])}"]
+        return [f"watch the video carefully, then {hiding_goal([colour for colour, _ in self.targets])}"]

@@ -27,7 +27,7 @@ from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
 from mme_vla.envs.vector.processes import begin, settings, simulating_processes
 from mme_vla.errors import UserError
-from mme_vla.utils.processes import signals_held
+from mme_vla.utils.processes import signals_deferred
 
 
 @dataclass(frozen=True)
@@ -243,7 +243,7 @@ class VecEnv:
         block = self._context.RawArray("B", protocol.BLOCK_BYTES)
         work = (imported_plugins(), there, block, self._factory, self._options)
         process = self._context.Process(target=begin, args=(settings(), _work, *work), daemon=True)
-        with signals_held():
+        with signals_deferred():
             process.start()
         there.close()
         return _Worker(process, here, block)
@@ -276,7 +276,7 @@ class VecEnv:
                 if kind == protocol.PIECE:
                     state.arrays += protocol.read(state.block, content[0])
                     state.deadline = max(state.deadline, time.monotonic() + self.timeout)
-                    protocol.send(state.connection, protocol.GO_ON)
+                    protocol.send(state.connection, protocol.CONTINUE)
                 elif kind == protocol.RESULT:
                     state.running = False
                     return Reply.of_outcome(

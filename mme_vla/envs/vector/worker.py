@@ -22,7 +22,7 @@ BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 # outcome of a command. FAILURE: the command raised. LOST: it raised, and the process is of no further use.
 PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
-RESET, STEP, CLOSE, GO_ON = "reset", "step", "close", "go on"
+RESET, STEP, CLOSE, CONTINUE = "reset", "step", "close", "go on"
 
 
 @dataclass(frozen=True)

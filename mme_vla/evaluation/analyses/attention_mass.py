@@ -12,8 +12,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.attention import sight_mask
-from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, Room
+from mme_vla.backbone.attention import layout_mask
+from mme_vla.backbone.gemma import JointBlock, KeyValue, LayerModulation, Layout, StaticKV
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
 
@@ -40,8 +40,8 @@ class AttentionMass:
         """
         if part not in self.parts:
             raise UserError(f"No attention on {part!r}: the sequence holds {', '.join(self.parts)}.")
-        own = self.layers[:, self.parts.index("action")]
-        return self.layers[:, self.parts.index(part)] / (1 - own)
+        self_mass = self.layers[:, self.parts.index("action")]
+        return self.layers[:, self.parts.index(part)] / (1 - self_mass)
 
     def table(self) -> list[tuple[str, float, float]]:
         """(part, mean, maximum over layers) in percent; the actions' own share is of everything."""
@@ -115,7 +115,7 @@ class AttentionWatch:
     def _begin(self, transformer: Any, args: tuple, kwargs: dict[str, Any]) -> None:
         layout: Layout = kwargs["layout"] if "layout" in kwargs else args[1]
         blocks: Sequence[Any] = kwargs["blocks"] if "blocks" in kwargs else args[0]
-        self._watching = blocks[-1].expert == transformer.answering
+        self._watching = blocks[-1].expert == transformer.action_expert
         if not self._watching:
             return
         names = [span.name for span in layout.spans]
@@ -124,7 +124,7 @@ class AttentionWatch:
         self._names, self._lengths = names, [span.length for span in layout.spans]
         if self._sums is None:
             self._sums = torch.zeros(len(transformer.layers), len(names), dtype=torch.float64)
-        self._mask = sight_mask(layout.sight, torch.float32)
+        self._mask = layout_mask(layout.mask_layout, torch.float32)
         self._samples += len(layout.valid)
 
     @torch.no_grad()
@@ -132,23 +132,25 @@ class AttentionWatch:
         if not self._watching:
             return
         names = ("segments", "turn", "mask", "condition", "hook", "past")
-        given = {**dict.fromkeys(names), **dict(zip(names, args, strict=False)), **kwargs}
-        segments, condition = given["segments"], given["condition"]
+        arguments = {**dict.fromkeys(names), **dict(zip(names, args, strict=False)), **kwargs}
+        segments, condition = arguments["segments"], arguments["condition"]
         of_attention = condition.attention if isinstance(condition, LayerModulation) else condition
-        past: KeyValue | Room | None = given["past"]
-        if isinstance(past, Room):
+        past: KeyValue | StaticKV | None = arguments["past"]
+        if isinstance(past, StaticKV):
             past = past.past(sum(segment.tokens.shape[1] for segment in segments))
         keys: list[Tensor] = [] if past is None else [past[0]]
         row, q = 0, None
         for segment in segments:
             rows = slice(row, row + segment.tokens.shape[1])
-            answers = segment.expert == block.answering
+            answers = segment.expert == block.action_expert
             layer: Any = block.experts[segment.expert]
-            asked, k, _, _ = layer.project(segment.tokens, given["turn"].rows(rows), of_attention if answers else None)
+            queries, k, _, _ = layer.project(
+                segment.tokens, arguments["turn"].rows(rows), of_attention if answers else None
+            )
             keys.append(k)
             row = rows.stop
             if answers:
-                q, mask = asked, self._mask[:, :, rows]
+                q, mask = queries, self._mask[:, :, rows]
         assert q is not None
         assert self._sums is not None
         k = torch.cat(keys, 1).repeat_interleave(q.shape[2] // keys[0].shape[2], dim=2)

@@ -40,9 +40,9 @@ class RememberedShapes(TorchDispatchMode):
         kwargs = kwargs or {}
         if any(result.alias_info is not None for result in func._schema.returns):
             return func(*args, **kwargs)
-        asked = (func, _about(args), tuple((name, _about(value)) for name, value in kwargs.items()))
+        signature = (func, _about(args), tuple((name, _about(value)) for name, value in kwargs.items()))
         try:
-            known = self._known.get(asked)
+            known = self._known.get(signature)
         except TypeError:  # something that has no hash
             return func(*args, **kwargs)
         if known is not None:
@@ -50,7 +50,7 @@ class RememberedShapes(TorchDispatchMode):
             return torch.empty_strided(size, stride, dtype=dtype, device="meta")
         result = func(*args, **kwargs)
         if isinstance(result, Tensor) and type(result) is Tensor and result.device.type == "meta":
-            self._known[asked] = (result.shape, result.stride(), result.dtype)
+            self._known[signature] = (result.shape, result.stride(), result.dtype)
         return result
 
 
@@ -118,9 +118,9 @@ def all_models() -> list[str]:
 def _check_attention_is_counted() -> None:
     q, k = torch.empty(1, 8, 20, 32, device="meta"), torch.empty(1, 8, 50, 32, device="meta")
     mask = torch.zeros(1, 1, 20, 50, device="meta")
-    found = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
-    if found != 2 * (2 * 8 * 20 * 50 * 32):
-        raise UserError(f"This PyTorch ({torch.__version__}) counts {found} FLOPs for an attention of 1,024,000.")
+    counted = flops(lambda: nn.functional.scaled_dot_product_attention(q, k, k, attn_mask=mask))
+    if counted != 2 * (2 * 8 * 20 * 50 * 32):
+        raise UserError(f"This PyTorch ({torch.__version__}) counts {counted} FLOPs for an attention of 1,024,000.")
 
 
 def _streamed(policy: Policy, batch: Any) -> int | None:
@@ -135,5 +135,5 @@ def _streamed(policy: Policy, batch: Any) -> int | None:
 def _frames(policy: Policy) -> int:
     if policy.memory is None:
         return 0
-    wanted = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
-    return wanted * flops(policy.see_empty_frame)
+    n_encoded = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
+    return n_encoded * flops(policy.warm_up_vision)

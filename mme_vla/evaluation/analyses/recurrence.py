@@ -9,7 +9,7 @@ import torch
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
 from mme_vla.evaluation.analyses.replay import STRIDE, replay
-from mme_vla.evaluation.results.plots import COLOURS, FAINT, picture, svg
+from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.mme import MMEPolicy
 
@@ -69,12 +69,12 @@ def recurrence_plot(episodes: Sequence[RecurrenceCurves], title: str) -> str:
     """
     names = list(episodes[0].curves)
     panels = ["inner loss" if name == _PAIR[0] else name for name in names if name != _PAIR[1]]
-    with picture((7.5, 2.3 * len(panels) + 0.6), len(panels)) as (canvas, axes):
+    with figure((7.5, 2.3 * len(panels) + 0.6), len(panels)) as (canvas, axes):
         for panel, name in zip(axes, panels, strict=True):
             for i, episode in enumerate(episodes):
                 colour = COLOURS[i % len(COLOURS)]
-                drawn = [(_PAIR[0], "--"), (_PAIR[1], "-")] if name == "inner loss" else [(name, "-")]
-                for curve, style in drawn:
+                curve_styles = [(_PAIR[0], "--"), (_PAIR[1], "-")] if name == "inner loss" else [(name, "-")]
+                for curve, style in curve_styles:
                     label = f"episode {episode.episode}" if style == "-" else None
                     panel.plot(episode.frames, episode.curves[curve], style, color=colour, lw=1.4, label=label)
                 if episode.exec_start:

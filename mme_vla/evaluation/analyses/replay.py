@@ -40,17 +40,17 @@ def replay(
     if most is not None and most < len(steps):
         steps = steps[np.linspace(0, len(steps) - 1, most).round().astype(int)]
     text = SubgoalText.from_config(policy.config.get("subgoal_text"))
-    running, seen = policy.start_episode(source.goal(episode)), 0
+    running, n_observed = policy.start_episode(source.goal(episode)), 0
     running.options = source.options(episode)
     for step in steps.tolist():
-        indices = np.arange(seen, step + 1)
+        indices = np.arange(n_observed, step + 1)
         views = {view: source.frames(episode, indices, view) for view in policy.embodiment.camera_names}
         executed = indices[indices >= start]
         actions = source.actions(episode)[np.maximum(executed - 1, 0)]
         if source.robot.action.frames is None:
             actions = source.past_actions(episode, step, len(actions))
-        running.observe(views, source.states(episode, seen, step + 1), indices < start, actions)
-        seen = step + 1
+        running.observe(views, source.states(episode, n_observed, step + 1), indices < start, actions)
+        n_observed = step + 1
         if text is not None:
             texts = source.subgoals(episode, step)
             if text.kind not in texts:

@@ -42,9 +42,9 @@ class RerunLog:
         self._episode = episode
         self._stream.set_time("step", sequence=step)
 
-    def picture(self, name: str, picture: np.ndarray | Image.Image) -> None:
+    def log_image(self, name: str, pixels: np.ndarray | Image.Image) -> None:
         """Log a picture [H, W, 3] uint8."""
-        image = self._rerun.Image(np.asarray(picture))
+        image = self._rerun.Image(np.asarray(pixels))
         self._log(name, image.compress(jpeg_quality=_JPEG_QUALITY))
 
     def number(self, name: str, value: float) -> None:
@@ -59,7 +59,7 @@ class RerunLog:
         """Go to a step of a recorded episode, and log its pictures and words."""
         self.at(episode, step)
         for view in source.robot.camera_names:
-            self.picture(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
+            self.log_image(f"views/{view}", source.frames(episode, np.array([step]), view)[0])
         self.words("goal", source.goal(episode))
         for kind, text in source.subgoals(episode, step).items():
             self.words(kind, text)

@@ -34,11 +34,11 @@ def selection_sheets(
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
     history, patches = OnlineHistory(memory.storage, memory.make_scorer(), start), memory.storage.grid**2
-    seen = 0
+    n_observed = 0
     for step in range(start, length, every):
-        part = frames[seen : step + 1]
-        history.append(part, torch.zeros(len(history.wanted(len(part))), patches, 1))
-        seen = step + 1
+        part = frames[n_observed : step + 1]
+        history.append(part, torch.zeros(len(history.to_encode(len(part))), patches, 1))
+        n_observed = step + 1
         selected = memory.select(history, step)
         title = f"{name} at step {step}: {len(selected)} of {memory.budget} tokens · {source.goal(episode)}"
         yield step, memory_sheet(frames[: step + 1], selected, memory.storage.grid, start, step, title)

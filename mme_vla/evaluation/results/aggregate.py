@@ -111,7 +111,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-USUAL_BUDGET = 512
+DEFAULT_BUDGET = 512
 
 
 @dataclass(frozen=True)
@@ -241,14 +241,14 @@ def aggregate(
     splits = sorted({record.split for record in merged})
     if split is None and len(splits) > 1:
         raise UserError(f"These are results of several splits ({', '.join(splits)}): choose one with --split.")
-    chosen = [r for r in merged if split in (None, r.split)]
-    if not chosen:
+    selected = [r for r in merged if split in (None, r.split)]
+    if not selected:
         raise UserError(f"There is no record{f' of split {split!r}' if split else ''}; there are: {splits or 'none'}.")
-    inside = [r for r in chosen if protocol.expects(r.key)]
+    inside = [r for r in selected if protocol.expects(r.key)]
     counted = [r for r in inside if not (protocol.errors == "missing" and r.outcome == "error")]
     if not counted:
         raise UserError(
-            f"None of the {len(chosen)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
+            f"None of the {len(selected)} records is of the tasks and episodes asked for (0 … {protocol.episodes - 1})."
         )
     _check_environments(counted)
     groups: dict[tuple[str, str | None, int | None, str | None], list[Run]] = {}
@@ -258,10 +258,10 @@ def aggregate(
     methods = [_method(*group, runs, protocol) for group, runs in groups.items()]
     repeats = repeated_episodes(records)
     for method in methods:
-        found = [repeats[run.key] for run in method.runs if run.key in repeats]
-        method.repeated, method.flipped = (sum(column) for column in zip(*found, strict=True)) if found else (0, 0)
+        counts = [repeats[run.key] for run in method.runs if run.key in repeats]
+        method.repeated, method.flipped = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
     apart = _tell_apart(methods)
-    return Results(methods, protocol, [*apart, *_notes(methods, protocol, len(chosen) - len(inside))])
+    return Results(methods, protocol, [*apart, *_notes(methods, protocol, len(selected) - len(inside))])
 
 
 def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[int, int]]:
@@ -271,10 +271,10 @@ def repeated_episodes(records: Iterable[EpisodeRecord]) -> dict[RunKey, tuple[in
         if record.outcome != "error":
             outcomes.setdefault((record.run, record.key), []).append(record.outcome)
     counts: dict[RunKey, tuple[int, int]] = {}
-    for (run, _), found in outcomes.items():
-        if len(found) > 1:
+    for (run, _), results in outcomes.items():
+        if len(results) > 1:
             repeated, flipped = counts.get(run, (0, 0))
-            counts[run] = repeated + 1, flipped + (len(set(found)) > 1)
+            counts[run] = repeated + 1, flipped + (len(set(results)) > 1)
     return counts
 
 
@@ -296,7 +296,7 @@ def _tell_apart(methods: Sequence[Method]) -> list[str]:
 def _method(
     model: str, subgoal: str | None, budget: int | None, composition: str | None, runs: list[Run], protocol: Protocol
 ) -> Method:
-    papers = budget in (None, USUAL_BUDGET) and all(run.key.split not in FURTHER_SPLITS for run in runs)
+    papers = budget in (None, DEFAULT_BUDGET) and all(run.key.split not in FURTHER_SPLITS for run in runs)
     known = paper.paper_method(model, subgoal) if papers else None
     label = model if subgoal is None else f"{model}+{subgoal}"
     label = label if budget is None else f"{label}@{budget}"
@@ -307,12 +307,12 @@ def _method(
         figure = _figure(runs, scope.tasks, protocol, lambda run, task: run.successes(task), reported)
         method.figures.setdefault(scope.kind, {})[scope.name] = figure
     difficulties = {key: record.difficulty for run in runs for key, record in run.records.items()}
-    whole = {task for task in protocol.averaged for run in runs if run.successes(task) is not None}
+    complete_tasks = {task for task in protocol.averaged for run in runs if run.successes(task) is not None}
     for level in DIFFICULTIES:
-        seen = {key.task for key, of in difficulties.items() if of == level} & set(protocol.averaged)
+        level_tasks = {key.task for key, of in difficulties.items() if of == level} & set(protocol.averaged)
         # A task without the level is left out; one that is not whole yet may have it, and keeps the figure incomplete.
-        tasks = tuple(task for task in protocol.averaged if task in seen or task not in whole)
-        if seen:
+        tasks = tuple(task for task in protocol.averaged if task in level_tasks or task not in complete_tasks)
+        if level_tasks:
             figure = _figure(runs, tasks, protocol, _of_difficulty(level, difficulties), None)
             method.figures.setdefault("difficulty", {})[level] = figure
     return method
@@ -337,17 +337,17 @@ def _figure(
 ) -> Figure:
     """A figure over whole tasks, from the runs that have all of them."""
     per_run = [[pick(run, task) for task in tasks] for run in runs]
-    whole = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
+    complete = [[task for task in of_tasks if task is not None] for of_tasks in per_run if None not in of_tasks]
     done = [record for run in runs for key, record in run.records.items() if key.task in tasks]
     counts = {
-        "runs": len(runs), "complete": len(whole), "done": len(done),
+        "runs": len(runs), "complete": len(complete), "done": len(done),
         "expected": len(runs) * len(tasks) * protocol.episodes,
     }  # fmt: skip
-    if not whole:
+    if not complete:
         partial = 100 * sum(record.success for record in done) / len(done) if done else None
         return Figure(None, None, None, **counts, partial=partial, paper=reported)
-    matrices = [np.array([run[i] for run in whole], np.float64).T for i in range(len(tasks))]  # episodes × runs
-    mean, std = mean_std([float(np.mean([matrix[:, r].mean() for matrix in matrices])) for r in range(len(whole))])
+    matrices = [np.array([run[i] for run in complete], np.float64).T for i in range(len(tasks))]  # episodes × runs
+    mean, std = mean_std([float(np.mean([matrix[:, r].mean() for matrix in matrices])) for r in range(len(complete))])
     if len(tasks) == 1:
         interval = task_interval(matrices[0], protocol.confidence)
     else:
@@ -402,8 +402,8 @@ def _notes(methods: Sequence[Method], protocol: Protocol, outside: int) -> list[
             )
         limits = {record.max_steps for run in method.runs for record in run.records.values()}
         if method.paper and limits != {MAX_STEPS}:
-            given = ", ".join(map(str, sorted(limits)))
-            notes.append(f"{method.label} ran with a limit of {given} steps; the paper's is {MAX_STEPS}.")
+            limit_text = ", ".join(map(str, sorted(limits)))
+            notes.append(f"{method.label} ran with a limit of {limit_text} steps; the paper's is {MAX_STEPS}.")
     for split in sorted({run.key.split for method in methods for run in method.runs} & {*FURTHER_SPLITS}):
         notes.append(f"Split {split!r}: scenes beyond the benchmark's own; figures of it are none of the benchmark's.")
     if outside:

@@ -44,10 +44,10 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """One sentence."""
-        said = self._judgement
+        text = self._judgement
         if self.repeated:
-            said += f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
-        return said
+            text += f"; of {self.repeated:,} episodes run twice alike, {self.flipped:,} ended otherwise"
+        return text
 
     @property
     def _judgement(self) -> str:

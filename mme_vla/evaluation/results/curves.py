@@ -12,7 +12,7 @@ from mme_vla.envs.subtasks import OPERATIONS
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import Interval, Method, Results, wilson
-from mme_vla.evaluation.results.plots import COLOURS, picture, svg
+from mme_vla.evaluation.results.plots import COLOURS, figure, svg
 from mme_vla.evaluation.results.tables import Table
 
 
@@ -43,20 +43,20 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
     Raises:
         UserError: none of the records is of a stress split, or they contradict each other.
     """
-    found: dict[tuple[str, str, str], dict[int, list[EpisodeRecord]]] = {}
+    groups: dict[tuple[str, str, str], dict[int, list[EpisodeRecord]]] = {}
     merged = merge(records, conflicts)
     for record in merged:
         variant = read_variant(record.split)
         if variant is not None and variant.dial:
             at = (str(record.run._replace(split=BASE)), record.task, variant.dial)
-            found.setdefault(at, {}).setdefault(variant.turned, []).append(record)
-    if not found:
+            groups.setdefault(at, {}).setdefault(variant.turned, []).append(record)
+    if not groups:
         raise UserError("None of these records is of a stress split: evaluate with split=stress:count=2, for instance.")
     curves: Curves = {}
-    for (run, task, dial), places in found.items():
-        plain = [r for r in merged if r.split == BASE and r.task == task and str(r.run) == run]
-        if plain and 0 not in places:
-            places[0] = plain
+    for (run, task, dial), places in groups.items():
+        baseline = [r for r in merged if r.split == BASE and r.task == task and str(r.run) == run]
+        if baseline and 0 not in places:
+            places[0] = baseline
         common = set.intersection(*({r.episode for r in there} for there in places.values()))
         curves[run, task, dial] = [
             _point(turned, [r for r in there if r.episode in common], confidence)
@@ -84,10 +84,10 @@ def stress_table(curves: Curves) -> Table:
 
 def stress_figures(curves: Curves) -> dict[str, str]:
     """For each task and dial a curve of every run, as SVG."""
-    drawn = {}
+    figures = {}
     for task, dial in dict.fromkeys((task, dial) for _, task, dial in sorted(curves)):
         mine = {run: points for (run, its, of), points in curves.items() if (its, of) == (task, dial)}
-        with picture((5.6, 3.2)) as (canvas, (axes,)):
+        with figure((5.6, 3.2)) as (canvas, (axes,)):
             for i, (run, points) in enumerate(mine.items()):
                 rates = [p.rate for p in points]
                 below = [max(p.rate - p.interval.low, 0) for p in points]
@@ -98,8 +98,8 @@ def stress_figures(curves: Curves) -> dict[str, str]:
             axes.set_ylabel("success (%)")
             axes.set_ylim(0, 100)
             axes.legend(fontsize=8)
-            drawn[f"{task}, {dial}"] = svg(canvas)
-    return drawn
+            figures[f"{task}, {dial}"] = svg(canvas)
+    return figures
 
 
 EXTRA = "process"
@@ -116,8 +116,8 @@ def process_of(record: EpisodeRecord) -> ProcessScore | None:
     Raises:
         UserError: the score is damaged.
     """
-    given = record.extra.get(EXTRA)
-    return None if given is None else ProcessScore.from_dict(given)
+    value = record.extra.get(EXTRA)
+    return None if value is None else ProcessScore.from_dict(value)
 
 
 def process_tables(results: Results) -> list[Table]:

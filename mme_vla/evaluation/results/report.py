@@ -5,7 +5,7 @@ from datetime import UTC, datetime
 from html import escape
 
 from mme_vla.evaluation.results import plots
-from mme_vla.evaluation.results.aggregate import USUAL_BUDGET, Results
+from mme_vla.evaluation.results.aggregate import DEFAULT_BUDGET, Results
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.curves import CAPTION, process_tables
 from mme_vla.evaluation.results.paper import chunk_flops
@@ -63,7 +63,7 @@ def html_report(results: Results, comparisons: Sequence[Comparison], title: str)
     parts.append(section("Tasks", plots.heat_map(results), "Success rate in percent."))
     rings = "Rings: the paper's averages. Neither subgoal predictors nor the encoding of past frames are counted."
     cost = ("Efficiency", plots.efficiency(results, chunk_flops()), rings)
-    points = plots.budget_points(results.methods, USUAL_BUDGET)
+    points = plots.budget_points(results.methods, DEFAULT_BUDGET)
     if points:
         curve = plots.budget_curve(results, points)
         parts.append(pair(cost, ("Memory budget", curve, "Dashed: the paper's sweep.")))

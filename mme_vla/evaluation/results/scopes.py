@@ -144,8 +144,8 @@ class Scope(NamedTuple):
 
 def scopes(protocol: Protocol) -> list[Scope]:
     """Everything figures are made of, whole tasks at a time (difficulties cut across them)."""
-    found = [Scope("task", task, (task,)) for task in protocol.tasks]
-    found += [Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites]
-    found += [Scope("group", group, tuple(protocol.choose("group", group))) for group in GROUPS]
-    found += [Scope("average", "average", protocol.averaged)]
-    return [scope for scope in found if scope.tasks]
+    result = [Scope("task", task, (task,)) for task in protocol.tasks]
+    result += [Scope("suite", suite, tuple(protocol.choose("suite", suite))) for suite in protocol.suites]
+    result += [Scope("group", group, tuple(protocol.choose("group", group))) for group in GROUPS]
+    result += [Scope("average", "average", protocol.averaged)]
+    return [scope for scope in result if scope.tasks]

@@ -20,8 +20,8 @@ def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
     """What a policy's configuration tells of it and of its training, for the notes of a run."""
     card = config.get("card")
     card = card if isinstance(card, Mapping) else {}
-    kept = {part: _section(config.get(part)) for part in ("memory", "integration")}
-    return {**kept, "data": card.get("data"), "recipe": card.get("recipe")}
+    parts = {part: _section(config.get(part)) for part in ("memory", "integration")}
+    return {**parts, "data": card.get("data"), "recipe": card.get("recipe")}
 
 
 def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:

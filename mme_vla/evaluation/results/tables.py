@@ -163,8 +163,8 @@ def leaderboard(method: Method, results: Results) -> list[Table]:
                     else 100 * sum(outcomes) / len(outcomes)
                 )
             values.append(row)
-        whole = [[row[i] for row in values] for i in range(len(runs))]
-        values.append([_mean(column) for column in whole])
+        run_columns = [[row[i] for row in values] for i in range(len(runs))]
+        values.append([_mean(column) for column in run_columns])
         names = [*results.protocol.averaged, "**Average**"]
         rows = [[name, *map(_percent, row), _percent(_mean(row))] for name, row in zip(names, values, strict=True)]
         tables.append(Table(f"{method.label}, checkpoint {checkpoint}", columns, rows))

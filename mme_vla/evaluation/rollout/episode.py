@@ -75,16 +75,16 @@ class RunningEpisode:
             self.episode.options = read_options(info[OPTIONS], len(self._robot.action.choice))
         self.video_frames = len(frames["state"]) - 1
         if self._subgoals is not None:
-            seen = self.video_frames and self._subgoals.sees_video
-            video = np.stack(frames[self._robot.memory_camera][:-1]) if seen else None
+            needs_video = self.video_frames and self._subgoals.sees_video
+            video = np.stack(frames[self._robot.memory_camera][:-1]) if needs_video else None
             self.watched = self._subgoals.start_episode(goal, video, self.job.task)
         self._expect(frames, np.arange(self.video_frames + 1) < self.video_frames, None, info)
 
-    def go_on(self, frames: Observation, info: dict[str, Any]) -> None:
+    def resume(self, frames: Observation, info: dict[str, Any]) -> None:
         """Take the frames that the executed actions led to: one each, unless an action is a motion of many."""
         count = self._count(info)
-        seen = count if self._robot.action.frames is not None else len(frames["state"])
-        self._expect(frames, np.zeros(seen, bool), self._sent[:count], info)
+        n_frames = count if self._robot.action.frames is not None else len(frames["state"])
+        self._expect(frames, np.zeros(n_frames, bool), self._sent[:count], info)
 
     def end(self, info: dict[str, Any]) -> None:
         """Take the report of the last actions; their frames are not needed any more."""
@@ -92,7 +92,7 @@ class RunningEpisode:
         self.video = str(info.get("video", ""))
         self.process = info.get("process", {})
 
-    def tick(self, info: dict[str, Any]) -> None:
+    def add_env_seconds(self, info: dict[str, Any]) -> None:
         """Add up the environment's time."""
         seconds = info.get("seconds", {})
         self._sim += seconds.get("sim", 0.0)
@@ -107,43 +107,43 @@ class RunningEpisode:
         """Take one piece of the waiting frames into memory."""
         begun = time.perf_counter()
         part = slice(self._at, self._at + self._piece)
-        views, drawn = self._views(part)
+        views, rendered = self._views(part)
         views |= {name: np.stack(self._frames[name][part]) for name in self._robot.readings}
         led = self._led
         if led is not None:  # one action a frame; or some motions, all told with the first of their frames
             led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
-        some = {} if all(len(places) == len(self._demo[part]) for places in drawn.values()) else {"drawn": drawn}
+        some = {} if all(len(places) == len(self._demo[part]) for places in rendered.values()) else {"drawn": rendered}
         self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
         if self.watched is not None and not self._demo[part][-1:].any():
             camera, demo = self._robot.memory_camera, self._demo[part]
-            shown = views[camera][~demo[drawn[camera]]]
-            if passed := int((~demo).sum()) - len(shown):
+            displayed = views[camera][~demo[rendered[camera]]]
+            if passed := int((~demo).sum()) - len(displayed):
                 self.watched.skip(passed)
-            if len(shown):
-                self.watched.observe(shown, self._info)
+            if len(displayed):
+                self.watched.observe(displayed, self._info)
         self._at = part.stop
-        self.thought(time.perf_counter() - begun)
+        self.add_policy_seconds(time.perf_counter() - begun)
 
     def _views(self, part: slice) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
         """Pictures of every camera, and their places in this part of the frames."""
-        views, drawn = {}, {}
+        views, rendered = {}, {}
         for name in self._robot.camera_names:
-            pictures = self._frames[name][part]
-            drawn[name] = np.array([i for i, picture in enumerate(pictures) if picture is not None], np.int64)
-            views[name] = np.stack([pictures[i] for i in drawn[name]]) if len(drawn[name]) else _NONE
-        return views, drawn
+            images = self._frames[name][part]
+            rendered[name] = np.array([i for i, image in enumerate(images) if image is not None], np.int64)
+            views[name] = np.stack([images[i] for i in rendered[name]]) if len(rendered[name]) else _NONE
+        return views, rendered
 
-    def thought(self, seconds: float) -> None:
+    def add_policy_seconds(self, seconds: float) -> None:
         """Add this episode's share of the policy's time."""
         self._thinking += seconds
 
-    def told(self, subgoal: Subgoal, latency_s: float) -> None:
+    def set_subgoal(self, subgoal: Subgoal, latency_s: float) -> None:
         """Take the subgoal of the current frame, which came after so many seconds."""
         self.episode.subgoal = subgoal.text
         if self.trace is not None:
             self.trace.add(self.watched, subgoal, latency_s)
 
-    def chosen(self, actions: np.ndarray) -> None:
+    def set_actions(self, actions: np.ndarray) -> None:
         """Note the actions [n, w] that are sent to the environment."""
         self._sent = actions
         self.chunks += 1

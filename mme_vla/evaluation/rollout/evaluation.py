@@ -63,14 +63,14 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
         if "RANK" not in environment or "WORLD_SIZE" not in environment:
             return Shard()
         text = f"{environment['RANK']}/{environment['WORLD_SIZE']}"
-    found = re.fullmatch(r"(\d+)/(\d+)", str(text))
-    shard = Shard(int(found[1]), int(found[2])) if found else Shard(1, 0)
+    match = re.fullmatch(r"(\d+)/(\d+)", str(text))
+    shard = Shard(int(match[1]), int(match[2])) if match else Shard(1, 0)
     if shard.index >= shard.count:
         raise UserError(f"shard={text!r}; expected <index>/<count> counted from 0, such as 0/4 … 3/4.")
     return shard
 
 
-USUAL_BUDGET = 512
+DEFAULT_BUDGET = 512
 VIDEOS = "videos"
 
 
@@ -103,7 +103,7 @@ def evaluate(
     base: Callable[..., Any] = make_env,
     notes: dict[str, Any] | None = None,
     times_from: Path | None = None,
-    shown: bool = True,
+    show_progress: bool = True,
 ) -> Evaluation:
     """Run every episode that `output` has no result of yet.
 
@@ -125,7 +125,7 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
-    check_sessions(settings.split, policy.sessions_before)
+    check_sessions(settings.split, policy.n_distractor_episodes)
     if base is make_env:
         check_benchmark(policy.embodiment, ACTION_SPACES)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
@@ -136,10 +136,10 @@ def evaluate(
         missing = [job for job in jobs if (job.task, job.episode) not in finished(done)]
         durations = Durations(earlier_records(output, times_from))
         missing = durations.longest_first(missing)
-        kept = [record for record in done if record.outcome != "error"]
-        with RolloutProgress(len(jobs), kept, shown) as progress:
-            if kept:
-                progress.say(f"{output} holds {len(kept)} of {len(jobs)} episodes: going on with the others")
+        completed = [record for record in done if record.outcome != "error"]
+        with RolloutProgress(len(jobs), completed, show_progress) as progress:
+            if completed:
+                progress.say(f"{output} holds {len(completed)} of {len(jobs)} episodes: going on with the others")
             workers = settings.worker_count(-(-len(missing) // shard.count))
             if forecast := durations.forecast(missing, workers, shard.count):
                 progress.say(str(forecast))
@@ -154,9 +154,9 @@ def _environments(
 ) -> VecEnv:
     robot = policy.embodiment
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
-    options["most_actions"] = policy.most_actions
+    options["max_actions"] = policy.max_actions
     if base is make_env:
-        options |= {"sessions": policy.sessions_before}
+        options |= {"sessions": policy.n_distractor_episodes}
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
         options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":
@@ -196,7 +196,7 @@ def run_settings(
     How many workers or shards there are, and on which machine, does not belong to it; nor does the batch size, though
     batches may change the last bits of an action.
     """
-    kept = ("seed", "split", "env", "max_steps", "render")
+    names = ("seed", "split", "env", "max_steps", "render")
     dtype = str(next(policy.parameters()).dtype).removeprefix("torch.")
     return {
         "model": facts.model,
@@ -207,7 +207,7 @@ def run_settings(
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
         "flow_steps": settings.flow_steps or policy.sample_steps,
-        **{name: getattr(settings, name) for name in kept},
+        **{name: getattr(settings, name) for name in names},
     }
 
 
@@ -235,8 +235,8 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
         raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
     kind = subgoal_kind(policy)
     if kind is not None and kind != f"{subgoals.kind}_subgoal":
-        wanted = kind.removesuffix("_subgoal")
-        raise UserError(f"The policy was trained with {wanted} subgoals: set subgoal.kind={wanted}.")
+        expected = kind.removesuffix("_subgoal")
+        raise UserError(f"The policy was trained with {expected} subgoals: set subgoal.kind={expected}.")
 
 
 def checkpoint_label(source: str | None) -> int | str:
@@ -251,7 +251,7 @@ def checkpoint_label(source: str | None) -> int | str:
 def memory_budget(policy: Policy) -> int | None:
     """Memory tokens, where they are not the usual 512."""
     budget = None if policy.memory is None else policy.memory.budget
-    return None if budget == USUAL_BUDGET else budget
+    return None if budget == DEFAULT_BUDGET else budget
 
 
 def default_output(facts: RunFacts) -> Path:
@@ -268,9 +268,9 @@ def _done(output: Path, jobs: Sequence[Job], facts: RunFacts, shard: Shard | Non
     checkpoint = int(facts.checkpoint) if str(facts.checkpoint).isdecimal() else facts.checkpoint
     run = RunKey(facts.model, facts.subgoal, facts.memory_budget, checkpoint, facts.model_seed, facts.split,
                  facts.composition)  # fmt: skip
-    wanted = {(job.task, job.episode) for job in jobs}
+    keys = {(job.task, job.episode) for job in jobs}
     files = sorted(output.glob("episodes*.jsonl")) if shard is None or shard.count == 1 else [output / shard.file]
-    found = [record for path in files for record in read_records(path)]
+    records = [record for path in files for record in read_records(path)]
     # run.json has seen to it that this is the same policy: records from before there were digests are of it too.
-    found = [replace(r, composition=facts.composition) if r.composition is None else r for r in found]
-    return [record for record in merge(found, "first") if record.run == run and record.key in wanted]
+    records = [replace(r, composition=facts.composition) if r.composition is None else r for r in records]
+    return [record for record in merge(records, "first") if record.run == run and record.key in keys]

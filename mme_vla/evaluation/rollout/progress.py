@@ -17,11 +17,11 @@ class RolloutProgress:
         total: episodes of this process. before: records of those that an earlier run has finished.
     """
 
-    def __init__(self, total: int, before: Sequence[EpisodeRecord] = (), shown: bool = True) -> None:
-        self.console = Console(quiet=not shown, highlight=False, soft_wrap=True, stderr=True)
+    def __init__(self, total: int, before: Sequence[EpisodeRecord] = (), visible: bool = True) -> None:
+        self.console = Console(quiet=not visible, highlight=False, soft_wrap=True, stderr=True)
         self.total, self._outcomes = total, Counter(record.outcome for record in before)
         self._bar: Progress | None = None
-        if self.console.is_terminal and shown:
+        if self.console.is_terminal and visible:
             clock = (TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
             columns = (BarColumn(24), MofNCompleteColumn(), TextColumn("{task.description}"), *clock)
             self._bar = Progress(*columns, console=self.console)

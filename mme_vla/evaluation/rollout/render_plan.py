@@ -10,7 +10,7 @@ from functools import cache
 
 import numpy as np
 
-from mme_vla.envs.render_request import Drawing
+from mme_vla.envs.render_request import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
@@ -21,7 +21,7 @@ EVERY = range(2**31)
 LONGEST_VIDEO = 10_000  # frames
 
 
-class Pictures:
+class RenderPlan:
     """Says for each command to an environment what is to be drawn; None asks for everything.
 
     Args:
@@ -34,24 +34,26 @@ class Pictures:
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
         memory = policy.memory
-        every = memory is not None and memory.looks_back is not None
+        every = memory is not None and memory.past_view_spec is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
         self._reads = cache(self._reads_of)
         # Depth and poses of cameras come with every frame.
         self._all = settings.draw == "all" or bool(self._robot.readings) or self._reads(0) is None
 
-    def before_video(self) -> Drawing | None:
+    def before_video(self) -> RenderRequest | None:
         """For a reset, before it is known how long the video is: what is certain to be wanted."""
         if self._all:
             return None
         memory = self._policy.memory
         if self._sees_video:
-            return self._drawing(EVERY)
+            return self._render_request(EVERY)
         # Of memories that keep few frames all are drawn at once, of others none.
         few = memory is not None and memory.storage.keep_every > 1
-        return self._drawing(frozenset(memory.storage.kept_frames(LONGEST_VIDEO).tolist()) if memory and few else ())
+        return self._render_request(
+            frozenset(memory.storage.stored_frames(LONGEST_VIDEO).tolist()) if memory and few else ()
+        )
 
-    def missing(self, frames: Observation) -> Drawing | None:
+    def missing(self, frames: Observation) -> RenderRequest | None:
         """For a second reset, after one that gave these frames; None where it gave all that is needed."""
         if self._all:
             return None
@@ -59,25 +61,25 @@ class Pictures:
         needed = range(video) if self._sees_video else self._within(video, 0, video)
         if all(frames[self._robot.memory_camera][frame] is not None for frame in needed):
             return None
-        return self._drawing(frozenset(needed))
+        return self._render_request(frozenset(needed))
 
-    def of_chunk(self, seen: int, count: int, exec_start: int) -> Drawing | None:
-        """For `count` actions after `seen` frames, of which the first `exec_start` were the video."""
+    def of_chunk(self, n_observed: int, count: int, exec_start: int) -> RenderRequest | None:
+        """For `count` actions after `n_observed` frames, of which the first `exec_start` were the video."""
         if self._all:
             return None
         if self._sees_passing:
-            return self._drawing(EVERY)
-        stop = seen + count if self._robot.action.frames is not None else EVERY.stop
-        return self._drawing(frozenset(self._within(exec_start, seen, stop)))
+            return self._render_request(EVERY)
+        stop = n_observed + count if self._robot.action.frames is not None else EVERY.stop
+        return self._render_request(frozenset(self._within(exec_start, n_observed, stop)))
 
-    def _drawing(self, frames: Container[int]) -> Drawing:
-        return Drawing(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)
+    def _render_request(self, frames: Container[int]) -> RenderRequest:
+        return RenderRequest(dict.fromkeys(self._cameras, frames), self._robot.camera_names, self._grounded)
 
     def _within(self, exec_start: int, first: int, stop: int) -> list[int]:
         reads = self._reads(exec_start)
         assert reads is not None
-        found: list[int] = reads[(reads >= first) & (reads < stop)].tolist()
-        return found
+        frames: list[int] = reads[(reads >= first) & (reads < stop)].tolist()
+        return frames
 
     def _reads_of(self, exec_start: int) -> np.ndarray | None:
         """Frames that the policy reads of an episode with this video, until its step limit."""

@@ -20,12 +20,12 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.curves import EXTRA as PROCESS
 from mme_vla.evaluation.rollout.episode import RunningEpisode
 from mme_vla.evaluation.rollout.progress import RolloutProgress
-from mme_vla.evaluation.rollout.render_plan import Pictures
+from mme_vla.evaluation.rollout.render_plan import RenderPlan
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import EXTRA, SubgoalTrace
 from mme_vla.evaluation.store import Claims
 from mme_vla.policy.base import Policy
-from mme_vla.policy.scheduler import Act, Prepare, Turns
+from mme_vla.policy.scheduler import Act, Prepare, Scheduler
 from mme_vla.subgoal import SubgoalPredictor
 
 
@@ -119,7 +119,7 @@ class Rollout:
     record: Callable[[EpisodeRecord], None]
     subgoals: SubgoalPredictor | None = None
     subgoal_folder: Path | None = None
-    progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, shown=False))
+    progress: RolloutProgress = field(default_factory=lambda: RolloutProgress(0, visible=False))
     workload: Workload = field(default_factory=Workload)
     _waiting: Waiting = field(default_factory=Waiting)
     _running: dict[int, RunningEpisode] = field(default_factory=dict)
@@ -127,8 +127,8 @@ class Rollout:
     _stillborn: int = 0
 
     def __post_init__(self) -> None:
-        self._turns: Turns[RunningEpisode, RunningEpisode, RunningEpisode] = Turns(self.settings.max_batch)
-        self._pictures = Pictures(self.policy, self.subgoals, self.settings)
+        self._scheduler: Scheduler[RunningEpisode, RunningEpisode, RunningEpisode] = Scheduler(self.settings.max_batch)
+        self._render_plan = RenderPlan(self.policy, self.subgoals, self.settings)
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
         """Run these episodes.
@@ -140,10 +140,10 @@ class Rollout:
         self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
         for worker in range(self.envs.workers):
             self._start(worker)
-        while self.envs.busy or self._turns:
-            for reply in self.envs.recv(0 if self._turns else None):
+        while self.envs.busy or self._scheduler:
+            for reply in self.envs.recv(0 if self._scheduler else None):
                 self._take(reply)
-            self._turn()
+            self._run_scheduler()
         self.workload.wall_s += time.perf_counter() - begun
 
     def _start(self, worker: int) -> None:
@@ -160,13 +160,13 @@ class Rollout:
         running = RunningEpisode(self.policy, job, settings.seed, self.subgoals, piece, trace)
         running.worker = worker
         self._running[worker] = running
-        self.envs.start(worker, job, draw=self._pictures.before_video())
+        self.envs.start(worker, job, draw=self._render_plan.before_video())
 
     def _take(self, reply: Reply) -> None:
         """Deal with what came back from a worker."""
         running = self._running[reply.worker]
-        self._turns.later.pop(running, None)
-        running.tick(reply.info)
+        self._scheduler.later.pop(running, None)
+        running.add_env_seconds(reply.info)
         if reply.info.get("exception_type") == "UserError" and reply.crashed:
             raise UserError(str(reply.info.get("error_message")))
         if reply.done:
@@ -186,12 +186,12 @@ class Rollout:
                 return
             running.begin(reply.observation, reply.info)
         else:
-            running.go_on(reply.observation, reply.info)
-        self._turns.reading.append(running)
+            running.resume(reply.observation, reply.info)
+        self._scheduler.reading.append(running)
 
     def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
         """Let the episode begin once more if pictures of its video are needed that it did not draw."""
-        missing, length = self._pictures.missing(reply.observation), len(reply.observation["state"]) - 1
+        missing, length = self._render_plan.missing(reply.observation), len(reply.observation["state"]) - 1
         if running.redrawn not in (None, length):
             raise UserError(
                 f"{reply.job}: its conditioning video had {running.redrawn} frames, and {length} when it was simulated "
@@ -203,18 +203,18 @@ class Rollout:
         self.envs.start(running.worker, running.job, draw=missing)
         return True
 
-    def _turn(self) -> None:
+    def _run_scheduler(self) -> None:
         begun = time.perf_counter()
-        for step in self._turns.turn():
+        for step in self._scheduler.next_steps():
             if isinstance(step, Act):
                 self._act(step.batch)
             elif isinstance(step, Prepare):
                 if self.policy.prepare(step.work.episode):
-                    self._turns.later[step.work] = None
+                    self._scheduler.later[step.work] = None
             else:
                 step.work.read()
                 if not step.work.pieces:
-                    self._turns.acting.append(step.work)
+                    self._scheduler.acting.append(step.work)
         self.workload.policy_s += time.perf_counter() - begun
 
     def _act(self, batch: list[RunningEpisode]) -> None:
@@ -223,21 +223,21 @@ class Rollout:
             subgoals = self.subgoals.predict([running.watched for running in batch])
             latency = time.perf_counter() - begun
             for running, subgoal in zip(batch, subgoals, strict=True):
-                running.told(subgoal, latency)
+                running.set_subgoal(subgoal, latency)
         chunks = self.policy.act([running.episode for running in batch], self.settings.flow_steps)
         self.workload.batches += 1
         self.workload.chunks += len(batch)
         share = (time.perf_counter() - begun) / len(batch)
         for running, chunk in zip(batch, chunks, strict=True):
-            running.thought(share)
+            running.add_policy_seconds(share)
             actions = chunk[: self.settings.execute or self.policy.embodiment.action.execute]
             if not np.isfinite(actions).all():
                 self._finish(running, "error", "the policy's actions are not finite numbers", retry=False)
                 continue
-            running.chosen(actions)
-            draw = self._pictures.of_chunk(running.episode.frames_seen, len(actions), running.video_frames)
+            running.set_actions(actions)
+            draw = self._render_plan.of_chunk(running.episode.n_observed_frames, len(actions), running.video_frames)
             self.envs.send(running.worker, {"actions": actions, "subgoal": running.episode.subgoal, "draw": draw})
-            self._turns.later[running] = None
+            self._scheduler.later[running] = None
 
     def _finish(self, running: RunningEpisode, status: str, error: str | None = None, retry: bool = True) -> None:
         """Record an episode and let its worker begin another."""

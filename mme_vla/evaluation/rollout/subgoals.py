@@ -43,20 +43,20 @@ class SubgoalScore:
     asked: int = 0
     problems: Counter[str] = field(default_factory=Counter)
 
-    def add(self, said: str | None, meant: str | None, asked: bool = False, problem: str = "") -> None:
+    def add(self, predicted: str | None, meant: str | None, queried: bool = False, problem: str = "") -> None:
         """Count one subgoal.
 
         Args:
-            said: the policy's subgoal; None while there is none. meant: the environment's; None where it has none.
+            predicted: the policy's subgoal; None while there is none. meant: the environment's; None where it has none.
         """
         self.chunks += 1
-        self.asked += asked
+        self.asked += queried
         if problem:
             self.problems[problem] += 1
         if meant is None:
             return
         self.judged += 1
-        distances = point_distances(said, meant)
+        distances = point_distances(predicted, meant)
         if distances is not None:
             self.right += 1
             self.points += len(distances)
@@ -114,14 +114,14 @@ def total_score(records: Iterable[EpisodeRecord]) -> SubgoalScore | None:
     return sum(scores, SubgoalScore()) if scores else None
 
 
-def point_distances(said: str | None, meant: str) -> list[float] | None:
+def point_distances(predicted: str | None, meant: str) -> list[float] | None:
     """Distances in pixels between the points of two subgoals, in order; None if their words differ."""
-    if said is None:
+    if predicted is None:
         return None
-    (said_words, said_points), (meant_words, meant_points) = mark_points(said), mark_points(meant)
-    if _plain(said_words) != _plain(meant_words) or len(said_points) != len(meant_points):
+    (predicted_words, predicted_points), (meant_words, meant_points) = mark_points(predicted), mark_points(meant)
+    if _normalised(predicted_words) != _normalised(meant_words) or len(predicted_points) != len(meant_points):
         return None
-    return [float(np.hypot(a - c, b - d)) for (a, b), (c, d) in zip(said_points, meant_points, strict=True)]
+    return [float(np.hypot(a - c, b - d)) for (a, b), (c, d) in zip(predicted_points, meant_points, strict=True)]
 
 
 def subgoal_tables(results: Results) -> list[Table]:
@@ -149,7 +149,7 @@ def _row(name: str, records: Sequence[EpisodeRecord]) -> list[str]:
     return [name, str(len(records)), str(total.judged), *figures, str(total.asked), problems]
 
 
-def _plain(words: str) -> str:
+def _normalised(words: str) -> str:
     return " ".join(words.lower().split()).rstrip(".")
 
 
@@ -187,11 +187,11 @@ class SubgoalTrace:
         """
         # Between two sub-tasks the environment names none, and the last one stays, as in training.
         self._meant = online_subgoal(episode.info, self._kind) or self._meant
-        self.score.add(subgoal.text, self._meant, subgoal.asked, subgoal.problem)
+        self.score.add(subgoal.text, self._meant, subgoal.queried, subgoal.problem)
         if self._folder is None:
             return
-        picture = f"{self._name}/{episode.step:05d}.jpg"
-        _save(episode.frame, self._folder / picture)
+        image_name = f"{self._name}/{episode.step:05d}.jpg"
+        _save(episode.frame, self._folder / image_name)
         line = {
             "step": episode.step,
             "seconds": round(time.perf_counter() - self._begun, 3),
@@ -200,11 +200,11 @@ class SubgoalTrace:
             "text": subgoal.text,
             "points": subgoal.points,
             "oracle": self._meant,
-            "asked": subgoal.asked,
-            "asked_step": episode.asked_step,
-            "answer": subgoal.answer,
+            "asked": subgoal.queried,
+            "asked_step": episode.query_step,
+            "answer": subgoal.reply,
             "problem": subgoal.problem,
-            "image": picture,
+            "image": image_name,
         }
         with self._file.open("a", encoding="utf-8") as file:
             file.write(json.dumps(line, ensure_ascii=False) + "\n")
@@ -215,7 +215,7 @@ class SubgoalTrace:
         return self._folder / f"{self._name}.jsonl"
 
 
-def _save(picture: np.ndarray, path: Path) -> None:
+def _save(image: np.ndarray, path: Path) -> None:
     from PIL import Image
 
-    Image.fromarray(picture).save(path, quality=90)
+    Image.fromarray(image).save(path, quality=90)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from mme_vla.utils import draft_of
-from mme_vla.utils.media import Film, film_frame
+from mme_vla.utils.media import VideoWriter, video_frame
 
-KEPT = ("none", "all", "success", "failure")
+SAVE_ON = ("none", "all", "success", "failure")
 BEHIND = 64
 """Frames that may wait to be compressed."""
 _LONGEST_GOAL = 100  # characters of a file name
@@ -28,57 +28,57 @@ class EpisodeVideo:
         kept: which outcomes are kept: `all`, `success` or `failure`.
     """
 
-    def __init__(self, path: Callable[[str, str], Path], kept: str = "all") -> None:
-        self._path, self._kept = path, kept
-        self._film: Film | None = None
+    def __init__(self, path: Callable[[str, str], Path], save_on: str = "all") -> None:
+        self._path, self._save_on = path, save_on
+        self._video: VideoWriter | None = None
         self._draft = Path()
         self._thread: ThreadPoolExecutor | None = None
         self._waiting: deque[Future[None]] = deque()
 
     def add(self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False) -> None:
         """Append the pictures [H, W, 3] uint8 that all cameras took at one moment."""
-        if self._film is None:
-            self._film, self._thread = self._open(), ThreadPoolExecutor(1, "film")
+        if self._video is None:
+            self._video, self._thread = self._open(), ThreadPoolExecutor(1, "film")
         assert self._thread is not None
-        self._waiting.append(self._thread.submit(self._film.add, film_frame(views, caption, demo)))
+        self._waiting.append(self._thread.submit(self._video.add, video_frame(views, caption, demo)))
         while len(self._waiting) > BEHIND:
             self._waiting.popleft().result()
 
     def finish(self, outcome: str, goal: str) -> Path | None:
         """Close the video under its name; None if this outcome is not kept."""
-        if self._film is None or self._kept not in ("all", "success" if outcome == "success" else "failure"):
+        if self._video is None or self._save_on not in ("all", "success" if outcome == "success" else "failure"):
             self.discard()
             return None
         self._compressed()
-        self._film.close()
+        self._video.close()
         target = self._path(outcome, goal)
         self._draft.replace(target)
-        self._film = None
+        self._video = None
         return target
 
     def discard(self) -> None:
         """Drop what was drawn."""
-        if self._film is not None:
+        if self._video is not None:
             for frame in self._waiting:
                 frame.cancel()
-            self._compressed(whole=False)
-            self._film.close(whole=False)
+            self._compressed(complete=False)
+            self._video.close(complete=False)
             self._draft.unlink(missing_ok=True)
-            self._film = None
+            self._video = None
 
-    def _compressed(self, whole: bool = True) -> None:
-        """Wait for the thread; with `whole`, what went wrong in it is raised."""
+    def _compressed(self, complete: bool = True) -> None:
+        """Wait for the thread; with `complete`, what went wrong in it is raised."""
         if self._thread is not None:
             self._thread.shutdown()
         waiting, self._waiting, self._thread = self._waiting, deque(), None
-        for frame in waiting if whole else ():
+        for frame in waiting if complete else ():
             frame.result()
 
-    def _open(self) -> Film:
+    def _open(self) -> VideoWriter:
         folder = self._path("", "").parent
         folder.mkdir(parents=True, exist_ok=True)
         self._draft = draft_of(folder / f"film-{id(self):x}.mp4")
-        return Film(self._draft)
+        return VideoWriter(self._draft)
 
 
 def video_name(task: str, episode: int, outcome: str, goal: str) -> str:

@@ -38,7 +38,7 @@ NEVER = 1_000_000
 """Frames between two whose pictures are kept: the first alone."""
 
 
-class OwnRows(History):
+class MotionRows(History):
     """A history as such a memory sees it: its tokens are rows, padded with zeros to the width of a token.
 
     Args:
@@ -48,17 +48,17 @@ class OwnRows(History):
 
     def __init__(
         self,
-        whole: History,
+        source: History,
         read: Callable[[np.ndarray], Tensor],
         width: int,
         memory: str,
         device: torch.device | None = None,
     ) -> None:
-        super().__init__(whole.spec, whole.exec_start)
-        self._whole, self._read, self._width, self._memory, self._device = whole, read, width, memory, device
+        super().__init__(source.spec, source.exec_start)
+        self._source, self._read, self._width, self._memory, self._device = source, read, width, memory, device
 
     def __len__(self) -> int:
-        return len(self._whole)
+        return len(self._source)
 
     def gather(self, indices: np.ndarray) -> Tensor:
         rows = self._read(indices[:, 0])
@@ -100,12 +100,12 @@ class LSTMLayer(RecurrentLayer):
         self, state: State, x: Tensor, valid: Tensor, following: int = 0, statistics: bool = False
     ) -> tuple[State, Statistics]:
         with full_precision(x):
-            seen, (hidden, cells) = layer_norm(self.norm, x.float()[:, :, 0]), state
+            normed, (hidden, cells) = layer_norm(self.norm, x.float()[:, :, 0]), state
             after: list[tuple[Tensor, Tensor]] = []
             for i, (inputs, recurrent) in enumerate(zip(self.inputs, self.recurrent, strict=True)):
                 h, c = hidden[:, i], cells[:, i]
-                entering, outputs = linear(inputs, seen), []  # type: ignore[arg-type]
-                for t in range(seen.shape[1]):
+                entering, outputs = linear(inputs, normed), []  # type: ignore[arg-type]
+                for t in range(normed.shape[1]):
                     gates = entering[:, t] + linear(recurrent, h)  # type: ignore[arg-type]
                     let_in, keep, new, out = gates.chunk(4, -1)
                     cell = keep.sigmoid() * c + let_in.sigmoid() * new.tanh()
@@ -113,7 +113,7 @@ class LSTMLayer(RecurrentLayer):
                     c = torch.where(real, cell, c)
                     h = torch.where(real, out.sigmoid() * cell.tanh(), h)
                     outputs.append(h)
-                seen = torch.stack(outputs, 1)
+                normed = torch.stack(outputs, 1)
                 after.append((h, c))
             return (torch.stack([h for h, _ in after], 1), torch.stack([c for _, c in after], 1)), {}
 
@@ -123,7 +123,7 @@ class LSTMLayer(RecurrentLayer):
 
 
 @MEMORIES.register("actions")
-class OwnActions(RecurrentMemory):
+class ActionMemory(RecurrentMemory):
     """`budget` tokens of what an LSTM makes of the robot's own states and actions."""
 
     reads_motion = True
@@ -162,13 +162,13 @@ class OwnActions(RecurrentMemory):
         return np.zeros(0, np.int64)
 
     def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(self._own(history), step, rng)
+        return super().recall(self._motion_rows(history), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
-        return super().encode([self._own(history, self.output.weight.device) for history in histories], streams)
+        return super().encode([self._motion_rows(history, self.output.weight.device) for history in histories], streams)
 
     def prepare(self, history: History, stream: Any) -> bool:
-        return super().prepare(self._own(history, self.output.weight.device), stream)
+        return super().prepare(self._motion_rows(history, self.output.weight.device), stream)
 
-    def _own(self, history: History, device: torch.device | None = None) -> OwnRows:
-        return OwnRows(history, history.moved, self.d_vision, "actions", device)
+    def _motion_rows(self, history: History, device: torch.device | None = None) -> MotionRows:
+        return MotionRows(history, history.motion_rows, self.d_vision, "actions", device)

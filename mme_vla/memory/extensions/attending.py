@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, every_one, whole_frames
+from mme_vla.memory.base import Memory, all_patches, union_frames
 from mme_vla.memory.history import History
 
 MLP = 4
@@ -44,8 +44,8 @@ class ReadingBlock(nn.Module):
         k, v = self.kv(self.context_norm(context)).unflatten(-1, (-1, self.head_dim)).chunk(2, -2)
         q, k, v = (part.transpose(1, 2) for part in (q, k, v))
         # A row that may read nothing is padding: reading all keeps it finite.
-        seen = (mask | ~mask.any(-1, keepdim=True))[:, None]
-        read = functional.scaled_dot_product_attention(q, k, v, attn_mask=seen)
+        key_mask = (mask | ~mask.any(-1, keepdim=True))[:, None]
+        read = functional.scaled_dot_product_attention(q, k, v, attn_mask=key_mask)
         x = x + self.out(read.transpose(1, 2).flatten(2))
         return x + self.down(functional.gelu(self.up(self.mlp_norm(x))))
 
@@ -66,7 +66,7 @@ def rows_at(x: Tensor, at: Tensor) -> Tensor:
     return torch.gather(x, 1, index)
 
 
-class WholeFrames(Memory):
+class FrameMemory(Memory):
     """A subclass says which frames; all tokens of these are selected, and as many as there are."""
 
     @abstractmethod
@@ -74,10 +74,10 @@ class WholeFrames(Memory):
         """The frames that are read at `step` of an episode whose execution begins at `exec_start`; int64, ascending."""
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([self.chosen(int(step), exec_start) for step in steps])
+        return union_frames([self.chosen(int(step), exec_start) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        return whole_frames(self.chosen(step, history.exec_start), self.storage.grid)
+        return all_patches(self.chosen(step, history.exec_start), self.storage.grid)
 
     def padded_length(self, count: int) -> int:
         return count

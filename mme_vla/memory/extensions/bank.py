@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.memory.base import recurrent_frames
-from mme_vla.memory.extensions.attending import WholeFrames, by_frame
+from mme_vla.memory.extensions.attending import FrameMemory, by_frame
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.registry import MEMORIES
@@ -22,7 +22,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("bank")
-class Banked(WholeFrames):
+class Banked(FrameMemory):
     """grid×grid tokens of the current frame, each fused with what the bank answers to it."""
 
     pad_left = True
@@ -82,9 +82,9 @@ class Banked(WholeFrames):
         moments = self.reduce(features)  # b t p d
         times = by_frame(history.positions, patches)[:, :, 0, 0].round().long()
         valid = by_frame(history.mask, patches)[..., 0]
-        held = self.bank.held(moments[:, :-1], times[:, :-1], valid[:, :-1])
+        stored = self.bank.replay(moments[:, :-1], times[:, :-1], valid[:, :-1])
         current = moments[:, -1]
-        tokens = self.output(self.bank.fuse(current, self.bank.ask(current, *held)))
+        tokens = self.output(self.bank.fuse(current, self.bank.ask(current, *stored)))
         return MemoryTokens(tokens, torch.ones(tokens.shape[:2], dtype=torch.bool, device=tokens.device))
 
 
@@ -133,7 +133,7 @@ class RetrievalBlock(nn.Module):
 
     def __init__(self, width: int, read: int | None = None) -> None:
         super().__init__()
-        self.query, self.key, self.value = (nn.Linear(given or width, width) for given in (width, read, read))
+        self.query, self.key, self.value = (nn.Linear(size or width, width) for size in (width, read, read))
         self.attention_norm, self.mlp_norm = nn.LayerNorm(width), nn.LayerNorm(width)
         self.mlp_in, self.mlp_out = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
 
@@ -182,27 +182,27 @@ class Retrieval(nn.Module):
             nn.init.normal_(self.gate.weight, std=GATE_STD)
             nn.init.normal_(self.gate.bias, std=GATE_STD)
 
-    def ask(self, tokens: Tensor, entries: Tensor, times: Tensor | None = None, held: Tensor | None = None) -> Tensor:
+    def ask(self, tokens: Tensor, entries: Tensor, times: Tensor | None = None, valid: Tensor | None = None) -> Tensor:
         """What entries [b, t, n, d] at times [b, t] answer to tokens [b, k, d].
 
         Args:
             times: for the time code, where there is one.
-            held: [b, t] bool, False where there is no entry; a row without any answers with its tokens.
+            valid: [b, t] bool, False where there is no entry; a row without any answers with its tokens.
         """
         keys = entries
         if self.time is not None:
             assert times is not None
             keys = entries + self.time(times.flatten()).to(tokens).unflatten(0, times.shape)[:, :, None]
         empty = mask = None
-        if held is not None:
-            empty = ~held.any(1)
+        if valid is not None:
+            empty = ~valid.any(1)
             # A row of nothing at all has no softmax; its answer is replaced below.
-            shown = torch.cat([held[:, :1] | empty[:, None], held[:, 1:]], 1)
-            mask = shown.repeat_interleave(entries.shape[2], 1)[:, None]
-        answer = tokens
+            readable = torch.cat([valid[:, :1] | empty[:, None], valid[:, 1:]], 1)
+            mask = readable.repeat_interleave(entries.shape[2], 1)[:, None]
+        output = tokens
         for block in self.blocks:
-            answer = block(answer, keys.flatten(1, 2), entries.flatten(1, 2), mask)
-        return answer if empty is None else torch.where(empty[:, None, None], tokens, answer)
+            output = block(output, keys.flatten(1, 2), entries.flatten(1, 2), mask)
+        return output if empty is None else torch.where(empty[:, None, None], tokens, output)
 
     def fuse(self, tokens: Tensor, retrieved: Tensor) -> Tensor:
         """Current and retrieved tokens [b, n, d] as one."""
@@ -211,11 +211,11 @@ class Retrieval(nn.Module):
         share = torch.sigmoid(self.gate(torch.cat([tokens, retrieved], -1)))
         return share * tokens + (1 - share) * retrieved
 
-    def recall(self, memory: MemoryTokens, tokens: Tensor) -> Tensor:
+    def read_memory(self, memory: MemoryTokens, tokens: Tensor) -> Tensor:
         """Fused tokens [b, k, d], from the current ones and a memory's tokens [b, n, read] in place of entries."""
         # Tokens where the mask is False are undefined: a weight of 0 alone would let a nan through.
         entries = memory.tokens.masked_fill(~memory.mask[..., None], 0).to(tokens)
-        return self.fuse(tokens, self.ask(tokens, entries[:, :, None], held=memory.mask))
+        return self.fuse(tokens, self.ask(tokens, entries[:, :, None], valid=memory.mask))
 
 
 class MemoryBank(Retrieval):
@@ -263,8 +263,8 @@ class MemoryBank(Retrieval):
             return tokens
         entries = torch.stack([_padded(state.entries, longest) for state in states]).to(tokens)  # b t n d
         times = torch.stack([_padded(state.times, longest) for state in states]).to(tokens.device)
-        held = torch.arange(longest, device=tokens.device) < torch.tensor(lengths, device=tokens.device)[:, None]
-        return self.ask(tokens, entries, times, None if min(lengths) == longest else held)
+        valid = torch.arange(longest, device=tokens.device) < torch.tensor(lengths, device=tokens.device)[:, None]
+        return self.ask(tokens, entries, times, None if min(lengths) == longest else valid)
 
     def read(self, states: Sequence[BankState], tokens: Tensor) -> Tensor:
         """Fused tokens [b, n, d] of b episodes, from the current ones and their banks."""
@@ -281,7 +281,7 @@ class MemoryBank(Retrieval):
             return BankState(entries[1:], times[1:])
         return _merge(entries, times)
 
-    def held(self, moments: Tensor, times: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def replay(self, moments: Tensor, times: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What banks hold after b sequences of moments, written at once: as `update` one by one, with fixed shapes.
 
         Args:
@@ -305,8 +305,8 @@ class MemoryBank(Retrieval):
             places = torch.arange(self.length, device=at.device)[None]
             rows = places + (places > pair).long()
             follows = (places == pair)[..., None, None]
-            kept = entries.gather(1, rows[..., None, None].expand(-1, -1, *entries.shape[2:]))
-            entries = torch.where(follows, (entries[:, :-1] + entries[:, 1:]) / 2, kept)
+            gathered = entries.gather(1, rows[..., None, None].expand(-1, -1, *entries.shape[2:]))
+            entries = torch.where(follows, (entries[:, :-1] + entries[:, 1:]) / 2, gathered)
             at, there = at.gather(1, rows), there.gather(1, rows)
         return entries, at, there
 
@@ -330,11 +330,11 @@ class MemoryBank(Retrieval):
         for step in range(max(len(sequence) for sequence in sequences)):
             going = [i for i, sequence in enumerate(sequences) if step < len(sequence)]
             here = torch.stack([sequences[i][step] for i in going]).to(tokens.device)
-            answer = self.read([banks[i] for i in going], tokens[here])
+            output = self.read([banks[i] for i in going], tokens[here])
             for row, i in enumerate(going):
                 place = int(sequences[i][step])
-                banks[i] = self.update(banks[i], tokens[place], answer[row], when[place])
-            fused.append(answer)
+                banks[i] = self.update(banks[i], tokens[place], output[row], when[place])
+            fused.append(output)
             places.append(here)
         order = torch.cat(places).argsort()
         return torch.cat(fused)[order], banks

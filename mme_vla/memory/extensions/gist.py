@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError
 from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.encoder import FeatureEncoder
-from mme_vla.memory.extensions.attending import ReadingBlock, WholeFrames, by_frame, heads_of, not_later, rows_at
+from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden
@@ -25,7 +25,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("gist")
-class Gist(WholeFrames):
+class Gist(FrameMemory):
     """[anchors, whole | gists of the frames between | recent frames, whole], in the order of time."""
 
     pad_left = True
@@ -66,17 +66,17 @@ class Gist(WholeFrames):
         for key, value in sizes.items():
             if value < 1:
                 raise UserError(f"memory.{key}={value} must be at least 1.")
-        whole = (anchors + recent) * grid**2
-        if budget < whole + gists:
+        full_tokens = (anchors + recent) * grid**2
+        if budget < full_tokens + gists:
             raise UserError(
                 f"memory.budget={budget} does not hold {anchors + recent} whole frames of {grid}×{grid} tokens and the "
-                f"gists of one more: choose at least {whole + gists}, or fewer memory.anchors or memory.recent."
+                f"gists of one more: choose at least {full_tokens + gists}, or fewer memory.anchors or memory.recent."
             )
         hidden = default_hidden(d_vision, hidden)
         heads = heads_of(hidden, heads)
         self.anchors, self.recent, self.gists, self.stride = anchors, recent, gists, stride
-        self.between = (budget - whole) // gists
-        self.budget = whole + self.between * gists
+        self.between = (budget - full_tokens) // gists
+        self.budget = full_tokens + self.between * gists
         self.storage = StorageSpec(grid, pooling)
         self.capacity = (anchors + self.between + recent) * grid**2
         self.encoder = FeatureEncoder(d_vision, width, **encoder)
@@ -101,21 +101,21 @@ class Gist(WholeFrames):
         valid = by_frame(history.mask, patches)[..., 0]  # b t
         first, between, last = self._parts(valid)
         gists = self.output(self.norm(self._gists(history, valid)))
-        whole = rows_at(by_frame(history.features, patches), torch.cat([first[0], last[0]], 1)).flatten(1, 2)
+        full = rows_at(by_frame(history.features, patches), torch.cat([first[0], last[0]], 1)).flatten(1, 2)
         where = rows_at(by_frame(history.positions, patches), torch.cat([first[0], last[0]], 1)).flatten(1, 2)
         there = torch.cat([first[1], last[1]], 1).repeat_interleave(patches, 1)
-        encoded = self.encoder(whole, where, there)
+        encoded = self.encoder(full, where, there)
         split = [self.anchors * patches, self.recent * patches]
         (anchors, recent), (anchor_mask, recent_mask) = encoded.split(split, 1), there.split(split, 1)
-        told = rows_at(gists.unflatten(1, (-1, self.gists)), between[0]).flatten(1, 2)
-        told_mask = between[1].repeat_interleave(self.gists, 1)
+        summaries = rows_at(gists.unflatten(1, (-1, self.gists)), between[0]).flatten(1, 2)
+        summary_mask = between[1].repeat_interleave(self.gists, 1)
         ages = None
         if history.ages is not None:
             of_frame = history.ages[:, places[:, 0]]
             counts = zip((first, between, last), (patches, self.gists, patches), strict=True)
             ages = torch.cat([rows_at(of_frame, at).repeat_interleave(n, 1) for (at, _), n in counts], 1)
-        tokens = torch.cat([anchors, told.to(anchors.dtype), recent], 1)
-        return MemoryTokens(tokens, torch.cat([anchor_mask, told_mask, recent_mask], 1), ages=ages)
+        tokens = torch.cat([anchors, summaries.to(anchors.dtype), recent], 1)
+        return MemoryTokens(tokens, torch.cat([anchor_mask, summary_mask, recent_mask], 1), ages=ages)
 
     def _parts(self, valid: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Which frames of [b, t], padded in front, fill the places of anchors, gists and recent frames.
@@ -141,9 +141,9 @@ class Gist(WholeFrames):
         gists = self.questions.to(x.dtype).repeat(frames, 1).expand(rows, -1, -1)
         of_gist = torch.arange(frames, device=x.device).repeat_interleave(self.gists)[None]
         of_token = torch.arange(frames, device=x.device).repeat_interleave(self.storage.grid**2)[None]
-        own = (of_gist[:, :, None] == of_token[:, None, :]) & history.mask[:, None, :]
+        attends = (of_gist[:, :, None] == of_token[:, None, :]) & history.mask[:, None, :]
         earlier = not_later(of_gist, of_gist) & valid.repeat_interleave(self.gists, 1)[:, None, :]
-        mask = torch.cat([own, earlier], 2)
+        mask = torch.cat([attends, earlier], 2)
         for layer in self.layers:
             gists = layer(gists, torch.cat([x, gists], 1), mask)
         return gists

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, every_one, whole_frames
+from mme_vla.memory.base import Memory, all_patches, union_frames
 from mme_vla.memory.encoder import FeatureEncoder, position_features
 from mme_vla.memory.extensions.attending import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
@@ -88,38 +88,38 @@ class LearnedTopK(Memory):
         self.encoder = FeatureEncoder(d_vision, width, **encoder)
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        return every_one([evenly_spaced_frames(int(step), self.pool) for step in steps])
+        return union_frames([evenly_spaced_frames(int(step), self.pool) for step in steps])
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """The candidates: which of them are kept is `forward`'s matter."""
-        return whole_frames(evenly_spaced_frames(step, self.pool), self.storage.grid)
+        return all_patches(evenly_spaced_frames(step, self.pool), self.storage.grid)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        kept, soft = self.keep(self.scores(history), history.mask)
-        mask = rows_at(history.mask, kept)
+        selected, soft = self.keep(self.scores(history), history.mask)
+        mask = rows_at(history.mask, selected)
         # One in the forward pass; in the backward pass what the sigmoid says.
-        worth = rows_at(soft, kept)
+        worth = rows_at(soft, selected)
         worth = worth + (1 - worth).detach()
-        best = self.encoder(rows_at(history.features, kept), rows_at(history.positions, kept), mask)
+        best = self.encoder(rows_at(history.features, selected), rows_at(history.positions, selected), mask)
         best = best * worth[..., None].to(best.dtype)
-        left = soft * history.mask.scatter(1, kept, torch.zeros_like(mask))
+        left = soft * history.mask.scatter(1, selected, torch.zeros_like(mask))
         share = left / left.sum(1, keepdim=True).clamp(min=EPS)
-        rest = self._rest(history, share).to(best.dtype)
-        rest_mask = left.sum(1, keepdim=True) > EPS
+        remainder = self._remainder(history, share).to(best.dtype)
+        remainder_mask = left.sum(1, keepdim=True) > EPS
         ages = history.ages
         if ages is not None:
-            ages = torch.cat([rows_at(ages, kept), (ages * share.detach()).sum(1, keepdim=True)], 1)
-        return MemoryTokens(torch.cat([best, rest], 1), torch.cat([mask, rest_mask], 1), ages=ages)
+            ages = torch.cat([rows_at(ages, selected), (ages * share.detach()).sum(1, keepdim=True)], 1)
+        return MemoryTokens(torch.cat([best, remainder], 1), torch.cat([mask, remainder_mask], 1), ages=ages)
 
     def scores(self, history: HistoryTokens) -> Tensor:
         """What each candidate is worth, [b, n] float32, with mean 0 and variance 1 over a sample's candidates."""
         x = self.judge(history.features, history.positions, history.mask)
         registers = self.registers.to(x.dtype).expand(len(x), -1, -1)
         x = torch.cat([x, registers], 1)
-        seen = nn.functional.pad(history.mask, (0, registers.shape[1]), value=True)
-        seen = seen[:, None, :].expand(-1, x.shape[1], -1)
+        key_mask = nn.functional.pad(history.mask, (0, registers.shape[1]), value=True)
+        key_mask = key_mask[:, None, :].expand(-1, x.shape[1], -1)
         for layer in self.layers:
-            x = layer(x, x, seen)
+            x = layer(x, x, key_mask)
         score = self.score(self.norm(x[:, : history.mask.shape[1]]))[..., 0].float()
         counted = history.mask.float()
         count = counted.sum(1, keepdim=True).clamp(min=1)
@@ -141,7 +141,7 @@ class LearnedTopK(Memory):
         soft = torch.sigmoid((scores - border) / self.temperature) * mask
         return order[:, :count].sort(1).values, soft
 
-    def _rest(self, history: HistoryTokens, share: Tensor) -> Tensor:
+    def _remainder(self, history: HistoryTokens, share: Tensor) -> Tensor:
         """One token [b, 1, d] for what is not kept: the mean of its features and of its places, by share [b, n]."""
         features = (history.features.float() * share[..., None]).sum(1, keepdim=True)
         places = position_features(history.positions, self.encoder.position_dim) * share[..., None]

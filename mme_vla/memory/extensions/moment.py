@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from mme_vla.errors import UserError
 from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.encoder import FeatureEncoder
-from mme_vla.memory.extensions.attending import ReadingBlock, WholeFrames, by_frame, heads_of, not_later
+from mme_vla.memory.extensions.attending import FrameMemory, ReadingBlock, by_frame, heads_of, not_later
 from mme_vla.memory.history import StorageSpec
 from mme_vla.memory.recurrent import default_hidden
 from mme_vla.registry import MEMORIES
@@ -25,7 +25,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("moment")
-class Moment(WholeFrames):
+class Moment(FrameMemory):
     """`moments` tokens of each of budget / moments frames, every token knowing the frames before its own."""
 
     pad_left = True
@@ -88,15 +88,15 @@ class Moment(WholeFrames):
         questions = self.questions.to(x.dtype).repeat(rows * frames, 1, 1)
         everything = torch.ones(rows * frames, self.moments, patches, dtype=torch.bool, device=x.device)
         tokens = self.ask(questions, x.flatten(0, 1), everything).unflatten(0, (rows, frames)).flatten(1, 2)
-        seen = self._of_frames(valid)
+        frame_mask = self._of_frames(valid)
         order = torch.arange(frames, device=x.device).repeat_interleave(self.moments)[None].expand(rows, -1)
-        mask = not_later(order, order) & seen[:, None, :]
+        mask = not_later(order, order) & frame_mask[:, None, :]
         for layer in self.layers:
             tokens = layer(tokens, tokens, mask)
         ages = history.ages
         if ages is not None:
             ages = self._padded(self._of_frames(by_frame(ages, patches)[..., 0]))
-        return MemoryTokens(self._padded(self.output(self.norm(tokens))), self._padded(seen), ages=ages)
+        return MemoryTokens(self._padded(self.output(self.norm(tokens))), self._padded(frame_mask), ages=ages)
 
     def _of_frames(self, x: Tensor) -> Tensor:
         """What is known of frames [b, t], of their tokens [b, t·moments]."""

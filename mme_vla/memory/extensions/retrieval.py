@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import whole_frames
+from mme_vla.memory.base import all_patches
 from mme_vla.memory.encoder import PerceptualMemory
 from mme_vla.memory.framesamp import evenly_spaced_frames
 from mme_vla.memory.history import History, StorageSpec
@@ -63,35 +63,35 @@ class Retrieval(PerceptualMemory):
         self.frames, self.cut, self.longest = budget // grid**2, cut, longest
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        frames = self.storage.kept_frames(step + 1)
+        frames = self.storage.stored_frames(step + 1)
         if len(frames) > self.frames:
-            frames = frames[self.alike(self.looks(history, frames), frames >= history.exec_start)]
-        return whole_frames(frames, self.storage.grid)
+            frames = frames[self.alike(self.frame_features(history, frames), frames >= history.exec_start)]
+        return all_patches(frames, self.storage.grid)
 
-    def looks(self, history: History, frames: np.ndarray) -> Tensor:
+    def frame_features(self, history: History, frames: np.ndarray) -> Tensor:
         """What stored frames [n] look like: [n, d_vision] of length 1, from their tokens as they are stored."""
-        tokens = history.stored(whole_frames(frames, self.storage.grid)).float()
+        tokens = history.stored(all_patches(frames, self.storage.grid)).float()
         return torch.nn.functional.normalize(tokens.unflatten(0, (len(frames), -1)).mean(1), dim=-1)
 
-    def alike(self, looks: Tensor, execution: np.ndarray) -> np.ndarray:
+    def alike(self, features: Tensor, execution: np.ndarray) -> np.ndarray:
         """Which frames are remembered.
 
         Args:
-            looks: of the stored frames, [n, d], of length 1. execution: bool [n], False in the video.
+            features: of the stored frames, [n, d], of length 1. execution: bool [n], False in the video.
 
         Returns:
             int64 [`frames`], ascending, the newest last.
         """
-        near = (looks[1:] * looks[:-1]).sum(1).cpu().numpy()
-        likeness = (looks @ looks[-1]).cpu().numpy()
+        near = (features[1:] * features[:-1]).sum(1).cpu().numpy()
+        likeness = (features @ features[-1]).cpu().numpy()
         chunks = chunks_of(near < self.cut, execution, self.longest)
-        asked = sorted(chunks[:-1], key=lambda chunk: -likeness[chunk].max())
-        taken, room = [np.array([len(looks) - 1])], self.frames - 1
-        for chunk in [*asked, chunks[-1][:-1]]:
-            if room and len(chunk):
-                whole = chunk if len(chunk) <= room else chunk[evenly_spaced_frames(len(chunk) - 1, room)]
-                taken.append(whole)
-                room -= len(whole)
+        ranked = sorted(chunks[:-1], key=lambda chunk: -likeness[chunk].max())
+        taken, remaining = [np.array([len(features) - 1])], self.frames - 1
+        for chunk in [*ranked, chunks[-1][:-1]]:
+            if remaining and len(chunk):
+                picked = chunk if len(chunk) <= remaining else chunk[evenly_spaced_frames(len(chunk) - 1, remaining)]
+                taken.append(picked)
+                remaining -= len(picked)
         return np.sort(np.concatenate(taken))
 
 

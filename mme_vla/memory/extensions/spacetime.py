@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import LooksBack, Memory, every_one
-from mme_vla.memory.extensions.actions import NEVER, OwnRows
+from mme_vla.memory.base import Memory, PastViewSpec, union_frames
+from mme_vla.memory.extensions.actions import NEVER, MotionRows
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -73,16 +73,16 @@ class SpaceTime(Memory):
         self.frames, self.stride, self.every = frames, stride, every
         self.width, self.state_dim = width, state_dim
         self.d_vision = d_vision
-        self.looks_back = LooksBack(frames, stride, every) if views else None
+        self.past_view_spec = PastViewSpec(frames, stride, every) if views else None
         self.reads_motion = states
         self.budget = self.capacity = frames if states else 0
         self.storage = StorageSpec(1, "mean", NEVER)
         self.states = nn.Linear(state_dim, width) if states else None
 
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
-        if self.looks_back is None:
+        if self.past_view_spec is None:
             return np.zeros(0, np.int64)
-        read = every_one([self.looks_back.at(int(step)) for step in steps])
+        read = union_frames([self.past_view_spec.at(int(step)) for step in steps])
         return read[read >= 0]
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
@@ -91,7 +91,7 @@ class SpaceTime(Memory):
         return np.stack([frames, np.zeros_like(frames)], 1)
 
     def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(OwnRows(history, self._felt(history), self.d_vision, "spacetime"), step, rng)
+        return super().recall(MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         if self.states is None:
@@ -103,17 +103,17 @@ class SpaceTime(Memory):
             tokens, history.mask.to(weight.device), ages=None if ages is None else ages.to(weight.device)
         )
 
-    def _felt(self, history: History) -> Callable[[np.ndarray], Tensor]:
+    def _proprio_rows(self, history: History) -> Callable[[np.ndarray], Tensor]:
         """Rows that stand for frames [n]: the robot's states, at most as wide as their layer; nothing without them."""
 
         def rows(frames: np.ndarray) -> Tensor:
             if self.states is None:
                 return torch.zeros(len(frames), self.d_vision)
-            felt = history.felt(frames)
-            if felt.shape[1] > self.state_dim:
+            proprio = history.proprio(frames)
+            if proprio.shape[1] > self.state_dim:
                 raise UserError(
-                    f"memory.state_dim={self.state_dim}: a state of this robot has {felt.shape[1]} numbers."
+                    f"memory.state_dim={self.state_dim}: a state of this robot has {proprio.shape[1]} numbers."
                 )
-            return felt
+            return proprio
 
         return rows

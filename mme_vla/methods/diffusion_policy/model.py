@@ -97,7 +97,7 @@ CHANNELS = 512
 """Of ResNet-18's last stage."""
 
 
-def picture_encoder() -> nn.Sequential:
+def build_image_encoder() -> nn.Sequential:
     """ResNet-18 without pooling and classifier, fresh, a group norm of 16 channels a group for each batch norm.
 
     Pictures [n, 3, H, W] → [n, 512, ⌈H/32⌉, ⌈W/32⌉].
@@ -281,7 +281,7 @@ class DiffusionNetwork(nn.Module):
         if tower:
             self.vision = VisionTower(sizes.memory_tower, sizes.memory_width)
             initialise(self.vision)
-        self.image_encoder = picture_encoder()
+        self.image_encoder = build_image_encoder()
         self.image_pool = keypoint_pool(sizes.keypoints)
         self.text_proj = nn.Sequential(
             nn.LayerNorm(sizes.text_dim),
@@ -295,16 +295,16 @@ class DiffusionNetwork(nn.Module):
             sizes.action_dim, self.condition_width, sizes.step_width, sizes.widths, sizes.kernel, sizes.groups
         )
 
-    def condition(self, pictures: Tensor, state: Tensor, text: Tensor, memory: Tensor | None = None) -> Tensor:
+    def condition(self, images: Tensor, state: Tensor, text: Tensor, memory: Tensor | None = None) -> Tensor:
         """The condition [b, c]: for each step keypoints of all cameras, state and words; then the memory's feature.
 
         Args:
-            pictures: [b, t, v, 3, h, w] in [−1, 1], cropped. state: [b, t, s] normalised. text: [b, d] of unit length.
+            images: [b, t, v, 3, h, w] in [−1, 1], cropped. state: [b, t, s] normalised. text: [b, d] of unit length.
         """
-        flat = pictures.flatten(0, 2)
+        flat = images.flatten(0, 2)
         features = run_layer(self.image_encoder, flat, how=self.training and self.recomputed)
-        points = self.image_pool(features).unflatten(0, pictures.shape[:3]).flatten(2)  # b t (v k 2)
-        words = self.text_proj(text)[:, None].expand(-1, pictures.shape[1], -1)
+        points = self.image_pool(features).unflatten(0, images.shape[:3]).flatten(2)  # b t (v k 2)
+        words = self.text_proj(text)[:, None].expand(-1, images.shape[1], -1)
         steps = torch.cat([points, state, words], dim=-1).flatten(1)
         return steps if memory is None else torch.cat([steps, memory], dim=-1)
 

@@ -40,7 +40,7 @@ class DiffusionPolicy(Policy):
     """
 
     processor: DiffusionProcessor | None
-    adapted = ("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3")
+    lora_targets = ("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3")
     heads = ("final_conv",)
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"backbone\.vision\.",
@@ -79,7 +79,7 @@ class DiffusionPolicy(Policy):
         self.augment = augment
         self.sizes = sizes = backbone.sizes
         self.horizon, self.action_dim = sizes.horizon, sizes.action_dim
-        self.skipped, self.sample_steps = sizes.window - 1, sizes.diffusion_steps
+        self.n_past_steps, self.sample_steps = sizes.window - 1, sizes.diffusion_steps
 
     @classmethod
     def from_config(
@@ -94,8 +94,8 @@ class DiffusionPolicy(Policy):
         sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
         integration = _pooled(config.get("integration"), sizes)
         if (integration is None) != (not config.get("memory")):
-            given = "a memory without an integration" if integration is None else "an integration without a memory"
-            raise UserError(f"This configuration names {given}; name both, or neither.")
+            mismatch = "a memory without an integration" if integration is None else "an integration without a memory"
+            raise UserError(f"This configuration names {mismatch}; name both, or neither.")
         if robot.action.width != sizes.action_dim:
             raise UserError(
                 f"backbone.action_dim={sizes.action_dim}: Diffusion Policy answers with the robot's own "
@@ -138,14 +138,14 @@ class DiffusionPolicy(Policy):
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        given = draws or self.loss_draws(len(batch.actions), torch.default_generator)
-        drawn = map_draws(given, lambda value: value.to(self.device))
+        values = draws or self.loss_draws(len(batch.actions), torch.default_generator)
+        sampled = map_draws(values, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history)
         with self.autocast():
             condition = self.condition(batch, memory, corner)
-            noisy = model.add_noise(self._schedule(), batch.actions, drawn["noise"], drawn["step"])
-            predicted = self.backbone.unet(noisy, drawn["step"], condition)
-        losses = (predicted.float() - drawn["noise"]).square().mean(-1)  # b h
+            noisy = model.add_noise(self._schedule(), batch.actions, sampled["noise"], sampled["step"])
+            predicted = self.backbone.unet(noisy, sampled["step"], condition)
+        losses = (predicted.float() - sampled["noise"]).square().mean(-1)  # b h
         loss = masked_mean(losses, batch.action_mask)
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
@@ -155,7 +155,7 @@ class DiffusionPolicy(Policy):
     ) -> Tensor:
         """What the U-Net denoises under, [b, c]: the window's steps, oldest first, then the memory's vector."""
         feature = None if self.integration is None else self.integration.feature(memory)
-        return self.backbone.condition(self._pictures(batch.images, corner), batch.state, batch.text, feature)
+        return self.backbone.condition(self._cropped_images(batch.images, corner), batch.state, batch.text, feature)
 
     def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
         """Memory tokens of a selection, or None for a policy without memory."""
@@ -164,9 +164,9 @@ class DiffusionPolicy(Policy):
         with self.autocast():
             return self.memory(history)
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Compute the pictures' features again in the backward pass instead of keeping them, or keep them."""
-        self.backbone.recomputed = wanted
+        self.backbone.recomputed = mode
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """The memory's tower, the picture encoder, and the U-Net."""
@@ -176,13 +176,13 @@ class DiffusionPolicy(Policy):
     def _schedule(self) -> Any:
         return model.noise_schedule(self.sizes.diffusion_steps)
 
-    def _pictures(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
+    def _cropped_images(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
         """Pictures [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
-        room = [side - kept for side, kept in zip(images.shape[-2:], self.sizes.cropped, strict=True)]
+        margins = [side - size for side, size in zip(images.shape[-2:], self.sizes.cropped, strict=True)]
         if corner is None and self.training and self.augment:
-            top, left = (int(torch.randint(most + 1, ())) for most in room)
+            top, left = (int(torch.randint(most + 1, ())) for most in margins)
         else:
-            top, left = (round(most / 2) for most in room) if corner is None else corner
+            top, left = (round(most / 2) for most in margins) if corner is None else corner
         height, width = self.sizes.cropped
         cropped = images[..., top : top + height, left : left + width]
         return (cropped.float() / 255 - 0.5) / 0.5
@@ -211,7 +211,7 @@ class DiffusionPolicy(Policy):
         """
         if draws is None:
             draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.state))])
-        drawn = map_draws(draws, lambda value: value.to(self.device))
+        sampled = map_draws(draws, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():
             condition = self.condition(batch, memory)
@@ -220,7 +220,7 @@ class DiffusionPolicy(Policy):
                 with self.autocast():
                     return self.backbone.unet(x, step, condition).float()
 
-            return model.sample(self._schedule(), predict, drawn["noise"], drawn["added"], steps)
+            return model.sample(self._schedule(), predict, sampled["noise"], sampled["added"], steps)
 
     # Episodes
 
@@ -278,11 +278,11 @@ class DiffusionPolicy(Policy):
             "horizon": (processor.horizon, sizes.horizon),
             "memory_size": (processor.memory_size, sizes.memory_tower.image_size),
         }
-        for name, (found, expected) in pairs.items():
-            if found != expected:
+        for name, (actual, expected) in pairs.items():
+            if actual != expected:
                 raise UserError(
-                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
-                    "two checkpoints, or one was changed."
+                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+                    "from two checkpoints, or one was changed."
                 )
 
     # Costs and parts
@@ -299,7 +299,7 @@ class DiffusionPolicy(Policy):
             history=None if self.memory is None else self.memory.full_history(sizes.memory_width, device),
         )
 
-    def see_empty_frame(self) -> None:
+    def warm_up_vision(self) -> None:
         """Run the memory's vision tower on one black frame."""
         side = self.sizes.memory_tower.image_size
         self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from mme_vla.embodiment import Embodiment
-from mme_vla.embodiment.action_space import whole
+from mme_vla.embodiment.action_space import integer
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
 from mme_vla.memory.base import stack_history
@@ -153,11 +153,11 @@ class DiffusionProcessor(PolicyProcessor):
         if not isinstance(text, str) or not text:
             raise UserError(f"processor.text={brief(text)} must be clip, hashed, or the folder of a CLIP.")
         height, width = picture
-        self.picture = (whole(height, "processor.picture"), whole(width, "processor.picture"))
+        self.picture = (integer(height, "processor.picture"), integer(width, "processor.picture"))
         self.embodiment = embodiment
-        self.text_name, self.text = text, text_encoder(text, whole(text_dim, "processor.text_dim"))
+        self.text_name, self.text = text, text_encoder(text, integer(text_dim, "processor.text_dim"))
         self.window, self.consecutive = window, frames == FRAMES[0]
-        self.memory_size = whole(memory_size, "processor.memory_size")
+        self.memory_size = integer(memory_size, "processor.memory_size")
         self.stats = stats
 
     @classmethod

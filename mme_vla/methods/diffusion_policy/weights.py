@@ -22,14 +22,16 @@ from mme_vla.weights.tables import Adapter, Derived, Piece
 STATS = "stats.json"
 WEIGHTS = "model.pth"
 _WRAPPED = re.compile(r"^(?:module\.|_orig_mod\.|_checkpoint_wrapped_module\.)+|(?<=\.)_checkpoint_wrapped_module\.")
-_UNET, _OURS = "policy.", "backbone.unet."
+_UNET, _LOCAL = "policy.", "backbone.unet."
 _GRID = "image_pool.0.pos_grid"
 
 
 def is_diffusion_policy(names: Iterable[str]) -> bool:
     """Whether tensors are named as in the authors' checkpoints, in whatever wrapping."""
-    plain = {unwrapped(name) for name in names}
-    return "image_pool.0.nets.weight" in plain and any(name.startswith(f"{_UNET}down_modules.") for name in plain)
+    unwrapped_names = {unwrapped(name) for name in names}
+    return "image_pool.0.nets.weight" in unwrapped_names and any(
+        name.startswith(f"{_UNET}down_modules.") for name in unwrapped_names
+    )
 
 
 def unwrapped(name: str) -> str:
@@ -37,18 +39,18 @@ def unwrapped(name: str) -> str:
     return _WRAPPED.sub("", name)
 
 
-def plain_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+def unwrap_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
     """Tensors by their names without wrapping.
 
     Raises:
         UserError: two of them become one.
     """
-    found: dict[str, Tensor] = {}
+    renamed: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
-        if unwrapped(name) in found:
+        if unwrapped(name) in renamed:
             raise UserError(f"{source} holds {unwrapped(name)} twice, once as {name}.")
-        found[unwrapped(name)] = tensor
-    return found
+        renamed[unwrapped(name)] = tensor
+    return renamed
 
 
 def diffusion_adapter(policy: Policy) -> Adapter:
@@ -63,9 +65,9 @@ def diffusion_adapter(policy: Policy) -> Adapter:
             "Set model=diffusion_policy."
         )
     table = {
-        name: [Piece(name.replace(_OURS, _UNET).removeprefix("backbone."))]
+        name: [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
         for name in policy.state_dict()
-        if policy.part_of(name) not in ("memory", "vision")
+        if policy.component_of(name) not in ("memory", "vision")
     }
     height, width = (map_size(side) for side in policy.sizes.cropped)
     return Adapter(table, derived=[Derived(_GRID, partial(cell_centres, height, width))])
@@ -95,10 +97,10 @@ def write_diffusion_policy(policy: Policy, folder: Path, dtype: torch.dtype, sta
     Raises:
         UserError: another kind of policy, or one with a memory, for which the format has no names.
     """
-    theirs = diffusion_adapter(policy).export(policy.state_dict())
-    model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in theirs.items()}
+    released = diffusion_adapter(policy).export(policy.state_dict())
+    model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in released.items()}
     torch.save({"model": model, "global_step": 0, "ckpt_manager": {}}, folder / WEIGHTS)
     if stats is not None:
         inner: dict[str, Any] = stats.to_dict()["norm_stats"]
-        written = {"norm_stats": {"state": inner["state"], "action": inner["actions"]}}
-        (folder / STATS).write_text(json.dumps(written, indent=2) + "\n")
+        statistics = {"norm_stats": {"state": inner["state"], "action": inner["actions"]}}
+        (folder / STATS).write_text(json.dumps(statistics, indent=2) + "\n")

@@ -64,9 +64,9 @@ class Schedule:
         before = np.concatenate([[1.0], left[:-1]])
         x, path = noise, []
         for i in reversed(range(count)):
-            found = predict(x, int(visited[i]))
-            clean = float(np.sqrt(1 / left[i])) * x - float(np.sqrt(1 / left[i] - 1)) * found
-            x = float(np.sqrt(before[i])) * clean + float(np.sqrt(1 - before[i])) * found
+            predicted = predict(x, int(visited[i]))
+            clean = float(np.sqrt(1 / left[i])) * x - float(np.sqrt(1 / left[i] - 1)) * predicted
+            x = float(np.sqrt(before[i])) * clean + float(np.sqrt(1 - before[i])) * predicted
             path.append(x)
         return path
 
@@ -112,8 +112,8 @@ class DitBlock(nn.Module):
         from timm.layers import Attention, GELUTanh, Mlp
 
         super().__init__()
-        plain = partial(nn.LayerNorm, width, eps=EPS, elementwise_affine=False)
-        self.norm, self.mlp_norm = plain(), plain()
+        norm = partial(nn.LayerNorm, width, eps=EPS, elementwise_affine=False)
+        self.norm, self.mlp_norm = norm(), norm()
         self.attention = Attention(width, num_heads=heads, qkv_bias=True)
         self.cross_norm = nn.LayerNorm(width, eps=EPS)
         self.cross = nn.MultiheadAttention(width, heads, batch_first=True)
@@ -193,5 +193,5 @@ class Dit(nn.Module):
             return self(x, steps, cognition, perceptual)
         drop = torch.arange(2, device=x.device).bool().repeat_interleave(len(x))
         twice = (torch.cat([part, part]) for part in (x, steps, cognition, perceptual))
-        asked, unasked = self(*twice, drop=drop).chunk(2)
-        return unasked + scale * (asked - unasked)
+        conditional, unasked = self(*twice, drop=drop).chunk(2)
+        return unasked + scale * (conditional - unasked)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mme_vla.memory.extensions.bank import BankState
 from mme_vla.methods.memoryvla.model import BankStates, MemoryVlaCore
-from mme_vla.policy.episode import Episode, Host, Written
+from mme_vla.policy.episode import Episode, Host, MemoryEntries
 
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
 
@@ -36,7 +36,7 @@ class MemoryVlaEpisode(Episode):
         super().__init__(policy, goal, seed)
         self._writer = policy
         self.banks: BankStates = policy.banked.init_state()
-        self.asked: tuple[Tensor, Tensor] | None = None
+        self.pending: tuple[Tensor, Tensor] | None = None
         """The moment at which the last chunk was chosen: its cognition token [1, d] and vision features [p, c]."""
         self._due: np.ndarray | None = None
 
@@ -45,38 +45,38 @@ class MemoryVlaEpisode(Episode):
         frames: np.ndarray,
         demo: np.ndarray,
         executed: np.ndarray,
-        drawn: np.ndarray | None = None,
+        rendered: np.ndarray | None = None,
         states: np.ndarray | None = None,
     ) -> None:
-        if self.asked is not None:
-            self.banks = self._writer.banked.store(self.banks, *self.asked)
-            self.asked = None
+        if self.pending is not None:
+            self.banks = self._writer.banked.store(self.banks, *self.pending)
+            self.pending = None
         moments = []
-        pictures = dict(zip(range(len(demo)) if drawn is None else drawn.tolist(), frames, strict=True))
+        images = dict(zip(range(len(demo)) if rendered is None else rendered.tolist(), frames, strict=True))
         for i in range(len(demo)):
             if self._due is not None and demo[i]:  # a later frame of the video shows that it was not the last one
                 moments.append(self._due)
             if self._due is not None and (demo[i] or not self._video_over):
                 self._due = None
-            if demo[i] and (self.frames_seen + i) % VIDEO_STRIDE == 0:
-                self._due = pictures[i].copy()
-        super()._take(frames, demo, executed, drawn, states)
+            if demo[i] and (self.n_observed_frames + i) % VIDEO_STRIDE == 0:
+                self._due = images[i].copy()
+        super()._take(frames, demo, executed, rendered, states)
         if moments:
             self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
 
     # What was written, for those who look at it (`policy/episode.py`)
 
-    written_clock = "moments"
+    memory_clock = "moments"
 
-    def written(self) -> tuple[Written, ...]:
+    def writable_memory(self) -> tuple[MemoryEntries, ...]:
         """The entries of both banks, each with its times."""
         named = (("cognition", self.banks.cognition), ("perceptual", self.banks.perceptual))
         return tuple(
-            Written(name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count)
+            MemoryEntries(name, tuple(zip(bank.times.tolist(), bank.entries, strict=True)), self.banks.count)
             for name, bank in named
         )
 
-    def as_if_written(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
+    def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
         """See `Writes`."""
         twin, banks = copy.copy(self), self.banks
         cognition, perceptual = stores
@@ -85,10 +85,10 @@ class MemoryVlaEpisode(Episode):
         )
         return twin
 
-    def go_on_from(self, twin: Episode) -> None:
+    def resume_from(self, twin: Episode) -> None:
         """See `Writes`."""
         assert isinstance(twin, MemoryVlaEpisode)
-        self.asked = twin.asked
+        self.pending = twin.pending
 
 
 def _bank(entries: Sequence[tuple[int, Tensor]], like: BankState) -> BankState:

@@ -16,19 +16,21 @@ from mme_vla.methods.prismatic import Prismatic
 from mme_vla.types import MemoryTokens
 
 
-def read_moments(vlm: Prismatic, pictures: Tensor, prompt: Tensor, prompt_mask: Tensor) -> tuple[Tensor, Tensor]:
+def read_moments(vlm: Prismatic, images: Tensor, prompt: Tensor, prompt_mask: Tensor) -> tuple[Tensor, Tensor]:
     """Cognition token [n, 1, d] and vision features [n, p, c] of moments.
 
     Args:
-        pictures: [n, 3, s, s] in [−1, 1]. prompt, prompt_mask: [n, l].
+        images: [n, 3, s, s] in [−1, 1]. prompt, prompt_mask: [n, l].
     """
-    features = vlm.encode_images(pictures)
+    features = vlm.encode_images(images)
     embedded, patches = vlm.embed(prompt), vlm.projector(features)
     tokens = torch.cat([embedded[:, :1], patches.to(embedded), embedded[:, 1:]], 1)
-    seen = torch.cat([prompt_mask[:, :1], torch.ones_like(patches[..., 0], dtype=torch.bool), prompt_mask[:, 1:]], 1)
+    attention_mask = torch.cat(
+        [prompt_mask[:, :1], torch.ones_like(patches[..., 0], dtype=torch.bool), prompt_mask[:, 1:]], 1
+    )
     n = tokens.shape[1]
     causal = torch.ones(n, n, dtype=torch.bool, device=tokens.device).tril()
-    mask = additive_mask(causal & seen[:, None, :], tokens.dtype)
+    mask = additive_mask(causal & attention_mask[:, None, :], tokens.dtype)
     places = torch.arange(n, device=tokens.device).expand(len(tokens), -1)
     hidden = vlm.read(tokens, mask, places)
     return cognition_token(hidden, features.shape[1], prompt_mask.sum(1)), features
@@ -96,8 +98,8 @@ class MemoryVlaConfig:
     guidance: float = 1.5
 
     def __post_init__(self) -> None:
-        whole = {name: value for name, value in vars(self).items() if isinstance(value, int)}
-        for name, value in whole.items():
+        integers = {name: value for name, value in vars(self).items() if isinstance(value, int)}
+        for name, value in integers.items():
             if value < 1:
                 raise UserError(f"backbone.{name}={value} must be at least 1.")
         if not 0 <= self.dropout < 1:
@@ -154,8 +156,8 @@ class Core(nn.Module):
         """The head's error [n, h] on chunks [n, h, a], noised as the draws say."""
         noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
         drop = draws["drop"] < self.config.dropout
-        found = self.head(noised, draws["steps"], cognition, perceptual, drop)
-        return (found.float() - draws["noise"].float()).square().mean(-1)
+        predicted = self.head(noised, draws["steps"], cognition, perceptual, drop)
+        return (predicted.float() - draws["noise"].float()).square().mean(-1)
 
     def copies_error(
         self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
@@ -203,8 +205,8 @@ class RecallingCore(Core):
     ) -> tuple[Tensor, Tensor]:
         """See `Core.through`; each moment reads its own memory tokens."""
         past = required(memory)
-        read = self.cognition_retrieval.recall(past, cognition)
-        return read, self.perceptual_retrieval.recall(past, self.compression(features))
+        read = self.cognition_retrieval.read_memory(past, cognition)
+        return read, self.perceptual_retrieval.read_memory(past, self.compression(features))
 
 
 class MemoryVlaCore(Core):
@@ -238,8 +240,8 @@ class MemoryVlaCore(Core):
             sequences: places of the moments that share a bank, in the order of time.
             draws: `noise` [r·m, h, a], `steps` [r·m], `drop` [r·m] uniform; the whole batch r times over.
         """
-        read, seen = self.through(cognition, features, times, sequences)
-        return self.copies_error(actions, read, seen, draws)
+        read, perceptual = self.through(cognition, features, times, sequences)
+        return self.copies_error(actions, read, perceptual, draws)
 
     def through(
         self,
@@ -255,7 +257,7 @@ class MemoryVlaCore(Core):
 
     # Acting
 
-    def look(self, states: Sequence[BankStates], cognition: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def read_banks(self, states: Sequence[BankStates], cognition: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """What the head reads of b episodes' current moments: fused cognition [b, 1, d] and perceptual tokens."""
         return (
             self.cognition_bank.read([state.cognition for state in states], cognition),
@@ -264,11 +266,11 @@ class MemoryVlaCore(Core):
 
     def store(self, state: BankStates, cognition: Tensor, features: Tensor) -> BankStates:
         """One episode's banks after the moment [1, d], [p, c]; its time is how many went before it."""
-        fused, seen = self.look([state], cognition[None], features[None])
+        fused, perceptual = self.read_banks([state], cognition[None], features[None])
         tokens = self.compression(features[None])[0]
         return BankStates(
             self.cognition_bank.update(state.cognition, cognition, fused[0], state.count),
-            self.perceptual_bank.update(state.perceptual, tokens, seen[0], state.count),
+            self.perceptual_bank.update(state.perceptual, tokens, perceptual[0], state.count),
             state.count + 1,
         )
 

@@ -44,8 +44,18 @@ class MemoryVlaPolicy(Policy):
     """
 
     heads = ("core",)
-    adapted = ("attn.qkv", "attn.proj", "q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj")
-    unadaptable = r"^core\."
+    lora_targets = (
+        "attn.qkv",
+        "attn.proj",
+        "q_proj",
+        "k_proj",
+        "v_proj",
+        "o_proj",
+        "gate_proj",
+        "up_proj",
+        "down_proj",
+    )
+    lora_exclude = r"^core\."
     PARTS: ClassVar[Mapping[str, str]] = {
         "vision": r"vlm\.vision\.",
         "vlm": r"vlm\.",
@@ -136,14 +146,14 @@ class MemoryVlaPolicy(Policy):
         Args:
             changes: [g, m', 6] of the pictures, m' ≥ m; by default the middle is cut out.
         """
-        pictures = batch.images[batch.valid]
+        images = batch.images[batch.valid]
         if changes is None:
-            shown = centre_cut(pictures)
+            cropped = centre_cut(images)
         else:
-            shown = augment(pictures, changes[:, : batch.valid.shape[1]][batch.valid])
+            cropped = augment(images, changes[:, : batch.valid.shape[1]][batch.valid])
         with self.autocast():
-            told = (batch.prompt[batch.valid], batch.prompt_mask[batch.valid])
-            cognition, features = read_moments(self.vlm, to_unit_range(shown), *told)
+            prompt = (batch.prompt[batch.valid], batch.prompt_mask[batch.valid])
+            cognition, features = read_moments(self.vlm, to_unit_range(cropped), *prompt)
         counts = batch.valid.sum(1).tolist()
         return cognition, features, list(torch.arange(sum(counts)).split(counts))
 
@@ -176,7 +186,7 @@ class MemoryVlaPolicy(Policy):
             "drop": torch.rand(shape, generator=generator),
         }
 
-    def picture_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
         """While training with augmentation `changes` [n, m, 6]: what happens to the pictures of `count` groups."""
         if not (self.training and self.augment):
             return {}
@@ -191,21 +201,21 @@ class MemoryVlaPolicy(Policy):
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
-        given = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
-        if "changes" not in given:
-            given |= self.picture_draws(len(batch.images), torch.default_generator)
-        changes = given.pop("changes", None)
+        values = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
+        if "changes" not in values:
+            values |= self.image_draws(len(batch.images), torch.default_generator)
+        changes = values.pop("changes", None)
         copies = batch.valid.shape[1]
 
-        def whole_batch_over(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
+        def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
             return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
 
-        drawn = map_draws(given, lambda value: whole_batch_over(value.to(self.device)))
+        sampled = map_draws(values, lambda value: repeat_batch(value.to(self.device)))
         memory = self.encode_memory(batch.histories())
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
-            read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
-            losses = self.core.copies_error(batch.actions[batch.valid], read, seen, drawn)  # r·m h
+            read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
+            losses = self.core.copies_error(batch.actions[batch.valid], read, perceptual, sampled)  # r·m h
         counted = None
         if batch.action_mask is not None:
             of_moments = batch.action_mask[batch.valid]
@@ -214,15 +224,15 @@ class MemoryVlaPolicy(Policy):
         reported = {} if memory is None else memory.metrics
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
-        self.vlm.recompute(wanted)
+        self.vlm.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """Towers, word embedding, every layer of the language model, and every block of the head."""
-        whole = (self.vlm.vision, self.vlm.language.model.embed_tokens)
+        full_modules = (self.vlm.vision, self.vlm.language.model.embed_tokens)
         layers = (*self.vlm.language.model.layers, *self.core.head.blocks)
-        return [*(ShardGroup(module, full=True) for module in whole), *map(ShardGroup, layers)]
+        return [*(ShardGroup(module, full=True) for module in full_modules), *map(ShardGroup, layers)]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers, the language model's layers and the head's blocks, each by itself."""
@@ -258,9 +268,9 @@ class MemoryVlaPolicy(Policy):
             memory = self.encode_memory(batch.history) if memory is None else memory
         cognition, features, groups = self._of_batch(batch)
         with self.autocast():
-            read, seen = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
+            read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
             last = [int(group[-1]) for group in groups]
-            return self.core.sample(draws["noise"].to(self.device), read[last], seen[last], steps)
+            return self.core.sample(draws["noise"].to(self.device), read[last], perceptual[last], steps)
 
     # Episodes
 
@@ -270,11 +280,13 @@ class MemoryVlaPolicy(Policy):
 
     def observation(self, episodes: Sequence[Episode]) -> GroupBatch:
         """The current moments of running episodes, each a group of one; only banks know what number theirs has."""
-        pictures = self.require_processor().seen(torch.stack([episode.images for episode in episodes]))
+        images = self.require_processor().prepare_images(torch.stack([episode.images for episode in episodes]))
         ids, masks = words([episode.prompt for episode in episodes])
-        times = torch.tensor([0 if self.memory is not None else _own(episode).banks.count for episode in episodes])
+        times = torch.tensor(
+            [0 if self.memory is not None else _memoryvla_episode(episode).banks.count for episode in episodes]
+        )
         valid = torch.ones(len(episodes), 1, dtype=torch.bool)
-        return GroupBatch(pictures[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
+        return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
 
     def answer(
         self, batch: GroupBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
@@ -287,20 +299,22 @@ class MemoryVlaPolicy(Policy):
         with torch.no_grad():
             cognition, features, _ = self._of_batch(batch)
             with self.autocast():
-                read, seen = self.banked.look([_own(episode).banks for episode in episodes], cognition, features)
-                chunk = self.core.sample(draws["noise"].to(self.device), read, seen, steps)
+                read, perceptual = self.banked.read_banks(
+                    [_memoryvla_episode(episode).banks for episode in episodes], cognition, features
+                )
+                chunk = self.core.sample(draws["noise"].to(self.device), read, perceptual, steps)
         for i, episode in enumerate(episodes):
-            _own(episode).asked = (cognition[i], features[i])
+            _memoryvla_episode(episode).pending = (cognition[i], features[i])
         return chunk
 
     @torch.no_grad()
     def write(self, banks: BankStates, frames: np.ndarray, prompt: tuple[Tensor, Tensor]) -> BankStates:
         """Banks after further frames [n, H, W, 3] uint8 of the camera that the policy looks through."""
         processor = self.require_processor()
-        pictures = processor.resized(frames).to(self.device)
+        images = processor.resized(frames).to(self.device)
         ids, mask = (part.to(self.device).expand(len(frames), -1) for part in prompt)
         with self.autocast():
-            cognition, features = read_moments(self.vlm, to_unit_range(centre_cut(pictures)), ids, mask)
+            cognition, features = read_moments(self.vlm, to_unit_range(centre_cut(images)), ids, mask)
             for i in range(len(frames)):
                 banks = self.banked.store(banks, cognition[i], features[i])
         return banks
@@ -319,8 +333,8 @@ class MemoryVlaPolicy(Policy):
 
     def vision_fingerprint(self) -> str:
         """A hash of the towers, the dtype they run in, and what a memory's pictures go through before them."""
-        pictures = "" if self.processor is None else self.processor.memory_pictures
-        return tower_fingerprint(self.vlm.vision, self.compute_dtype, pictures, str(self.vlm.vision.dino_standard))
+        image_format = "" if self.processor is None else self.processor.memory_image_format
+        return tower_fingerprint(self.vlm.vision, self.compute_dtype, image_format, str(self.vlm.vision.dino_standard))
 
     def require_processor(self) -> MemoryVlaProcessor:
         """Return the processor, or say what it takes to have one."""
@@ -337,11 +351,11 @@ class MemoryVlaPolicy(Policy):
             "action_dim": (processor.action_dim, sizes.action_dim),
             "horizon": (processor.horizon, sizes.horizon),
         }
-        for name, (found, expected) in pairs.items():
-            if found != expected:
+        for name, (actual, expected) in pairs.items():
+            if actual != expected:
                 raise UserError(
-                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
-                    "two checkpoints, or one was changed."
+                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+                    "from two checkpoints, or one was changed."
                 )
 
     # Costs and parts
@@ -364,7 +378,7 @@ class MemoryVlaPolicy(Policy):
             history=None if self.memory is None else self.memory.full_history(self.sizes.vision.width, device),
         )
 
-    def see_empty_frame(self) -> None:
+    def warm_up_vision(self) -> None:
         """Run the vision towers on one black frame."""
         size = self.sizes.vision.image_size
         self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
@@ -374,6 +388,6 @@ class MemoryVlaPolicy(Policy):
         return self.PARTS
 
 
-def _own(episode: Episode) -> MemoryVlaEpisode:
+def _memoryvla_episode(episode: Episode) -> MemoryVlaEpisode:
     assert isinstance(episode, MemoryVlaEpisode)
     return episode

@@ -49,10 +49,10 @@ class GroupBatch(TensorStruct):
         alone = replace(self, history=None)._map(lambda x: x[here][:, None])
         return replace(alone, history=self._histories(here))
 
-    def _histories(self, chosen: Tensor) -> HistoryTokens | None:
+    def _histories(self, index: Tensor) -> HistoryTokens | None:
         if self.history is None or self.history.mask.ndim == 2:
             return self.history
-        return self.history.rows(chosen)
+        return self.history.rows(index)
 
 
 @PROCESSORS.register("memoryvla")
@@ -82,8 +82,8 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """As `Processor.from_sections`, at the sizes of the section `backbone`, which is no `Backbone` here."""
         of_network = {key: value for key, value in sections["backbone"].items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, of_network, "backbone")
-        own = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
-        built = cls.from_config({**sections["processor"], **own, "embodiment": embodiment_of(sections).to_dict()})
+        options = {"image_size": sizes.vision.image_size, "action_dim": sizes.action_dim}
+        built = cls.from_config({**sections["processor"], **options, "embodiment": embodiment_of(sections).to_dict()})
         if built.tokenizer.vocab_size > sizes.vocab_size:
             raise UserError(
                 f"The tokenizer {built.tokenizer.spec!r} has {built.tokenizer.vocab_size} entries but "
@@ -96,9 +96,9 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """The one camera that this policy looks through."""
         return (self.embodiment.memory_camera,)
 
-    def prompt(self, *given: Any, **named: Any) -> tuple[Tensor, Tensor]:
+    def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:
         """As `OpenVlaProcessor.prompt`, with the end-of-sequence token behind the piece `▁`."""
-        ids, mask = super().prompt(*given, **named)
+        ids, mask = super().prompt(*args, **named)
         place = min(int(mask.sum()), len(ids) - 1)
         ids[place - 1], ids[place] = self.tokenizer.piece("▁"), self.tokenizer.end
         mask[place] = True
@@ -124,7 +124,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         """Frames [..., H, W, 3] uint8 of that camera as pictures [..., 3, s, s] uint8."""
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(self._resized(frames), -1, -3)))
 
-    def seen(self, images: Tensor) -> Tensor:
+    def prepare_images(self, images: Tensor) -> Tensor:
         """Of pictures [..., v, 3, s, s] those of the one camera this policy looks through."""
         robot = self.embodiment
         return images[..., robot.camera_names.index(robot.memory_camera), :, :, :]

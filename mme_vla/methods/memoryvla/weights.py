@@ -18,8 +18,8 @@ _CONVOLUTION = "o i 1 1 -> o i"
 _BANK = r"(cognition|perceptual)_bank"
 
 _RULES = tuple(
-    (re.compile(rf"^(?:core\.)?{ours}$"), theirs, pattern)
-    for ours, theirs, pattern in (
+    (re.compile(rf"^(?:core\.)?{target}$"), source, pattern)
+    for target, source, pattern in (
         (r"vlm\.vision\.dino\.(.*)", r"vision_backbone.dino_featurizer.\1", ""),
         (r"vlm\.vision\.siglip\.(.*)", r"vision_backbone.siglip_featurizer.\1", ""),
         (r"vlm\.projector\.fc1\.(.*)", r"projector.projector.0.\1", ""),
@@ -57,34 +57,34 @@ _WORDS = {"cognition_bank": "cog_mem_bank", "perceptual_bank": "per_mem_bank"}
 _PROJECTIONS = {".query.": ".q_proj.", ".key.": ".k_proj.", ".value.": ".v_proj."}
 
 
-def memoryvla_piece(ours: str) -> Piece | None:
+def memoryvla_piece(target: str) -> Piece | None:
     """Where one of our tensors lies there; None where it has no name."""
     for pattern, replacement, layout in _RULES:
-        if pattern.match(ours):
-            theirs = pattern.sub(replacement, ours)
-            for words in (_WORDS, _PROJECTIONS) if "_bank." in ours else ():
+        if pattern.match(target):
+            source = pattern.sub(replacement, target)
+            for words in (_WORDS, _PROJECTIONS) if "_bank." in target else ():
                 for word, their in words.items():
-                    theirs = theirs.replace(word, their)
-            return Piece(theirs, layout)
+                    source = source.replace(word, their)
+            return Piece(source, layout)
     return None
 
 
 def memoryvla_table(names: Iterable[str]) -> NameTable:
     """The table of those of our tensors that have a name there."""
     pairs = ((name, memoryvla_piece(name)) for name in names)
-    return {ours: [piece] for ours, piece in pairs if piece is not None}
+    return {target: [piece] for target, piece in pairs if piece is not None}
 
 
 WEIGHTS = "model.pt"
-_OWN = ("memory", "action")
+_COMPONENTS = ("memory", "action")
 """Parts that Prismatic's checkpoints have nothing of."""
 _DROPPED = "action_model.net.history_embedder."  # CogACT's, which nothing reads
 
 
 def is_memoryvla(names: Iterable[str]) -> bool:
     """Whether tensors are named as in the authors' checkpoints, or in those of Prismatic that they start from."""
-    found = set(names)
-    return "vision_backbone.dino_featurizer.cls_token" in found and "llm_backbone.llm.model.norm.weight" in found
+    present = set(names)
+    return "vision_backbone.dino_featurizer.cls_token" in present and "llm_backbone.llm.model.norm.weight" in present
 
 
 def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
@@ -104,7 +104,7 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
             "Set model=memoryvla."
         )
     names = policy.state_dict()
-    return Adapter(memoryvla_table(names), fresh=frozenset(n for n in names if policy.part_of(n) in _OWN))
+    return Adapter(memoryvla_table(names), fresh=frozenset(n for n in names if policy.component_of(n) in _COMPONENTS))
 
 
 def write_memoryvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -115,6 +115,6 @@ def write_memoryvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: Nor
     """
     model: dict[str, dict[str, Tensor]] = {}
     for name, tensor in memoryvla_adapter(policy).export(policy.state_dict()).items():
-        part, _, own = name.partition(".")
-        model.setdefault(part, {})[own] = cast(tensor.detach(), dtype).cpu().contiguous()
+        part, _, suffix = name.partition(".")
+        model.setdefault(part, {})[suffix] = cast(tensor.detach(), dtype).cpu().contiguous()
     torch.save({"model": model}, folder / WEIGHTS)

@@ -80,8 +80,8 @@ class OpenVlaBackbone(Backbone):
     """
 
     Config = OpenVlaConfig
-    hosts = frozenset({"blocks"})
-    adapted = (
+    supports = frozenset({"blocks"})
+    lora_targets = (
         *("patch_embed.proj", "attn.qkv", "attn.proj", "mlp.fc1", "mlp.fc2"),
         *("attn_pool.q", "attn_pool.kv", "attn_pool.proj"),
         *("projector.fc1", "projector.fc2", "projector.fc3"),
@@ -145,16 +145,16 @@ class OpenVlaBackbone(Backbone):
         Raises:
             ValueError: the network reads the state, and the batch has none.
         """
-        seen = batch.image_mask[:, :, None].expand(fused.shape[:3]).flatten(1)
+        token_mask = batch.image_mask[:, :, None].expand(fused.shape[:3]).flatten(1)
         words = self.vlm.embed(batch.prompt)
         blocks = [
             Block("begin", words[:, :1], batch.prompt_mask[:, :1], "vlm"),
-            Block("images", self.vlm.projector(fused).flatten(1, 2), seen, "vlm"),
+            Block("images", self.vlm.projector(fused).flatten(1, 2), token_mask, "vlm"),
         ]
         if self.state_token is not None:
             if batch.proprio is None:
                 raise ValueError("This backbone reads the state: batch.proprio must hold it, normalised (it is None).")
-            blocks.append(Block("state", self.state_token(batch.proprio), torch.ones_like(seen[:, :1]), "vlm"))
+            blocks.append(Block("state", self.state_token(batch.proprio), torch.ones_like(token_mask[:, :1]), "vlm"))
         return [*blocks, Block("prompt", words[:, 1:], batch.prompt_mask[:, 1:], "vlm")]
 
     # The pass
@@ -165,9 +165,9 @@ class OpenVlaBackbone(Backbone):
         The words of one sample may be fewer than another's. Slots and `</s>` follow each one's last word by position;
         attention has no other order, so the padding between does no harm.
         """
-        own = {block.name: block for block in blocks if block.name in ("begin", "images", "state", "prompt")}
-        prompt = own.pop("prompt")
-        before = [*own.values(), *(block for block in blocks if block.name not in ("prompt", *own))]
+        by_name = {block.name: block for block in blocks if block.name in ("begin", "images", "state", "prompt")}
+        prompt = by_name.pop("prompt")
+        before = [*by_name.values(), *(block for block in blocks if block.name not in ("prompt", *by_name))]
         slots = self.horizon * self.action_dim
         zeros = prompt.tokens.new_zeros(len(prompt.tokens), slots, prompt.tokens.shape[-1])
         end = self.vlm.embed(torch.full_like(prompt.mask[:, :1], self.config.end_id, dtype=torch.long))
@@ -185,8 +185,8 @@ class OpenVlaBackbone(Backbone):
 
     def hidden(self, sequence: TokenSequence, every_layer: bool = False) -> Any:
         """The VLM's hidden states [b, n, d]: every token sees every valid one."""
-        seen = sequence.valid[:, None, :].expand(-1, sequence.valid.shape[1], -1)
-        mask = additive_mask(seen, sequence.tokens.dtype)
+        attention_mask = sequence.valid[:, None, :].expand(-1, sequence.valid.shape[1], -1)
+        mask = additive_mask(attention_mask, sequence.tokens.dtype)
         return self.vlm.read(sequence.tokens, mask, sequence.positions, every_layer)
 
     def slots(self, sequence: TokenSequence, hidden: Tensor) -> Tensor:
@@ -196,9 +196,9 @@ class OpenVlaBackbone(Backbone):
 
     def answer(self, batch: Batch, images: Tensor, inject: Inject) -> Tensor:
         """The chunk [b, h, a]."""
-        return self.answer_to(inject(self.observation_blocks(batch, images)).blocks)
+        return self.predict_from(inject(self.observation_blocks(batch, images)).blocks)
 
-    def answer_to(self, blocks: Sequence[Block]) -> Tensor:
+    def predict_from(self, blocks: Sequence[Block]) -> Tensor:
         """The chunk [b, h, a] for the blocks of an injection."""
         sequence = self.sequence(blocks)
         return self.head(self.slots(sequence, self.hidden(sequence)))
@@ -215,9 +215,9 @@ class OpenVlaBackbone(Backbone):
         """The chunk [b, h, a]; there is nothing to draw."""
         return self.answer(batch, images, inject)
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
-        self.vlm.recompute(wanted)
+        self.vlm.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """Towers, word embedding, and every layer of the language model."""
@@ -233,6 +233,6 @@ class OpenVlaBackbone(Backbone):
         return self.PARTS
 
 
-def absolute_error(answer: Tensor, actions: Tensor) -> Tensor:
+def absolute_error(predicted: Tensor, actions: Tensor) -> Tensor:
     """Mean |answer − actions| over the numbers of an action: [b, h, a] → [b, h]."""
-    return (answer.float() - actions.float()).abs().mean(-1)
+    return (predicted.float() - actions.float()).abs().mean(-1)

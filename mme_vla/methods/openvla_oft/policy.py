@@ -38,6 +38,6 @@ class OpenVlaPolicy(MMEPolicy):
         return draw_changes(count * views, generator).unflatten(0, (count, views))
 
     def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
-        pictures = batch.images.flatten(0, 1)
-        shown = centre_crop(pictures) if changes is None else augment(pictures, changes.flatten(0, 1))
-        return to_unit_range(shown).view(batch.images.shape)
+        images = batch.images.flatten(0, 1)
+        cropped = centre_crop(images) if changes is None else augment(images, changes.flatten(0, 1))
+        return to_unit_range(cropped).view(batch.images.shape)

@@ -190,7 +190,7 @@ def augment(images: Tensor, draws: Tensor) -> Tensor:
     """
     top, left, *colours = draws.to(images.device).unbind(1)
     pixels = crop(images.float() / 255, top, left).clamp(0, 1)
-    for change, by in zip((brighten, contrast, saturate, turn_hue), colours, strict=True):
+    for change, by in zip((brighten, contrast, saturate, shift_hue), colours, strict=True):
         pixels = change(pixels, by[:, None, None, None].float()).clamp(0, 1)
     return quantised(pixels)
 
@@ -212,7 +212,7 @@ def saturate(pixels: Tensor, by: Tensor) -> Tensor:
     return hsv_to_rgb(hue, (saturation * by.squeeze(-1)).clamp(0, 1), value)[:, 0]
 
 
-def turn_hue(pixels: Tensor, by: Tensor) -> Tensor:
+def shift_hue(pixels: Tensor, by: Tensor) -> Tensor:
     """Turn the hue, in turns of the circle."""
     hue, saturation, value = rgb_to_hsv(pixels[:, None])
     return hsv_to_rgb((hue + by.squeeze(-1)) % 1, saturation, value)[:, 0]
@@ -259,7 +259,7 @@ class OpenVlaProcessor(Processor):
         return to_unit_range(resized.to(device) if device is not None else resized).movedim(-1, 1)
 
     @property
-    def memory_pictures(self) -> str:
+    def memory_image_format(self) -> str:
         """Whether they are JPEG in between."""
         return "jpeg" if self.jpeg else ""
 
@@ -268,9 +268,9 @@ class OpenVlaProcessor(Processor):
 
     # Words
 
-    def prompt(self, *given: Any, **named: Any) -> tuple[Tensor, Tensor]:
+    def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:
         """As `Processor.prompt`, closed by the piece `▁`, whose state answers for the first number of the chunk."""
-        ids, mask = super().prompt(*given, **named)
+        ids, mask = super().prompt(*args, **named)
         place = min(int(mask.sum()), len(ids) - 1)
         ids[place], mask[place] = self.tokenizer.piece("▁"), True
         return ids, mask

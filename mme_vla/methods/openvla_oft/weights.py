@@ -24,8 +24,8 @@ from mme_vla.weights.torch_files import read_torch_file
 VLA, HEAD, STATE = "vla/", "action_head/", "proprio_projector/"
 
 _RULES = tuple(
-    (re.compile(ours), theirs)
-    for ours, theirs in (
+    (re.compile(target), source)
+    for target, source in (
         (r"^backbone\.vlm\.vision\.dino\.(.*)\.gamma$", rf"{VLA}vision_backbone.featurizer.\1.scale_factor"),
         (r"^backbone\.vlm\.vision\.dino\.(.*)$", rf"{VLA}vision_backbone.featurizer.\1"),
         (r"^backbone\.vlm\.vision\.siglip\.(.*)$", rf"{VLA}vision_backbone.fused_featurizer.\1"),
@@ -42,22 +42,22 @@ _RULES = tuple(
 )
 
 
-def openvla_name(ours: str) -> str | None:
+def openvla_name(target: str) -> str | None:
     """What a tensor of ours is called there, adapters included; None where it has no name.
 
     The same model under another policy of ours (MemoryVLA's `vlm.…`) has the same names.
     """
-    ours = f"backbone.{ours}" if ours.startswith("vlm.") else ours
-    for pattern, theirs in _RULES:
-        if pattern.match(ours):
-            return pattern.sub(theirs, ours)
+    target = f"backbone.{target}" if target.startswith("vlm.") else target
+    for pattern, replacement in _RULES:
+        if pattern.match(target):
+            return pattern.sub(replacement, target)
     return None
 
 
 def openvla_table(names: Iterable[str]) -> NameTable:
     """The table of those of our tensors that have a name there."""
     pairs = ((name, openvla_name(name)) for name in names)
-    return {ours: [Piece(theirs)] for ours, theirs in pairs if theirs is not None}
+    return {target: [Piece(source)] for target, source in pairs if source is not None}
 
 
 FOLDER, FILE, SETTINGS = "lora_adapter", "adapter_model.safetensors", "adapter_config.json"
@@ -71,8 +71,8 @@ def has_adapters(folder: Path) -> bool:
 
 def named_base(folder: Path) -> str:
     """What a run says its adapters were trained on; for messages alone."""
-    said = _settings(folder).get("base_model_name_or_path")
-    return said if isinstance(said, str) and said else "its base model"
+    name = _settings(folder).get("base_model_name_or_path")
+    return name if isinstance(name, str) and name else "its base model"
 
 
 def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
@@ -110,8 +110,8 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
 
 def _settings(folder: Path) -> dict[str, Any]:
     place = inside(folder / FOLDER, SETTINGS, "adapters")
-    found: dict[str, Any] = read_json(place, "a LoRA's settings", limit=2**20)
-    return found
+    settings: dict[str, Any] = read_json(place, "a LoRA's settings", limit=2**20)
+    return settings
 
 
 STATISTICS = "dataset_statistics.json"
@@ -122,8 +122,8 @@ _WRAPPED = "module."  # what data parallelism puts before the names of head and 
 
 def is_openvla(names: Iterable[str]) -> bool:
     """Whether tensors are named as in OpenVLA's own files."""
-    found = set(names)
-    return "vision_backbone.featurizer.cls_token" in found and "projector.fc1.weight" in found
+    present = set(names)
+    return "vision_backbone.featurizer.cls_token" in present and "projector.fc1.weight" in present
 
 
 def openvla_adapter(policy: Policy) -> Adapter:
@@ -141,7 +141,9 @@ def openvla_adapter(policy: Policy) -> Adapter:
             "start model=memoryvla from it (init_from=…)."
         )
     names = [name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name]
-    return Adapter(openvla_table(names), fresh=frozenset(name for name in names if policy.part_of(name) == "action"))
+    return Adapter(
+        openvla_table(names), fresh=frozenset(name for name in names if policy.component_of(name) == "action")
+    )
 
 
 def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
@@ -160,13 +162,13 @@ def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]
             "vision_backbone is of a run with FiLM (use_film), a noisy_action_projector of one with a diffusion head "
             "(use_diffusion): use a run without them."
         )
-    found = {f"{VLA}{name}": tensor for name, tensor in tensors.items()}
+    merged = {f"{VLA}{name}": tensor for name, tensor in tensors.items()}
     for module in (HEAD, STATE):
         files = sorted(folder.glob(f"{module.rstrip('/')}--*_checkpoint.pt"), key=_step)
         if files:
-            own = read_torch_file(files[-1])
-            found |= {f"{module}{name.removeprefix(_WRAPPED)}": tensor for name, tensor in own.items()}
-    return found
+            heads = read_torch_file(files[-1])
+            merged |= {f"{module}{name.removeprefix(_WRAPPED)}": tensor for name, tensor in heads.items()}
+    return merged
 
 
 def _step(file: Path) -> tuple[int, str]:
@@ -184,9 +186,11 @@ def read_dataset_statistics(folder: Path) -> NormStats | None:
         return None
     data = read_json(inside(folder, STATISTICS, "statistics"), "normalisation statistics", limit=2**24)
     of = next(iter(data.values())) if len(data) == 1 else None
-    if not isinstance(of, dict) or not all(isinstance(of.get(theirs), dict) for theirs in _FEATURES.values()):
+    if not isinstance(of, dict) or not all(isinstance(of.get(source_name), dict) for source_name in _FEATURES.values()):
         return None
-    return NormStats(**{ours: QuantileStats.from_dict(_known(of[name]), name) for ours, name in _FEATURES.items()})
+    return NormStats(
+        **{target_name: QuantileStats.from_dict(_known(of[name]), name) for target_name, name in _FEATURES.items()}
+    )
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -201,16 +205,16 @@ def write_openvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormS
     """
     from safetensors.torch import save_file
 
-    theirs = openvla_adapter(policy).export(policy.state_dict())
-    ready = {name: cast(tensor.detach(), dtype).cpu().contiguous() for name, tensor in theirs.items()}
+    released = openvla_adapter(policy).export(policy.state_dict())
+    ready = {name: cast(tensor.detach(), dtype).cpu().contiguous() for name, tensor in released.items()}
 
     def of(module: str, before: str = "") -> dict[str, Tensor]:
         return {before + name.removeprefix(module): x for name, x in ready.items() if name.startswith(module)}
 
     save_file(of(VLA), folder / WEIGHTS, metadata={"format": "pt"})
     for module in (HEAD, STATE):
-        if own := of(module, _WRAPPED):
-            torch.save(own, folder / f"{module.rstrip('/')}--0_checkpoint.pt")
+        if tensors := of(module, _WRAPPED):
+            torch.save(tensors, folder / f"{module.rstrip('/')}--0_checkpoint.pt")
     if stats is not None:
-        written = {theirs: getattr(stats, ours).to_dict() for ours, theirs in _FEATURES.items()}
-        (folder / STATISTICS).write_text(json.dumps({DATASET: written}, indent=2) + "\n")
+        statistics = {released: getattr(stats, target_name).to_dict() for target_name, released in _FEATURES.items()}
+        (folder / STATISTICS).write_text(json.dumps({DATASET: statistics}, indent=2) + "\n")

@@ -24,8 +24,8 @@ def unproject(depth: np.ndarray, intrinsic: np.ndarray, extrinsic: np.ndarray) -
     x = (columns - intrinsic[0, 2]) / intrinsic[0, 0] * depth
     y = (rows - intrinsic[1, 2]) / intrinsic[1, 1] * depth
     rotation, shift = extrinsic[:3, :3], extrinsic[:3, 3]
-    seen: np.ndarray = np.stack([x, y, depth], -1) - shift
-    return seen @ rotation  # of row vectors: the rotation's transpose, its inverse
+    camera_points: np.ndarray = np.stack([x, y, depth], -1) - shift
+    return camera_points @ rotation  # of row vectors: the rotation's transpose, its inverse
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def zoom_back(point: Tensor, centre: Tensor, factor: float = ZOOM) -> Tensor:
     return point / factor + centre
 
 
-def shift_and_turn(points: Tensor, centre: Tensor, shift: Tensor, angle: Tensor) -> Tensor:
+def shift_and_rotate(points: Tensor, centre: Tensor, shift: Tensor, angle: Tensor) -> Tensor:
     """Points [b, n, 3] turned about the vertical through a centre and moved.
 
     Args:
@@ -133,7 +133,7 @@ def angles_of(quaternions: Tensor) -> Tensor:
     roll = torch.where(up, 2 * difference, torch.where(down, 2 * added, difference + added))
     yaw = torch.where(up | down, 0.0, added - difference)
     tilt = torch.where(up, 90.0, torch.where(down, -90.0, tilt))
-    return torch.stack([_half_turn(torch.rad2deg(roll)), tilt, _half_turn(torch.rad2deg(yaw))], -1)
+    return torch.stack([_wrap_angle(torch.rad2deg(roll)), tilt, _wrap_angle(torch.rad2deg(yaw))], -1)
 
 
 def quaternions_of(angles: Tensor) -> Tensor:
@@ -161,7 +161,7 @@ def from_bins(bins: Tensor, count: int) -> Tensor:
     return quaternions_of(angles_of_bins(bins, count))
 
 
-def _half_turn(degrees: Tensor) -> Tensor:
+def _wrap_angle(degrees: Tensor) -> Tensor:
     return 180 - (180 - degrees).remainder(360)
 
 
@@ -176,10 +176,10 @@ def targets(pixels: Tensor, side: int, sigma: float = SIGMA) -> Tensor:
     With a `sigma` below 0 all of a target stands in the one pixel that is nearest.
     """
     if sigma < 0:
-        whole = pixels.round().to(torch.int64)
+        base = pixels.round().to(torch.int64)
         sharp = pixels.new_zeros(len(pixels), side * side)
-        inside = ((whole >= 0) & (whole < side)).all(-1)
-        sharp[inside.nonzero()[:, 0], (whole[:, 1] * side + whole[:, 0])[inside]] = 1
+        inside = ((base >= 0) & (base < side)).all(-1)
+        sharp[inside.nonzero()[:, 0], (base[:, 1] * side + base[:, 0])[inside]] = 1
         return sharp.view(-1, side, side)
     line = torch.arange(side, device=pixels.device, dtype=pixels.dtype)
     squares = (line - pixels[..., None]) ** 2  # n 2 side
@@ -201,8 +201,8 @@ def heatmap_loss(logits: Tensor, points: Tensor, sigma: float = SIGMA) -> Tensor
     """
     side = logits.shape[-1]
     pixels = project(points, side)
-    wanted = targets(pixels.flatten(0, 1), side, sigma).view(*pixels.shape[:2], side, side)
-    return soft_cross_entropy(logits[:, :, 0], wanted)
+    expected = targets(pixels.flatten(0, 1), side, sigma).view(*pixels.shape[:2], side, side)
+    return soft_cross_entropy(logits[:, :, 0], expected)
 
 
 def corners(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -250,8 +250,8 @@ class PointFinder:
         first, second = torch.meshgrid(self.line, self.line, indexing="ij")
         zero = torch.zeros_like(first)
         # top is seen by (x, y), front by (y, z), right by (x, z)
-        seen = [(first, second, zero), (zero, first, second), (first, zero, second)]
-        pixels = torch.stack([project(torch.stack(xyz, -1), side)[..., view, :] for view, xyz in enumerate(seen)])
+        axes = [(first, second, zero), (zero, first, second), (first, zero, second)]
+        pixels = torch.stack([project(torch.stack(xyz, -1), side)[..., view, :] for view, xyz in enumerate(axes)])
         self._numbers, self._weights = corners(pixels, side, side)
 
     def scores(self, heatmaps: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ _REDUCTION = 16
 """Pixels of the encoder's pictures to a patch of its third map."""
 
 
-class AdaptedProjection(nn.Module):
+class LoraProjection(nn.Module):
     """A fused projection to queries, keys and values, with low-rank changes of the queries and the values.
 
     Each change reaches as many numbers as the input has: the first ones and the last ones of the output. In the blocks
@@ -39,7 +39,7 @@ class AdaptedProjection(nn.Module):
         return out + torch.cat([queries, middle, values], -1)
 
 
-class PictureEncoder(nn.Module):
+class ImageEncoder(nn.Module):
     """Virtual pictures → maps at three sizes. One encoder serves both looks."""
 
     def __init__(self, sizes: SAM2ActSizes) -> None:
@@ -47,17 +47,17 @@ class PictureEncoder(nn.Module):
         self.side = sizes.grid * _REDUCTION
         self.vision = _vision_model(sizes.encoder, self.side)
         for block in self.vision.backbone.blocks:
-            block.attn.qkv = AdaptedProjection(block.attn.qkv, sizes.encoder.lora)
+            block.attn.qkv = LoraProjection(block.attn.qkv, sizes.encoder.lora)
         self.fine = nn.Conv2d(sizes.encoder.neck, sizes.token // 4, 1)
         self.middle = nn.Conv2d(sizes.encoder.neck, sizes.token // 2, 1)
 
-    def forward(self, pictures: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Maps [n, token/4, 4g, 4g], [n, token/2, 2g, 2g], [n, neck, g, g] of colours [n, 3, s, s] in [0, 1].
 
         Colours go in as they are: the released code neither subtracts a mean nor divides by a deviation.
         """
         size = (self.side, self.side)
-        scaled = nn.functional.interpolate(pictures, size, mode="bilinear", align_corners=True)
+        scaled = nn.functional.interpolate(images, size, mode="bilinear", align_corners=True)
         fine, middle, coarse = self.vision(scaled).fpn_hidden_states
         return self.fine(fine), self.middle(middle), coarse
 
@@ -83,10 +83,10 @@ def _vision_model(sizes: EncoderSizes, side: int) -> Any:
         "global_attention_blocks": list(sizes.global_blocks),
     }
     fine = side // 4
-    whole: dict[str, Any] = {
+    options: dict[str, Any] = {
         "backbone_config": transformers.Sam2HieraDetConfig(**hiera),
         "backbone_channel_list": sizes.widths[::-1],
         "backbone_feature_sizes": [[fine >> level, fine >> level] for level in range(3)],
         "fpn_hidden_size": sizes.neck,
     }
-    return transformers.Sam2VisionModel(transformers.Sam2VisionConfig(**whole))
+    return transformers.Sam2VisionModel(transformers.Sam2VisionConfig(**options))

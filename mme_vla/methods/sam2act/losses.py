@@ -8,14 +8,14 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.backbone.base import Draws
-from mme_vla.methods.sam2act.geometry import ZOOM, Cube, heatmap_loss, shift_and_turn, to_bins
+from mme_vla.methods.sam2act.geometry import ZOOM, Cube, heatmap_loss, shift_and_rotate, to_bins
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
-from mme_vla.methods.sam2act.processor import KeyframeBatch, closer_pictures, cloud_pictures
+from mme_vla.methods.sam2act.processor import KeyframeBatch, cloud_images, zoomed_images
 
-SHIFT, TURN = 0.125, math.pi / 4
+SHIFT, ROTATION = 0.125, math.pi / 4
 """Augmentation as released: shifts to this part of the cube's sides, turns to this angle."""
 _CLOSE_TO_EDGE = 1e-3  # metres that a shifted target keeps from the bounds
-_TOLD_WRONG = (-2, 2)  # how far off the bins that the heads are told may be; the upper end is left out
+_BIN_OFFSETS = (-2, 2)  # how far off the bins that the heads are told may be; the upper end is left out
 
 
 def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Draws:
@@ -23,7 +23,7 @@ def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -
     return {
         "shift": 2 * torch.rand(count, keyframes, 3, generator=generator) - 1,
         "turn": 2 * torch.rand(count, keyframes, generator=generator) - 1,
-        "told": torch.randint(*_TOLD_WRONG, (count, keyframes, 3), generator=generator),
+        "told": torch.randint(*_BIN_OFFSETS, (count, keyframes, 3), generator=generator),
     }
 
 
@@ -56,10 +56,10 @@ def augmented(
     if draws is not None:
         low, high = target.new_tensor(cube.low), target.new_tensor(cube.high)
         shift = draws["shift"].flatten(0, 1).to(target) * SHIFT * (high - low)
-        moved = (target + shift).clamp(low + _CLOSE_TO_EDGE, high - _CLOSE_TO_EDGE)
-        angle = draws["turn"].flatten().to(target) * TURN
-        points = shift_and_turn(points, target, moved - target, angle)
-        target, rotation = moved, _turned(rotation, angle)
+        shifted = (target + shift).clamp(low + _CLOSE_TO_EDGE, high - _CLOSE_TO_EDGE)
+        angle = draws["turn"].flatten().to(target) * ROTATION
+        points = shift_and_rotate(points, target, shifted - target, angle)
+        target, rotation = shifted, _turned(rotation, angle)
     return Scenes(
         points=points,
         colours=batch.colours.flatten(0, 1).to(points) / 255,
@@ -74,34 +74,34 @@ def augmented(
 
 def memory_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, length: int) -> dict[str, Tensor]:
     """The loss of the memory's stage: the coarse heatmaps of sequences of `length` keyframes."""
-    pictures = cloud_pictures(scenes.points, scenes.colours, cube, network.sizes.side)
-    logits = network.coarse_sequences(network.look(pictures, scenes.state, scenes.language), length)
+    images = cloud_images(scenes.points, scenes.colours, cube, network.sizes.side)
+    logits = network.coarse_sequences(network.encode_views(images, scenes.state, scenes.language), length)
     return {"heatmap": heatmap_loss(logits, scenes.target).mean()}
 
 
-def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, told: Tensor | None = None) -> dict[str, Tensor]:
+def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Tensor | None = None) -> dict[str, Tensor]:
     """The losses of the first stage, each of weight 1; single keyframes, no memory.
 
     The closer look stands at the true waypoint, and the heads read there.
 
     Args:
-        told: [n, 3]; by how many bins the rotation that the heads are told differs from the true one.
+        offsets: [n, 3]; by how many bins the rotation that the heads are told differs from the true one.
     """
     side, centre = network.sizes.side, scenes.target
-    pictures = cloud_pictures(scenes.points, scenes.colours, cube, side)
-    coarse = network.coarse_alone(network.look(pictures, scenes.state, scenes.language))
-    near = closer_pictures(scenes.points, scenes.colours, cube, centre, ZOOM, side)
-    fine, tokens = network.fine_step(network.look(near, scenes.state, scenes.language))
+    images = cloud_images(scenes.points, scenes.colours, cube, side)
+    coarse = network.coarse_alone(network.encode_views(images, scenes.state, scenes.language))
+    near = zoomed_images(scenes.points, scenes.colours, cube, centre, ZOOM, side)
+    fine, tokens = network.fine_step(network.encode_views(near, scenes.state, scenes.language))
     here = torch.zeros_like(centre)  # the waypoint, in the closer look's cube
     maps = torch.cat([heatmap_loss(coarse, centre), heatmap_loss(fine, here)], 1)
-    told_bins = scenes.bins if told is None else (scenes.bins + told) % network.sizes.rotation_bins
-    found = network.heads(tokens, here, told_bins)
+    noisy_bins = scenes.bins if offsets is None else (scenes.bins + offsets) % network.sizes.rotation_bins
+    outputs = network.heads(tokens, here, noisy_bins)
     entropy = nn.functional.cross_entropy
     return {
         "heatmap": maps.mean(),
-        **{f"rotation_{axis}": entropy(found[axis], scenes.bins[:, i]) for i, axis in enumerate("xyz")},
-        "gripper": entropy(found["gripper"], scenes.gripper),
-        "collision": entropy(found["collision"], scenes.collision),
+        **{f"rotation_{axis}": entropy(outputs[axis], scenes.bins[:, i]) for i, axis in enumerate("xyz")},
+        "gripper": entropy(outputs["gripper"], scenes.gripper),
+        "collision": entropy(outputs["collision"], scenes.collision),
     }
 
 

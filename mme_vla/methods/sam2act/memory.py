@@ -99,11 +99,11 @@ class RotaryAttention(nn.Module):
         Args:
             angles: [n, d/2]; those of the n places, the same for every remembered moment.
         """
-        asked = turn(self.queries(x), angles)
-        offered = turn(self.keys(keys), angles.repeat(keys.shape[1] // len(angles), 1))
+        queries = apply_rope(self.queries(x), angles)
+        offered = apply_rope(self.keys(keys), angles.repeat(keys.shape[1] // len(angles), 1))
         drop = _DROPOUT if self.training else 0.0
         mixed = nn.functional.scaled_dot_product_attention(
-            asked[:, None], offered[:, None], self.values(values)[:, None], dropout_p=drop
+            queries[:, None], offered[:, None], self.values(values)[:, None], dropout_p=drop
         )
         out: Tensor = self.out(mixed[:, 0])
         return out
@@ -160,7 +160,7 @@ def grid_angles(side: int, width: int, device: torch.device | None = None) -> Te
     return torch.cat([columns[:, None] * rates, rows[:, None] * rates], -1)
 
 
-def turn(x: Tensor, angles: Tensor) -> Tensor:
+def apply_rope(x: Tensor, angles: Tensor) -> Tensor:
     """Turn each pair of neighbouring numbers of x [b, n, d] by its angle [n, d/2]."""
     even, odd = x[..., 0::2], x[..., 1::2]
     cos, sin = angles.cos(), angles.sin()
@@ -216,7 +216,7 @@ class KeyframeBank(nn.Module):
         if not recent:
             return tokens
         places = self.positions().to(tokens)  # g² m
-        aged = [(places + self.ages[age]).expand_as(kept) for age, kept in enumerate(recent)]
+        aged = [(places + self.ages[age]).expand_as(entry) for age, entry in enumerate(recent)]
         x = tokens.flatten(2).transpose(1, 2)
         x = self.attention(x, positions, torch.cat(recent, 1), torch.cat(aged, 1))
         return x.transpose(1, 2).view_as(tokens)
@@ -229,8 +229,8 @@ class KeyframeBank(nn.Module):
         """
         side = self.grid * 2**self.mask_stages
         mask = nn.functional.interpolate(logits.float(), (side, side), mode="bilinear")
-        kept = self.encoder(tokens, mask.sigmoid() * _SHARPNESS - _SHIFT).flatten(2).transpose(1, 2)
-        return BankState((*state.maps, kept)[-self.remembered :])
+        encoded = self.encoder(tokens, mask.sigmoid() * _SHARPNESS - _SHIFT).flatten(2).transpose(1, 2)
+        return BankState((*state.maps, encoded)[-self.remembered :])
 
     def positions(self) -> Tensor:
         """Where remembered places stand, [g², m]."""

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.geometry import VIEWS, project, read_maps
-from mme_vla.methods.sam2act.image_encoder import PictureEncoder
+from mme_vla.methods.sam2act.image_encoder import ImageEncoder
 from mme_vla.methods.sam2act.memory import BankState, KeyframeBank, released_positions
 from mme_vla.speed.recompute import Recompute, run_layer
 
@@ -63,14 +63,14 @@ _WIDER = 4  # feed-forward layers, inside
 
 
 @dataclass(frozen=True)
-class Look:
+class EncodedViews:
     """What one look at the scene gives the network.
 
     pictures: [b, 3, 10, s, s] of `virtual_pictures`. maps: of the picture encoder for all views, finest first:
     [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p]. language: [b, l, w].
     """
 
-    pictures: Tensor
+    images: Tensor
     maps: tuple[Tensor, Tensor, Tensor]
     state: Tensor
     language: Tensor
@@ -157,16 +157,16 @@ class MultiViewTransformer(nn.Module):
         self.recomputed: Recompute = False
         """Whether layers keep no activations in training."""
 
-    def forward(self, look: Look) -> Tensor:
+    def forward(self, inputs: EncodedViews) -> Tensor:
         """Tokens [b·3, token, g, g], view by view."""
-        batch, grid = len(look.pictures), self.sizes.grid
-        patches = self.patches(look.pictures.flatten(0, 1))  # (b v) c g g
-        sam = nn.functional.leaky_relu(self.sam(look.maps[2]), SLOPE)
-        state = self.state(look.state)[:, None, :, None, None].expand(batch, VIEWS, -1, grid, grid).flatten(0, 1)
+        batch, grid = len(inputs.images), self.sizes.grid
+        patches = self.patches(inputs.images.flatten(0, 1))  # (b v) c g g
+        sam = nn.functional.leaky_relu(self.sam(inputs.maps[2]), SLOPE)
+        state = self.state(inputs.state)[:, None, :, None, None].expand(batch, VIEWS, -1, grid, grid).flatten(0, 1)
         tokens = torch.cat([sam, patches, state], 1).flatten(2).transpose(1, 2)
         tokens = tokens.reshape(batch, VIEWS * grid**2, -1) + self.positions
-        words = look.language.shape[1]
-        language = self.language(look.language.flatten(0, 1)).view(batch, words, -1)
+        words = inputs.language.shape[1]
+        language = self.language(inputs.language.flatten(0, 1)).view(batch, words, -1)
         x = self.wide(torch.cat([language, tokens], 1))
         language, views = x[:, :words], x[:, words:]
         alone = len(self.layers) // 2
@@ -229,10 +229,10 @@ class Heads(nn.Module):
         """What the heads read [b, f] of tokens [b·3, token, g, g] at waypoints [b, 3] of the closer look's cube."""
         batch, (token, grid) = len(waypoints), tokens.shape[1:3]
         by_view = tokens.view(batch, VIEWS, token, grid, grid)
-        whole = by_view.amax((-2, -1)).transpose(1, 2).flatten(1)  # channel by channel
+        pooled = by_view.amax((-2, -1)).transpose(1, 2).flatten(1)  # channel by channel
         pixels = project(waypoints, grid * self.patch) / self.patch  # b v 2
         there = read_maps(tokens, pixels.flatten(0, 1)[:, None]).view(batch, -1)  # view by view
-        return torch.cat([whole, there], -1)
+        return torch.cat([pooled, there], -1)
 
     def forward(self, features: Tensor, rotation: Tensor | None = None) -> dict[str, Tensor]:
         """Logits `gripper` [b, 2], `collision` [b, 2], and of each rotation bin `x`, `y`, `z` [b, bins].
@@ -245,10 +245,10 @@ class Heads(nn.Module):
         gripper, collision = self.gripper(features).chunk(2, -1)
         normed = self.norm(features)
         x = self.x(normed)
-        told = normed + self.code(x.argmax(-1) if rotation is None else rotation[:, 0])
-        y = self.y(told)
-        told = told + self.code(y.argmax(-1) if rotation is None else rotation[:, 1])
-        return {"gripper": gripper, "collision": collision, "x": x, "y": y, "z": self.z(told)}
+        conditioned = normed + self.code(x.argmax(-1) if rotation is None else rotation[:, 0])
+        y = self.y(conditioned)
+        conditioned = conditioned + self.code(y.argmax(-1) if rotation is None else rotation[:, 1])
+        return {"gripper": gripper, "collision": collision, "x": x, "y": y, "z": self.z(conditioned)}
 
     def code(self, bins: Tensor) -> Tensor:
         """Sines and cosines [b, f] of bins [b]."""
@@ -287,7 +287,7 @@ class SAM2ActNetwork(nn.Module):
     def __init__(self, sizes: SAM2ActSizes) -> None:
         super().__init__()
         self.sizes = sizes
-        self.encoder = PictureEncoder(sizes)
+        self.encoder = ImageEncoder(sizes)
         self.memory = KeyframeBank(
             grid=sizes.grid,
             token=sizes.token,
@@ -300,62 +300,62 @@ class SAM2ActNetwork(nn.Module):
         self.coarse = Branch(sizes)
         self.fine = Branch(sizes, with_heads=True)
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Compute the transformer layers' activations again in the backward pass, or keep them."""
-        self.coarse.transformer.recomputed = self.fine.transformer.recomputed = wanted
+        self.coarse.transformer.recomputed = self.fine.transformer.recomputed = mode
 
-    def look(self, pictures: Tensor, state: Tensor, language: Tensor) -> Look:
+    def encode_views(self, images: Tensor, state: Tensor, language: Tensor) -> EncodedViews:
         """What a branch reads: virtual pictures [b, 3, 10, s, s], the state [b, p], the goal's tokens [b, l, w]."""
-        return Look(pictures, self.encoder(pictures[:, :, COLOURS].flatten(0, 1)), state, language)
+        return EncodedViews(images, self.encoder(images[:, :, COLOURS].flatten(0, 1)), state, language)
 
-    def coarse_step(self, look: Look, remembered: BankState) -> tuple[Tensor, BankState]:
-        """Heatmap logits [b, 3, 1, s, s] of the coarse look, and what is remembered after it."""
-        tokens = self.coarse.transformer(look)
-        positions = released_positions(self.coarse.transformer.positions, len(look.pictures))
-        return self._remember_and_decode(look, tokens, positions, remembered)
+    def coarse_step(self, views: EncodedViews, remembered: BankState) -> tuple[Tensor, BankState]:
+        """Heatmap logits [b, 3, 1, s, s] of the coarse views, and what is remembered after it."""
+        tokens = self.coarse.transformer(views)
+        positions = released_positions(self.coarse.transformer.positions, len(views.images))
+        return self._store_and_decode(views, tokens, positions, remembered)
 
-    def coarse_alone(self, look: Look) -> Tensor:
+    def coarse_alone(self, views: EncodedViews) -> Tensor:
         """Heatmap logits [b, 3, 1, s, s] of the coarse look of episodes that remember nothing."""
-        logits: Tensor = self.coarse.decoder(self.coarse.transformer(look), *look.maps[:2])
+        logits: Tensor = self.coarse.decoder(self.coarse.transformer(views), *views.maps[:2])
         return logits.unflatten(0, (-1, VIEWS))
 
-    def coarse_sequences(self, look: Look, length: int) -> Tensor:
+    def coarse_sequences(self, views: EncodedViews, length: int) -> Tensor:
         """Heatmap logits [b, 3, 1, s, s] of sequences of keyframes, each with a bank of its own that begins empty.
 
         Gradients flow through everything that is remembered.
 
         Args:
-            look: of b = n · length keyframes, sequence by sequence.
+            views: of b = n · length keyframes, sequence by sequence.
         """
-        batch = len(look.pictures)
-        tokens = self.coarse.transformer(look)
+        batch = len(views.images)
+        tokens = self.coarse.transformer(views)
         positions = released_positions(self.coarse.transformer.positions, batch)
         rows = torch.arange(batch * VIEWS, device=tokens.device).view(-1, length, VIEWS)
-        remembered, found = self.memory.init_state(), []
+        remembered, decoded = self.memory.init_state(), []
         for step in range(length):
             now = rows[:, step].flatten()
-            maps = (look.maps[0][now], look.maps[1][now], look.maps[2][now])
-            here = replace(look, maps=maps)
-            logits, remembered = self._remember_and_decode(here, tokens[now], positions[now], remembered)
-            found.append(logits)
-        return torch.stack(found, 1).flatten(0, 1)
+            maps = (views.maps[0][now], views.maps[1][now], views.maps[2][now])
+            here = replace(views, maps=maps)
+            logits, remembered = self._store_and_decode(here, tokens[now], positions[now], remembered)
+            decoded.append(logits)
+        return torch.stack(decoded, 1).flatten(0, 1)
 
-    def _remember_and_decode(
-        self, look: Look, tokens: Tensor, positions: Tensor, remembered: BankState
+    def _store_and_decode(
+        self, views: EncodedViews, tokens: Tensor, positions: Tensor, remembered: BankState
     ) -> tuple[Tensor, BankState]:
         enriched = self.memory.read(remembered, tokens, positions)
-        logits = self.coarse.decoder(enriched, *look.maps[:2])
+        logits = self.coarse.decoder(enriched, *views.maps[:2])
         return logits.unflatten(0, (-1, VIEWS)), self.memory.update(remembered, tokens, logits)
 
-    def fine_step(self, look: Look) -> tuple[Tensor, Tensor]:
-        """Heatmap logits [b, 3, 1, s, s] of the closer look, and its tokens [b·3, token, g, g] for the heads."""
-        tokens = self.fine.transformer(look)
-        logits: Tensor = self.fine.decoder(tokens, *look.maps[:2])
+    def fine_step(self, views: EncodedViews) -> tuple[Tensor, Tensor]:
+        """Heatmap logits [b, 3, 1, s, s] of the closer views, and its tokens [b·3, token, g, g] for the heads."""
+        tokens = self.fine.transformer(views)
+        logits: Tensor = self.fine.decoder(tokens, *views.maps[:2])
         return logits.unflatten(0, (-1, VIEWS)), tokens
 
     def heads(self, tokens: Tensor, waypoints: Tensor, rotation: Tensor | None = None) -> dict[str, Tensor]:
         """What to do at waypoints [b, 3] of the closer look's cube: see `Heads.forward`."""
         heads = self.fine.heads
         assert heads is not None
-        found: dict[str, Tensor] = heads(heads.features(tokens, waypoints), rotation)
-        return found
+        outputs: dict[str, Tensor] = heads(heads.features(tokens, waypoints), rotation)
+        return outputs

@@ -70,34 +70,34 @@ _PARTS: list[_Rule] = [
 _AGES = "k 1 1 m -> k m"
 BRANCHES = ("mvt1", "mvt2")
 RATES = "mvt2.feat_fc_pe.div_term"
-PICTURES = "sam2."
+IMAGE_PREFIX = "sam2."
 """SAM2's tensors begin so; a checkpoint holds them twice more, once below each branch."""
 
 
-def released_name(ours: str, mask_stages: int) -> str:
+def released_name(target: str, mask_stages: int) -> str:
     """The released code's name of one of the network's tensors; masks are halved `mask_stages` times."""
-    name = ours
-    for pattern, theirs in [(r"memory\.encoder\.mask\.out\.", _mask(3 * mask_stages)), *_PLACES]:
-        name, found = re.subn(f"^{pattern}", theirs, name, count=1)
-        if found:
+    name = target
+    for pattern, replacement in [(r"memory\.encoder\.mask\.out\.", _mask(3 * mask_stages)), *_PLACES]:
+        name, count = re.subn(f"^{pattern}", replacement, name, count=1)
+        if count:
             break
-    for pattern, theirs in _PARTS:
-        name = re.sub(pattern, theirs, name)
+    for pattern, replacement in _PARTS:
+        name = re.sub(pattern, replacement, name)
     return name
 
 
-def released_names(ours: Iterable[str], mask_stages: int) -> NameTable:
+def released_names(targets: Iterable[str], mask_stages: int) -> NameTable:
     """The table of a network's tensors."""
     table: NameTable = {}
-    for name in ours:
-        theirs = released_name(name, mask_stages)
-        table[name] = [Piece(theirs, _AGES if name.endswith("memory.ages") else "")]
+    for name in targets:
+        released = released_name(name, mask_stages)
+        table[name] = [Piece(released, _AGES if name.endswith("memory.ages") else "")]
     return table
 
 
 def released_copies(names: Iterable[str]) -> dict[str, str]:
     """Copy → original: the branches' own copies of every tensor of SAM2's."""
-    return {f"{branch}.{name}": name for name in names if name.startswith(PICTURES) for branch in BRANCHES}
+    return {f"{branch}.{name}": name for name in names if name.startswith(IMAGE_PREFIX) for branch in BRANCHES}
 
 
 def released_constants(width: int) -> list[Derived]:
@@ -111,7 +111,7 @@ def released_unread(width: int = 256) -> list[Unread]:
     Args:
         width: of SAM2's own tokens.
     """
-    return [Unread(f"{PICTURES}{name}", shape) for name, shape in _unread_shapes(width).items()]
+    return [Unread(f"{IMAGE_PREFIX}{name}", shape) for name, shape in _unread_shapes(width).items()]
 
 
 def _unread_shapes(width: int) -> Mapping[str, tuple[int, ...]]:

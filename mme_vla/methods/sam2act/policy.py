@@ -12,7 +12,7 @@ from mme_vla.backbone.base import Draws, map_draws
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.methods.sam2act.config import SAM2ActSizes
-from mme_vla.methods.sam2act.episode import KeyframeEpisode, Seen, decide, watch
+from mme_vla.methods.sam2act.episode import KeyframeEpisode, SceneInputs, decide, watch
 from mme_vla.methods.sam2act.geometry import Cube, PointFinder
 from mme_vla.methods.sam2act.losses import augmentation_draws, augmented, first_loss, memory_loss
 from mme_vla.methods.sam2act.memory import BankState
@@ -73,7 +73,7 @@ class SAM2ActPolicy(Policy):
 
     processor: SAM2ActProcessor | None
     memory = None  # its memory stands inside the network, between transformer and decoder
-    adapted = ("to_q", "to_kv")
+    lora_targets = ("to_q", "to_kv")
     heads = ("heads",)
     PARTS: Mapping[str, str] = {
         "vision": r"backbone\.encoder\.vision\.(?!.*\.linear_[ab]_[qv]\.)",
@@ -144,7 +144,7 @@ class SAM2ActPolicy(Policy):
         heads.compute_rates(self.device)
 
     @property
-    def most_actions(self) -> int | None:  # type: ignore[override]
+    def max_actions(self) -> int | None:  # type: ignore[override]
         """Waypoints of an episode, which its clock counts to."""
         return None if self.processor is None else self.processor.waypoints
 
@@ -173,28 +173,28 @@ class SAM2ActPolicy(Policy):
         self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The stage's loss, and its parts to log (detached)."""
-        given = self.loss_draws(len(batch.points), torch.default_generator) if draws is None else draws
-        drawn = map_draws(given, lambda value: value.to(self.device))
+        values = self.loss_draws(len(batch.points), torch.default_generator) if draws is None else draws
+        sampled = map_draws(values, lambda value: value.to(self.device))
         cube, sizes = self.cube, self.backbone.sizes
-        moved = drawn if self.training and self.augment else None
-        scenes = augmented(batch, batch.language, moved, cube, sizes.rotation_bins)
+        augmentation = sampled if self.training and self.augment else None
+        scenes = augmented(batch, batch.language, augmentation, cube, sizes.rotation_bins)
         with self.autocast():
             if self.stage == "first":
-                told = drawn["told"].flatten(0, 1) if self.training else None
-                parts = first_loss(self.backbone, scenes, cube, told)
+                offsets = sampled["told"].flatten(0, 1) if self.training else None
+                parts = first_loss(self.backbone, scenes, cube, offsets)
             else:
                 parts = memory_loss(self.backbone, scenes, cube, batch.points.shape[1])
         loss = torch.stack(list(parts.values())).sum()
         return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
 
-    def recompute(self, wanted: Recompute) -> None:
+    def recompute(self, mode: Recompute) -> None:
         """Compute the layers' activations again in the backward pass instead of keeping them, or keep them."""
-        self.backbone.recompute(wanted)
+        self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """SAM2's encoder, and every layer of both transformers."""
-        looks = (self.backbone.coarse, self.backbone.fine)
-        layers = [ShardGroup(layer) for look in looks for layer in stacked_layers(look.transformer)]
+        stages = (self.backbone.coarse, self.backbone.fine)
+        layers = [ShardGroup(layer) for stage in stages for layer in stacked_layers(stage.transformer)]
         return [ShardGroup(self.backbone.encoder, full=True), *layers]
 
     # Sampling
@@ -204,28 +204,30 @@ class SAM2ActPolicy(Policy):
         self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
     ) -> Tensor:
         """The waypoint [b, 1, 7] after the last keyframe of each sequence; those before it are remembered."""
-        found = []
+        waypoints = []
         for i in range(len(batch.points)):
             state = BankState()
-            seen = [self._seen(batch, i, k) for k in range(batch.points.shape[1])]
-            for earlier in seen[:-1]:
+            scenes = [self._scene_of(batch, i, k) for k in range(batch.points.shape[1])]
+            for earlier in scenes[:-1]:
                 state = self.watch(earlier, state)
-            found.append(self._decide(seen[-1], state)[0])
-        return torch.stack(found)[:, None]
+            waypoints.append(self._decide(scenes[-1], state)[0])
+        return torch.stack(waypoints)[:, None]
 
-    def _seen(self, batch: KeyframeBatch, sample: int, keyframe: int) -> Seen:
+    def _scene_of(self, batch: KeyframeBatch, sample: int, keyframe: int) -> SceneInputs:
         colours = batch.colours[sample, keyframe].float() / 255
-        return Seen(batch.points[sample, keyframe], colours, batch.state[sample, keyframe], batch.language[sample])
+        return SceneInputs(
+            batch.points[sample, keyframe], colours, batch.state[sample, keyframe], batch.language[sample]
+        )
 
-    def watch(self, seen: Seen, remembered: BankState) -> BankState:
+    def watch(self, scene: SceneInputs, remembered: BankState) -> BankState:
         """What an episode remembers after a frame at which nothing is decided."""
         with self.autocast():
-            return watch(self.backbone, seen.to(self.device), remembered, self.cube)
+            return watch(self.backbone, scene.to(self.device), remembered, self.cube)
 
-    def _decide(self, seen: Seen, remembered: BankState) -> tuple[Tensor, BankState]:
+    def _decide(self, scene: SceneInputs, remembered: BankState) -> tuple[Tensor, BankState]:
         cube = self.cube
         with self.autocast():
-            return decide(self.backbone, seen.to(self.device), remembered, cube, self._finder)
+            return decide(self.backbone, scene.to(self.device), remembered, cube, self._finder)
 
     @cached_property
     def _finder(self) -> PointFinder:
@@ -237,25 +239,25 @@ class SAM2ActPolicy(Policy):
         """Begin an episode with an empty bank."""
         return KeyframeEpisode(self, goal, seed)
 
-    def observation(self, episodes: "Sequence[Episode]") -> list[Seen]:
+    def observation(self, episodes: "Sequence[Episode]") -> list[SceneInputs]:
         """What running episodes see now."""
-        return [episode.seen() for episode in episodes if isinstance(episode, KeyframeEpisode)]
+        return [episode.scene_inputs() for episode in episodes if isinstance(episode, KeyframeEpisode)]
 
     def answer(
         self,
-        batch: list[Seen],
+        batch: list[SceneInputs],
         episodes: "Sequence[Episode]",
         draws: Mapping[str, Tensor],
         steps: int | None = None,
     ) -> Tensor:
         """The next waypoints [n, 1, 7]; what is remembered of these keyframes counts from the next frames on."""
-        found = []
-        for seen, episode in zip(batch, episodes, strict=True):
+        waypoints = []
+        for scene, episode in zip(batch, episodes, strict=True):
             assert isinstance(episode, KeyframeEpisode)
-            action, after = self._decide(seen, episode.remembered)
+            action, after = self._decide(scene, episode.remembered)
             episode.decided(after)
-            found.append(action)
-        return torch.stack(found)[:, None]
+            waypoints.append(action)
+        return torch.stack(waypoints)[:, None]
 
     def require_processor(self) -> SAM2ActProcessor:
         """Return the processor, or say what it takes to have one."""
@@ -267,11 +269,11 @@ class SAM2ActPolicy(Policy):
         """See `Saved`."""
         super().check_processor(source)
         text, sizes = self.require_processor().text, self.backbone.sizes
-        for name, found, expected in (("language", text.width, sizes.language), ("words", text.words, sizes.words)):
-            if found != expected:
+        for name, actual, expected in (("language", text.width, sizes.language), ("words", text.words, sizes.words)):
+            if actual != expected:
                 raise UserError(
-                    f"{source}: the processor's {name} is {brief(found)}, the network's {expected}. The files are from "
-                    "two checkpoints, or one was changed."
+                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+                    "from two checkpoints, or one was changed."
                 )
 
     # Costs and parts
@@ -280,7 +282,7 @@ class SAM2ActPolicy(Policy):
         """A batch of one without content, as the stage trains on it."""
         sizes, k = self.backbone.sizes, self.keyframes
         points = len(self.embodiment.cameras) * 128**2
-        whole = torch.zeros(1, k, dtype=torch.int64, device=device)
+        integers = torch.zeros(1, k, dtype=torch.int64, device=device)
         return KeyframeBatch(
             points=torch.zeros(1, k, points, 3, device=device),
             colours=torch.zeros(1, k, points, 3, dtype=torch.uint8, device=device),
@@ -288,11 +290,11 @@ class SAM2ActPolicy(Policy):
             language=torch.zeros(1, sizes.words, sizes.language, device=device),
             target=torch.zeros(1, k, 3, device=device),
             rotation=torch.tensor([0.0, 0, 0, 1], device=device).expand(1, k, 4),
-            gripper=whole,
-            collision=whole.clone(),
+            gripper=integers,
+            collision=integers.clone(),
         )
 
-    def see_empty_frame(self) -> None:
+    def warm_up_vision(self) -> None:
         """Run the encoder on the virtual pictures of nothing."""
         side = self.backbone.encoder.side
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))

@@ -16,7 +16,7 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, missing_extra
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
 from mme_vla.methods.sam2act.geometry import VIEWS, Cube, constant_channels, quaternions_of, unproject
-from mme_vla.methods.sam2act.render import EMPTY, virtual_pictures
+from mme_vla.methods.sam2act.render import EMPTY, virtual_images
 from mme_vla.processing.base import STATS_FILE, PolicyProcessor
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.registry import PROCESSORS
@@ -88,30 +88,30 @@ def cloud_of(shots: Sequence[Shot], side: int) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(points), np.concatenate(colours)
 
 
-def cloud_pictures(points: Tensor, colours: Tensor, cube: Cube, side: int) -> Tensor:
+def cloud_images(points: Tensor, colours: Tensor, cube: Cube, side: int) -> Tensor:
     """What the coarse look sees of clouds in the world: [b, 3, 10, side, side].
 
     Args:
         points: [b, n, 3] in metres; those outside of the cube are left out. colours: [b, n, 3] in [0, 1].
     """
     inside = cube.inside(points)
-    return _pictures(cube.place(points), colours, inside, side)
+    return _render_images(cube.place(points), colours, inside, side)
 
 
-def closer_pictures(points: Tensor, colours: Tensor, cube: Cube, centre: Tensor, zoom: float, side: int) -> Tensor:
+def zoomed_images(points: Tensor, colours: Tensor, cube: Cube, centre: Tensor, zoom: float, side: int) -> Tensor:
     """What the closer look sees: the same points, `zoom` times larger around centres [b, 3] in the cube."""
     inside = cube.inside(points)
-    return _pictures(zoom * (cube.place(points) - centre[:, None]), colours, inside, side)
+    return _render_images(zoom * (cube.place(points) - centre[:, None]), colours, inside, side)
 
 
-def _pictures(points: Tensor, colours: Tensor, shown: Tensor, side: int) -> Tensor:
+def _render_images(points: Tensor, colours: Tensor, inside: Tensor, side: int) -> Tensor:
     if points.is_meta:  # shapes alone: there is nothing to draw
         return points.new_empty(len(points), VIEWS, CHANNELS, side, side)
-    seen = [
-        virtual_pictures(cloud[kept], paint[kept], side) if kept.any() else _nothing(side, cloud.device)
-        for cloud, paint, kept in zip(points, colours, shown, strict=True)
+    images = [
+        virtual_images(cloud[mask], paint[mask], side) if mask.any() else _nothing(side, cloud.device)
+        for cloud, paint, mask in zip(points, colours, inside, strict=True)
     ]
-    return torch.stack(seen)
+    return torch.stack(images)
 
 
 def _nothing(side: int, device: torch.device) -> Tensor:

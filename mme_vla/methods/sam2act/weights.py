@@ -18,23 +18,23 @@ WEIGHTS = "model_plus_last.pth"
 _WRAPPED = "module."
 
 
-def is_sam2act(found: Iterable[str]) -> bool:
+def is_sam2act(names: Iterable[str]) -> bool:
     """Whether tensors are named as in the authors' checkpoints, in whatever wrapping."""
-    plain = {name.removeprefix(_WRAPPED) for name in found}
-    return {"mvt1.pos_encoding", "mvt2.pos_encoding"} <= plain
+    unwrapped = {name.removeprefix(_WRAPPED) for name in names}
+    return {"mvt1.pos_encoding", "mvt2.pos_encoding"} <= unwrapped
 
 
-def plain_sam2act_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
+def unwrap_sam2act_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
     """Tensors by their names without wrapping, each copy of SAM2's compared with the original.
 
     Raises:
         UserError: a copy is another tensor: the three are one module in the released code.
     """
-    found = {name.removeprefix(_WRAPPED): tensor for name, tensor in tensors.items()}
-    for copy, original in names.released_copies(found).items():
-        if copy in found and not torch.equal(found[copy], found[original]):
+    renamed = {name.removeprefix(_WRAPPED): tensor for name, tensor in tensors.items()}
+    for copy, original in names.released_copies(renamed).items():
+        if copy in renamed and not torch.equal(renamed[copy], renamed[original]):
             raise UserError(f"{source}: {copy} is another tensor than {original}, of which it should be a copy.")
-    return found
+    return renamed
 
 
 def sam2act_adapter(policy: Policy) -> Adapter:
@@ -66,6 +66,6 @@ def write_sam2act(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormS
     Raises:
         UserError: another kind of policy.
     """
-    theirs = sam2act_adapter(policy).export(policy.state_dict())
-    model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in theirs.items()}
+    released = sam2act_adapter(policy).export(policy.state_dict())
+    model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in released.items()}
     torch.save({"epoch": 0, "model_state": model, "optimizer_state": {}, "lr_sched_state": {}}, folder / WEIGHTS)

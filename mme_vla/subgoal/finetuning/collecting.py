@@ -32,13 +32,13 @@ from mme_vla.utils import (
     FolderLock,
     claim_plan,
     file_sum,
-    plain,
     read_json,
     remove_drafts,
+    to_json,
     write_atomically,
     write_sums,
 )  # fmt: skip
-from mme_vla.utils.media import png_bytes, write_film
+from mme_vla.utils.media import png_bytes, write_video
 
 if TYPE_CHECKING:
     pass
@@ -54,7 +54,7 @@ class Demonstration:
     number: int
     origin: str
     labels: Callable[[], Labels]
-    pictures: Callable[[Sequence[int]], Iterator[np.ndarray]]
+    read_images: Callable[[Sequence[int]], Iterator[np.ndarray]]
 
     @property
     def name(self) -> str:
@@ -94,7 +94,7 @@ def build(
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise UserError(f"Two episodes are called {twice[0]}: give inputs that do not overlap, or build them apart.")
     origins = {episode.name: episode.origin for episode in episodes}
-    plan = plain({"sets": list(sets), "options": asdict(options), "episodes": origins})
+    plan = to_json({"sets": list(sets), "options": asdict(options), "episodes": origins})
     with FolderLock(output, "build of subgoal data"):
         return _build(episodes, output, sets, options, plan)
 
@@ -127,18 +127,18 @@ def _build(
 
 def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], options: RowOptions) -> None:
     labels = episode.labels()
-    wanted: dict[int, list[Path]] = {}
+    paths_at: dict[int, list[Path]] = {}
     for name in sets:
         built = episode_rows(name, labels, options)
         for image, frame in built.images.items():
-            wanted.setdefault(frame, []).append(output / image)
+            paths_at.setdefault(frame, []).append(output / image)
         if built.video:
             _write_once(output / built.video, partial(_write_video, episode, labels.exec_start))
-    missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(wanted.items())}
+    missing = {t: [path for path in paths if not path.is_file()] for t, paths in sorted(paths_at.items())}
     steps = [t for t, paths in missing.items() if paths]
-    for t, picture in zip(steps, episode.pictures(steps), strict=True):
+    for t, pixels in zip(steps, episode.read_images(steps), strict=True):
         for path in missing[t]:
-            _write_once(path, partial(_write_png, picture))
+            _write_once(path, partial(_write_png, pixels))
     for name in sets:  # the rows last: where they are, their pictures are
         rows = episode_rows(name, labels, options).rows
         with write_atomically(_part(output, name, episode)) as draft:
@@ -152,12 +152,12 @@ def _write_once(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def _write_video(episode: Demonstration, length: int, path: Path) -> None:
-    write_film(episode.pictures(range(length)), path, **ENCODING)
+    write_video(episode.read_images(range(length)), path, **ENCODING)
 
 
-def _write_png(picture: np.ndarray, path: Path) -> None:
+def _write_png(image: np.ndarray, path: Path) -> None:
     with write_atomically(path) as draft:
-        draft.write_bytes(png_bytes(picture))
+        draft.write_bytes(png_bytes(image))
 
 
 def _part(output: Path, name: str, episode: Demonstration) -> Path:
@@ -178,22 +178,22 @@ def _h5_readers(ref: EpisodeRef) -> tuple[Callable[[], Labels], Callable[[Sequen
                 *episode.joints(),
             )
 
-    def pictures(steps: Sequence[int]) -> Iterator[np.ndarray]:
+    def read_images(steps: Sequence[int]) -> Iterator[np.ndarray]:
         with open_episode(ref) as episode:
             for t in steps:
                 yield episode.front(t)
 
-    return labels, pictures
+    return labels, read_images
 
 
 def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstration]:
     needed = ("simple_subgoal", "grounded_subgoal")
     if lacking := [name for name in needed if name not in source.subgoal_names]:
         raise UserError(f"{source.root} has no column {' and no '.join(lacking)}: nothing to learn subgoals from.")
-    given = {} if tasks is None else _read_tasks(tasks)
-    found = []
+    task_names = {} if tasks is None else _read_tasks(tasks)
+    demonstrations = []
     for e in range(len(source)):
-        task = given.get(str(e)) or source.task(e)
+        task = task_names.get(str(e)) or source.task(e)
         if not task:
             raise UserError(
                 f"{source.root} does not tell the task of episode {e}, which some rules depend on. Give a JSON file "
@@ -204,16 +204,16 @@ def _from_lerobot(source: EpisodeSource, tasks: Path | None) -> list[Demonstrati
         if type(number) is not int or not 0 <= number < 2**31:
             raise UserError(f"{source.root} gives {brief(number)} as the number of episode {e}; expected a whole one.")
         reader = partial(_lerobot_labels, source, e, task, number)
-        pictures = partial(_lerobot_pictures, source, e)
-        found.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, pictures))
-    return found
+        read_images = partial(_lerobot_images, source, e)
+        demonstrations.append(Demonstration(task, number, f"{source.fingerprint}:{e}", reader, read_images))
+    return demonstrations
 
 
 def _read_tasks(path: Path) -> dict[str, str]:
-    given: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}', kind=(dict, list))
-    if not isinstance(given, dict) or not all(isinstance(task, str) for task in given.values()):
+    tasks: dict[str, str] = read_json(path, 'tasks=<file> of {"<episode index>": "<Task>", …}', kind=(dict, list))
+    if not isinstance(tasks, dict) or not all(isinstance(task, str) for task in tasks.values()):
         raise UserError(f'tasks={path} must hold {{"<episode index>": "<Task>", …}}.')
-    return given
+    return tasks
 
 
 def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int) -> Labels:
@@ -230,6 +230,6 @@ def _lerobot_labels(source: EpisodeSource, episode: int, task: str, number: int)
     )
 
 
-def _lerobot_pictures(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
+def _lerobot_images(source: EpisodeSource, episode: int, steps: Sequence[int]) -> Iterator[np.ndarray]:
     for start in range(0, len(steps), 64):  # what is decoded at once stays small
         yield from source.frames(episode, list(steps[start : start + 64]))

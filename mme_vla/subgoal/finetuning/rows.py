@@ -19,7 +19,7 @@ from mme_vla.subgoal.text import (
     BBOX,
     Point,
     mark_points,
-    memer_answer,
+    memer_reply,
     memer_system,
     memer_user,
     subgoal_system,
@@ -55,8 +55,8 @@ class RowOptions:
 
     def __post_init__(self) -> None:
         if self.noise is not None:
-            whole = all(isinstance(value, int) for value in self.noise)
-            if not whole or len(self.noise) != 2 or self.noise[0] > self.noise[1]:
+            are_integers = all(isinstance(value, int) for value in self.noise)
+            if not are_integers or len(self.noise) != 2 or self.noise[0] > self.noise[1]:
                 raise UserError(f"noise={list(self.noise)} must be [lowest, highest] in whole pixels, or null.")
         if not isinstance(self.seed, int) or self.seed < 0:
             raise UserError(f"seed={self.seed!r} must be a whole number, 0 or more.")
@@ -93,16 +93,16 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
     for messages, points, frames in build(kind, labels, options):
         names = [f"{stem}_step{t}.png" for t in frames]
         images.update(zip(names, frames, strict=True))
-        system, user, answer = messages
+        system, user, target = messages
         row: Row = {
             "messages": [
                 {"role": "system", "content": system},
                 {"role": "user", "content": user},
-                {"role": "assistant", "content": answer},
+                {"role": "assistant", "content": target},
             ]
         }
         if kind == "grounded":
-            row["objects"] = {"ref": [], "bbox": [_moved(point, options.noise, rng) for point in points]}
+            row["objects"] = {"ref": [], "bbox": [_perturbed(point, options.noise, rng) for point in points]}
         row["images"] = names
         if video:
             row["videos"] = [video]
@@ -117,24 +117,24 @@ def _qwenvl(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
     steps, repeats = selected_steps(labels, options.short_segments)
     history = SubgoalHistory()
     for t in steps:
-        answer, points = mark_points(labels.texts(kind)[t])
+        target, points = mark_points(labels.texts(kind)[t])
         user = subgoal_user(kind, labels.goal, history.entries, video=labels.exec_start > 0)
-        texts = (subgoal_system(kind), user, answer)
+        texts = (subgoal_system(kind), user, target)
         for _ in range(1 + (repeats.get(t, 0) if options.repeat_changes else 0)):
             yield texts, [*history.points, *points], [t]
-        history.add(answer, points)
+        history.add(target, points)
 
 
 def _memer(kind: str, labels: Labels, options: RowOptions) -> Iterator[Draft]:
-    wanted = keyframes(labels, options.substring_match)
-    for window in windows(labels, wanted, one_a_window=not options.second_keyframe):
+    targets = keyframes(labels, options.substring_match)
+    for window in windows(labels, targets, one_a_window=not options.second_keyframe):
         subtask, points = mark_points(labels.texts(kind)[window.frames[-1]])
         user = memer_user(labels.goal, len(window.past), len(window.frames), video=labels.exec_start > 0)
-        texts = (memer_system(), user, memer_answer(subtask, window.positions))
+        texts = (memer_system(), user, memer_reply(subtask, window.positions))
         yield texts, points, [*window.past, *window.frames]
 
 
-def _moved(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
+def _perturbed(point: Point, noise: tuple[int, int] | None, rng: np.random.Generator) -> list[int]:
     if noise is None:
         return list(point)
     shift = rng.integers(noise[0], noise[1] + 1, 2)
@@ -155,9 +155,7 @@ def read_rows(file: str | Path) -> list[Row]:
     """
     path = Path(file)
     if not path.is_file():
-        raise UserError(
-            f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}"
-        )
+        raise UserError(f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
     Sums(path.parent, remedy="Build the training data again").check(path.name)
     rows: list[Row] = []
     for number, row in read_json_lines(path, "rows of training data", _LIMIT):
@@ -198,18 +196,18 @@ def _is_point(point: object) -> bool:
 
 def texts_of(row: Row) -> tuple[str, str, str]:
     """System, user and answer of a row, points written as the model sees them."""
-    system, user, answer = (message["content"] for message in row["messages"])
+    system, user, target = (message["content"] for message in row["messages"])
     points = [(y, x) for y, x in row.get("objects", {}).get("bbox", [])]
-    asked = user.count(BBOX)
-    return system, write_boxes(user, points[:asked]), write_boxes(answer, points[asked:])
+    n_points = user.count(BBOX)
+    return system, write_boxes(user, points[:n_points]), write_boxes(target, points[n_points:])
 
 
 def question_of(row: Row, folder: Path) -> Question:
     """A row with its pictures; paths are relative to `folder`."""
-    system, user, answer = texts_of(row)
+    system, user, target = texts_of(row)
     images = [read_image(inside(folder, name, "picture")) for name in row.get("images", [])]
     videos = [Clip.read(inside(folder, name, "video")) for name in row.get("videos", [])]
-    return Question(system, user, images, videos, answer)
+    return Question(system, user, images, videos, target)
 
 
 class RowDataset(torch.utils.data.Dataset[Question]):
@@ -222,10 +220,10 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         self.folder = Path(file).parent
         self._sums = Sums(self.folder, remedy="Build the training data again")
         rows = read_rows(file)
-        shown = next((name for row in rows for name in row.get("images", [])), None)
-        if shown is None:
+        example = next((name for row in rows for name in row.get("images", [])), None)
+        if example is None:
             raise UserError(f"{file} has no row with a picture. Build the training data again.")
-        image = _image_tokens(read_image(inside(self.folder, shown, "picture")).shape)
+        image = _image_tokens(read_image(inside(self.folder, example, "picture")).shape)
         self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
         self.left_out = len(rows) - len(self.rows)
         if not self.rows:
@@ -277,8 +275,8 @@ def hf_dataset(file: str | Path) -> Any:
     folder = Path(file).resolve().parent
     columns: dict[str, list[Any]] = {"messages": [], "images": [], "videos": []}
     for row in read_rows(file):
-        system, user, answer = texts_of(row)
-        messages = Question(system, user, answer=answer).messages()
+        system, user, target = texts_of(row)
+        messages = Question(system, user, target=target).messages()
         for message in messages:
             message["content"] = [{"type": p["type"], "text": p.get("text")} for p in message["content"]]
         columns["messages"].append(messages)

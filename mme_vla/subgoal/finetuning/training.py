@@ -95,13 +95,13 @@ def find_checkpoint(output: Path, resume: str | None) -> str | None:
     Raises:
         UserError: `output` holds a run that is not to be resumed, or there is no such checkpoint.
     """
-    found = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
+    checkpoints = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
     if resume is None:
-        if found or (output / ADAPTER).exists():
+        if checkpoints or (output / ADAPTER).exists():
             raise UserError(f"{output} holds a run: go on with resume=auto, or choose another output.")
         return None
     if resume == "auto":
-        return str(found[-1]) if found else None
+        return str(checkpoints[-1]) if checkpoints else None
     if not Path(resume).is_dir():
         raise UserError(f"resume={resume!r}: there is no such checkpoint folder; auto takes the newest of the run.")
     return resume

@@ -19,10 +19,10 @@ import numpy as np
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.models.connection import Connection, Settings, Shown, Turn
+from mme_vla.subgoal.models.connection import Connection, MediaPart, Message, Settings
 from mme_vla.subgoal.models.google import GoogleConnection
 from mme_vla.subgoal.models.openai_chat import OpenAIConnection
-from mme_vla.utils import read_json, sealed, unsealed
+from mme_vla.utils import read_json, verified, with_checksum
 
 
 def start[T](call: Callable[[], T]) -> Future[T]:
@@ -145,26 +145,26 @@ class Api:
         try:
             return self._connected()
         except UserError as error:
-            kept = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
-            raise UserError(f"{error}{kept}") from None
+            hint = "" if self.settings.cache is None else f" (The cache {self.settings.cache} lacks this answer.)"
+            raise UserError(f"{error}{hint}") from None
 
-    def ask(self, system: str, turns: Sequence[Turn]) -> Reply:
+    def ask(self, system: str, messages: Sequence[Message]) -> Reply:
         """Ask the last turn of a conversation.
 
         Raises:
             ApiFailure: no usable answer came, after all tries.
             UserError: the key or the model's name is not accepted.
         """
-        known = self._cache_file(system, turns)
-        if known is not None and (kept := _read_reply(known)) is not None:
+        known = self._cache_file(system, messages)
+        if known is not None and (cached := _read_reply(known)) is not None:
             with self._lock:
                 self.usage.cached += 1
-            return kept
-        reply = self._tried(system, turns)
+            return cached
+        reply = self._tried(system, messages)
         if known is not None:
             known.parent.mkdir(parents=True, exist_ok=True)
             draft = known.with_suffix(f".{uuid.uuid4().hex}.partial")  # other processes may share the folder
-            draft.write_text(json.dumps(sealed(vars(reply))))
+            draft.write_text(json.dumps(with_checksum(vars(reply))))
             try:
                 draft.replace(known)
             except OSError as error:  # a folder in its place: the answer counts, it is only not kept
@@ -172,7 +172,7 @@ class Api:
                 log.warning("%s cannot be written: %s", known, error.strerror)
         return reply
 
-    def _tried(self, system: str, turns: Sequence[Turn]) -> Reply:
+    def _tried(self, system: str, messages: Sequence[Message]) -> Reply:
         connection = self._needed()
         pause = self.settings.backoff
         failure = ApiFailure("failed", "never asked")
@@ -182,9 +182,9 @@ class Api:
                     self.usage.retries += 1
                 self.sleep(min(pause, _LONGEST_PAUSE))
                 pause *= 2
-            self._wait_for_turn()
+            self._wait_for_slot()
             try:
-                return self._once(connection, system, turns)
+                return self._once(connection, system, messages)
             except ApiFailure as error:
                 failure = error
                 if error.problem == "refused":
@@ -202,23 +202,23 @@ class Api:
             log.info("%s: try %d came to nothing (%s)", self.settings.model, attempt + 1, failure)
         raise failure
 
-    def _once(self, connection: Connection, system: str, turns: Sequence[Turn]) -> Reply:
+    def _once(self, connection: Connection, system: str, messages: Sequence[Message]) -> Reply:
         started = self.clock()
-        heard = within(self.settings.timeout, lambda: connection.ask(system, turns))
+        raw = within(self.settings.timeout, lambda: connection.ask(system, messages))
         prices = self.settings.input_price, self.settings.output_price
         with self._lock:
             self.usage.calls += 1
             self.usage.seconds += self.clock() - started
-            self.usage.input_tokens += heard.input_tokens
-            self.usage.output_tokens += heard.output_tokens
-            self.usage.cost += (heard.input_tokens * prices[0] + heard.output_tokens * prices[1]) / 1e6
-        if heard.refusal:
-            raise ApiFailure("refused", self._redacted(heard.refusal, _SECRET))
-        if not (text := self._redacted(heard.text, _SECRET).strip()):
+            self.usage.input_tokens += raw.input_tokens
+            self.usage.output_tokens += raw.output_tokens
+            self.usage.cost += (raw.input_tokens * prices[0] + raw.output_tokens * prices[1]) / 1e6
+        if raw.refusal:
+            raise ApiFailure("refused", self._redacted(raw.refusal, _SECRET))
+        if not (text := self._redacted(raw.text, _SECRET).strip()):
             raise ApiFailure("empty", "the answer is empty")
-        return Reply(text, heard.input_tokens, heard.output_tokens)
+        return Reply(text, raw.input_tokens, raw.output_tokens)
 
-    def _wait_for_turn(self) -> None:
+    def _wait_for_slot(self) -> None:
         if self.settings.requests_per_minute is None:
             return
         with self._lock:
@@ -227,14 +227,14 @@ class Api:
         if (wait := start - self.clock()) > 0:
             self.sleep(wait)
 
-    def _cache_file(self, system: str, turns: Sequence[Turn]) -> Path | None:
+    def _cache_file(self, system: str, messages: Sequence[Message]) -> Path | None:
         if self.settings.cache is None:
             return None
         digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.speaks].cached_as(self.settings), system]).encode())
-        for role, parts in turns:
+        for role, parts in messages:
             digest.update(f"\n{role}".encode())
-            for shown in parts:
-                part = shown.pixels if isinstance(shown, Shown) else shown
+            for item in parts:
+                part = item.pixels if isinstance(item, MediaPart) else item
                 # The pictures themselves, not their encoding, which may differ between versions of the encoder.
                 raw = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
                 digest.update(f"\n{getattr(part, 'shape', 'text')} {len(raw)} ".encode() + raw)
@@ -257,11 +257,11 @@ def _read_reply(path: Path) -> Reply | None:
     if not path.exists() and not path.is_symlink():
         return None
     try:
-        kept = unsealed(read_json(path, "an answer that was kept"), str(path))
-        counts: list[Any] = [kept.get("input_tokens"), kept.get("output_tokens")]
-        if not isinstance(kept.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
+        stored = verified(read_json(path, "an answer that was kept"), str(path))
+        counts: list[Any] = [stored.get("input_tokens"), stored.get("output_tokens")]
+        if not isinstance(stored.get("text"), str) or not all(type(n) is int and 0 <= n < 2**40 for n in counts):
             raise UserError(f"{path} lacks a text and two numbers of tokens")
-        return Reply(kept["text"], *counts)
+        return Reply(stored["text"], *counts)
     except UserError as error:
         log.warning("%s The question is asked again.", error)
         return None

@@ -10,7 +10,7 @@ import numpy as np
 
 from mme_vla.errors import UserError
 
-Turn = tuple[str, list[Any]]
+Message = tuple[str, list[Any]]
 """Role (`user` or `model`); parts: texts, pictures [H, W, 3], videos [t, H, W, 3], bare or as `Shown`."""
 
 
@@ -38,13 +38,13 @@ class Settings:
     output_price: float = 10.0
 
     def __post_init__(self) -> None:
-        for name, wanted in _WANTED.items():
+        for name, expected in _WANTED.items():
             value = getattr(self, name)
-            if value is None and "null" in wanted:
+            if value is None and "null" in expected:
                 continue
             usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-            if not usable or value < 0 or (value == 0 and "above" in wanted):
-                raise UserError(f"{name}={value!r} must be {wanted}.")
+            if not usable or value < 0 or (value == 0 and "above" in expected):
+                raise UserError(f"{name}={value!r} must be {expected}.")
         if not isinstance(self.retries, int):
             raise UserError(f"retries={self.retries!r} must be a whole number, 0 or more.")
 
@@ -71,7 +71,7 @@ _WANTED = {
 
 
 @dataclass
-class Shown:
+class MediaPart:
     """A picture [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
 
     pixels: np.ndarray
@@ -81,12 +81,12 @@ class Shown:
         """What is sent in this form."""
         if form not in self._encoded:
             self._encoded[form] = encode(self.pixels)
-        found: T = self._encoded[form]
-        return found
+        encoded: T = self._encoded[form]
+        return encoded
 
 
 @dataclass(frozen=True)
-class Heard:
+class RawReply:
     """What an API answered. refusal: why the model would not answer, empty if it did. Thoughts count as output."""
 
     text: str
@@ -111,7 +111,7 @@ class Connection:
     def __init__(self, settings: Any, client: Any = None) -> None:
         raise NotImplementedError
 
-    def ask(self, system: str, turns: Sequence[Turn]) -> Heard:
+    def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
         """Ask the last turn of a conversation, once; whatever goes wrong is raised as the client raises it."""
         raise NotImplementedError
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.subgoal.clips import ENCODING
-from mme_vla.subgoal.models.connection import Connection, Heard, Settings, Shown, Turn, count
-from mme_vla.utils.media import film_bytes, png_bytes
+from mme_vla.subgoal.models.connection import Connection, MediaPart, Message, RawReply, Settings, count
+from mme_vla.utils.media import png_bytes, video_bytes
 
 
 class GoogleConnection(Connection):
@@ -20,17 +20,17 @@ class GoogleConnection(Connection):
     def __init__(self, settings: Settings, client: Any = None) -> None:
         self._settings, self._client = settings, client or _make_client(settings)
 
-    def ask(self, system: str, turns: Sequence[Turn]) -> Heard:
+    def ask(self, system: str, messages: Sequence[Message]) -> RawReply:
         """See `Connection`."""
         response = self._client.models.generate_content(
             model=self._settings.model,
-            contents=[{"role": role, "parts": [_part(part) for part in parts]} for role, parts in turns],
+            contents=[{"role": role, "parts": [_part(part) for part in parts]} for role, parts in messages],
             config={"system_instruction": system, "temperature": self._settings.temperature},
         )
         used = getattr(response, "usage_metadata", None)
-        written = count(used, "candidates_token_count") + count(used, "thoughts_token_count")
+        n_output = count(used, "candidates_token_count") + count(used, "thoughts_token_count")
         text = getattr(response, "text", None) or ""
-        return Heard(text, count(used, "prompt_token_count"), written, _refusal(response))
+        return RawReply(text, count(used, "prompt_token_count"), n_output, _refusal(response))
 
 
 def _make_client(settings: Settings) -> Any:
@@ -46,13 +46,13 @@ def _make_client(settings: Settings) -> Any:
 def _part(part: Any) -> Mapping[str, Any]:
     if isinstance(part, str):
         return {"text": part}
-    return (part if isinstance(part, Shown) else Shown(part)).once("google", _inline)
+    return (part if isinstance(part, MediaPart) else MediaPart(part)).once("google", _inline)
 
 
 def _inline(pixels: np.ndarray) -> Mapping[str, Any]:
-    picture = pixels.ndim == 3
-    data = png_bytes(pixels) if picture else film_bytes(pixels, **ENCODING)
-    return {"inline_data": {"mime_type": "image/png" if picture else "video/mp4", "data": data}}
+    is_image = pixels.ndim == 3
+    data = png_bytes(pixels) if is_image else video_bytes(pixels, **ENCODING)
+    return {"inline_data": {"mime_type": "image/png" if is_image else "video/mp4", "data": data}}
 
 
 def _refusal(response: Any) -> str:

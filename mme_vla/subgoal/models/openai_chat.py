@@ -11,7 +11,7 @@ import numpy as np
 
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.subgoal.clips import sample_video
-from mme_vla.subgoal.models.connection import Connection, Heard, Settings, Shown, Turn, count
+from mme_vla.subgoal.models.connection import Connection, MediaPart, Message, RawReply, Settings, count
 from mme_vla.utils.media import png_bytes
 
 _ROLES = {"user": "user", "model": "assistant"}
@@ -68,10 +68,10 @@ class OpenAIConnection(Connection):
     def __init__(self, settings: OpenAISettings, client: Any = None) -> None:
         self._settings, self._client = settings, client or _make_client(settings)
 
-    def ask(self, system: str, turns: Sequence[Turn]) -> Heard:
+    def ask(self, system: str, conversation: Sequence[Message]) -> RawReply:
         """See `Connection`."""
         messages: list[dict[str, Any]] = [{"role": "system", "content": system}]
-        messages += [{"role": _ROLES[role], "content": self._content(role, parts)} for role, parts in turns]
+        messages += [{"role": _ROLES[role], "content": self._content(role, parts)} for role, parts in conversation]
         temperature = self._settings.temperature
         response = self._client.chat.completions.create(
             model=self._settings.model,
@@ -79,14 +79,14 @@ class OpenAIConnection(Connection):
             **({} if temperature is None else {"temperature": temperature}),
         )
         used = getattr(response, "usage", None)
-        read, written = count(used, "prompt_tokens"), count(used, "completion_tokens")
+        read, n_output = count(used, "prompt_tokens"), count(used, "completion_tokens")
         if not (choices := getattr(response, "choices", None)):
-            return Heard("", read, written)
+            return RawReply("", read, n_output)
         message = choices[0].message
         refusal = getattr(message, "refusal", None) or ""
         if choices[0].finish_reason == "content_filter":
             refusal = refusal or "the answer was stopped: content_filter"
-        return Heard(getattr(message, "content", None) or "", read, written, refusal)
+        return RawReply(getattr(message, "content", None) or "", read, n_output, refusal)
 
     def _content(self, role: str, parts: Sequence[Any]) -> Any:
         if role == "model":
@@ -97,7 +97,9 @@ class OpenAIConnection(Connection):
         if isinstance(part, str):
             return [{"type": "text", "text": part}]
         most = self._settings.video_frames
-        return (part if isinstance(part, Shown) else Shown(part)).once(f"openai {most}", partial(_pictures, most=most))
+        return (part if isinstance(part, MediaPart) else MediaPart(part)).once(
+            f"openai {most}", partial(_image_parts, most=most)
+        )
 
     @staticmethod
     def cached_as(settings: OpenAISettings) -> list[Any]:
@@ -139,14 +141,14 @@ def _base64(text: str) -> str:
     return base64.b64encode(text.encode()).decode("ascii")
 
 
-def _pictures(pixels: np.ndarray, most: int) -> list[dict[str, Any]]:
+def _image_parts(pixels: np.ndarray, most: int) -> list[dict[str, Any]]:
     if pixels.ndim == 3:
-        return [_picture(pixels)]
+        return [_image_part(pixels)]
     places = sample_video(len(pixels), most=most)
-    said = f"A video of {len(pixels)} frames; {len(places)} of them in order:"
-    return [{"type": "text", "text": said}, *(_picture(pixels[i]) for i in places)]
+    caption = f"A video of {len(pixels)} frames; {len(places)} of them in order:"
+    return [{"type": "text", "text": caption}, *(_image_part(pixels[i]) for i in places)]
 
 
-def _picture(pixels: np.ndarray) -> dict[str, Any]:
+def _image_part(pixels: np.ndarray) -> dict[str, Any]:
     data = base64.b64encode(png_bytes(pixels)).decode("ascii")
     return {"type": "image_url", "image_url": {"url": f"data:image/png;base64,{data}"}}

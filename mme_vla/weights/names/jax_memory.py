@@ -56,11 +56,16 @@ def rotary_table(positions: int, head_dim: int) -> Tensor:
 def layer_names(layer: nn.Module, root: str = LAYER) -> NameTable:
     """The table of a recurrent layer that sits at `root` in the released tree."""
 
-    def norm(ours: str, theirs: str) -> NameTable:
-        return {f"{ours}.weight": [Piece(f"{root}/{theirs}/scale")], f"{ours}.bias": [Piece(f"{root}/{theirs}/bias")]}
+    def norm(target: str, source: str) -> NameTable:
+        return {
+            f"{target}.weight": [Piece(f"{root}/{source}/scale")],
+            f"{target}.bias": [Piece(f"{root}/{source}/bias")],
+        }
 
     def kernels(names: dict[str, str]) -> NameTable:
-        return {f"{ours}.weight": [Piece(f"{root}/{theirs}/kernel", "i o -> o i")] for ours, theirs in names.items()}
+        return {
+            f"{target}.weight": [Piece(f"{root}/{source}/kernel", "i o -> o i")] for target, source in names.items()
+        }
 
     if isinstance(layer, TTTLayer):
         table = kernels({"q": "wq", "k": "wk", "v": "wv", "out": "wo"})

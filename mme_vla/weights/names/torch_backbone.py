@@ -38,8 +38,8 @@ def torch_names(backbone: Pi05Backbone) -> NameTable:
             names = _expert_layer(backbone.config, layer, f"{root}.layers.{i}")
             table |= prefixed(f"transformer.layers.{i}.experts.{expert}", names)
     table |= prefixed("transformer.final_norm.dense", _affine(f"{EXPERTS['action']}.norm.dense"))
-    for ours, theirs in HEADS.items():
-        table |= prefixed(ours, _affine(theirs))
+    for target, source in HEADS.items():
+        table |= prefixed(target, _affine(source))
     return table
 
 
@@ -68,10 +68,10 @@ def _expert_layer(config: BackboneConfig, layer: ExpertLayer, root: str) -> Name
     def rows(name: str, heads: int) -> Piece:
         return Piece(f"{root}.self_attn.{name}.weight", "(n h) d -> (n h) d", {"n": heads, "h": config.head_dim})
 
-    def norm(ours: str, module: object, theirs: str) -> NameTable:
+    def norm(target: str, module: object, source: str) -> NameTable:
         if isinstance(module, AdaRMSNorm):
-            return prefixed(f"{ours}.dense", _affine(f"{root}.{theirs}.dense"))
-        return {f"{ours}.scale": [Piece(f"{root}.{theirs}.weight")]}
+            return prefixed(f"{target}.dense", _affine(f"{root}.{source}.dense"))
+        return {f"{target}.scale": [Piece(f"{root}.{source}.weight")]}
 
     kv = [rows("k_proj", config.num_kv_heads), rows("v_proj", config.num_kv_heads)]
     table = norm("attention_norm", layer.attention_norm, "input_layernorm")

@@ -56,9 +56,9 @@ class Shapes:
             self._builder.add_box_visual(pose, half_size=tuple(half_size), material=_material(colour, glossy))
         return self
 
-    def solid_box(self, half_size: Sequence[float], colour: RGB | None, **rest: Any) -> "Shapes":
+    def solid_box(self, half_size: Sequence[float], colour: RGB | None, **options: Any) -> "Shapes":
         """A box that is touched where it is seen."""
-        return self.box(half_size, colour, collision=half_size, **rest)
+        return self.box(half_size, colour, collision=half_size, **options)
 
     def cylinder(
         self,

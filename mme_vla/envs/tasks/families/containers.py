@@ -42,7 +42,7 @@ def add_hidden_cubes(env: Task, colours: Sequence[str], containers: Sequence[Con
 
 def container_picks(
     env: Task,
-    wanted: Sequence[tuple[str, Container]],
+    targets: Sequence[tuple[str, Container]],
     containers: Sequence[Container],
     letters: tuple[str, str] = ("a", "b"),
 ) -> list[SubTask]:
@@ -50,14 +50,14 @@ def container_picks(
 
     Args:
         env: the task.
-        wanted: colour and container, in order.
+        targets: colour and container, in order.
         containers: all of them; lifting another one fails.
         letters: multi-choice options of picking up and of putting down.
     """
     steps: list[SubTask] = []
-    for colour, container in wanted:
+    for colour, container in targets:
         if steps:
-            steps.append(put_down_container(env, wanted[len(steps) // 2][1], containers, letters[1]))
+            steps.append(put_down_container(env, targets[len(steps) // 2][1], containers, letters[1]))
         steps.append(pick_up_container(colour, container, containers, letters[0]))
     return steps
 

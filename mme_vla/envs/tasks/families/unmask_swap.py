@@ -6,7 +6,7 @@ from mme_vla.envs.scene.cues import Cue, under
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS, SWAP_STEPS, Cover, Hide, Swap
 from mme_vla.envs.scene.objects import Container, H, build_container
-from mme_vla.envs.scene.placement import ANCHOR_HALF, Avoid, Point, Region, SceneError, draw_container, swaps_in_turn
+from mme_vla.envs.scene.placement import ANCHOR_HALF, Avoid, Point, Region, SceneError, draw_container, sequential_swaps
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.families.containers import add_hidden_cubes
 
@@ -58,14 +58,14 @@ class UnmaskSwap(Task):
         return COVER_STEPS + SWAP_STEPS * self.swap_count
 
     @property
-    def wanted(self) -> list[tuple[str, Container]]:
+    def targets(self) -> list[tuple[str, Container]]:
         """Colours to be found, in order, each with the container over it."""
         return list(zip(self.colours, self.over_cubes, strict=True))[: self.pick_count]
 
     def start_episode(self, draws: Draws) -> None:
         self.motions: list[Cover | Swap | Hide] = [
             Cover(self.containers),
-            *swaps_in_turn(self.initiators, self.containers, COVER_STEPS),
+            *sequential_swaps(self.initiators, self.containers, COVER_STEPS),
             Hide(list(zip(self.cubes, self.over_cubes, strict=True)), COVER_STEPS, self.swapped_after),
         ]
 

@@ -105,7 +105,7 @@ class VideoPlace(Task):
         return False
 
     def subtasks(self) -> list[SubTask]:
-        rest = GO_HOME_STEPS + self.turned("delay")
+        steps = GO_HOME_STEPS + self.turned("delay")
         self._swap_stage = SubTask(
             "static", StaticFor(self, SWAP_STAGE_STEPS), lambda demo: demo.hold(SWAP_STAGE_STEPS), video=True
         )
@@ -117,7 +117,7 @@ class VideoPlace(Task):
                 run=lambda demo: demo.place_on(self.spot, TABLE_Z),
                 video=True,
             ),
-            SubTask("static", StaticFor(self, rest), lambda demo: self._go_home(demo, rest), video=True),
+            SubTask("static", StaticFor(self, steps), lambda demo: self._go_home(demo, steps), video=True),
             self._swap_stage,
             SubTask(
                 NO_RECORD,

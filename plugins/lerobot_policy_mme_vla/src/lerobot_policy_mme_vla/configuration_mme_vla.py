@@ -62,7 +62,7 @@ class MMEVLAConfig(PreTrainedConfig):
         """
         features = self.input_features or {}
         for camera in robot.cameras:
-            picture_key(camera, features)
+            image_key(camera, features)
         for what, feature, width in (
             (STATE, features.get(STATE), robot.state.width),
             ("action", self.action_feature, robot.action.width),
@@ -101,7 +101,7 @@ class MMEVLAConfig(PreTrainedConfig):
         return None
 
 
-def picture_key(camera: Camera, features: Collection[str]) -> str:
+def image_key(camera: Camera, features: Collection[str]) -> str:
     """The feature that holds a camera's pictures: under its column's name, or its own.
 
     Raises:

@@ -11,7 +11,7 @@ from lerobot.configs import PreTrainedConfig
 from lerobot.policies.pretrained import PreTrainedPolicy
 from torch import Tensor
 
-from lerobot_policy_mme_vla.configuration_mme_vla import IS_DEMO, STATE, MMEVLAConfig, picture_key
+from lerobot_policy_mme_vla.configuration_mme_vla import IS_DEMO, STATE, MMEVLAConfig, image_key
 from lerobot_policy_mme_vla.rows import Row, act
 from lerobot_policy_mme_vla.samples import Samples
 from mme_vla import Policy
@@ -98,8 +98,8 @@ class MMEVLAPolicy(PreTrainedPolicy):
             for row, chunk in zip(waiting, act(self.model, waiting, self.config.flow_steps), strict=True):
                 row.plan.extend(chunk[:execute])
         ignored = np.zeros(self.model.embodiment.action.width, np.float32)
-        chosen = [ignored if row.in_video else row.plan.popleft() for row in rows]
-        return torch.from_numpy(np.stack(chosen).astype(np.float32))
+        actions = [ignored if row.in_video else row.plan.popleft() for row in rows]
+        return torch.from_numpy(np.stack(actions).astype(np.float32))
 
     @torch.no_grad()
     def predict_action_chunk(
@@ -123,24 +123,22 @@ class MMEVLAPolicy(PreTrainedPolicy):
         if prev_chunk_left_over is not None:
             if not self.supports_rtc():
                 raise UserError("This policy cannot agree with a chunk under way: use --inference.type=sync.")
-            promised = np.atleast_3d(prev_chunk_left_over.float().cpu().numpy())
-            promised = promised.reshape(-1, *prev_chunk_left_over.shape[-2:])
-            for row, actions in zip(rows, promised, strict=True):
+            action_prefix = np.atleast_3d(prev_chunk_left_over.float().cpu().numpy())
+            action_prefix = action_prefix.reshape(-1, *prev_chunk_left_over.shape[-2:])
+            for row, actions in zip(rows, action_prefix, strict=True):
                 row.read()
                 actions = actions[: len(np.trim_zeros(np.abs(actions).sum(1), "b"))]
                 if len(actions):
-                    row.episode.promise(actions, min(inference_delay or 0, len(actions)))
+                    row.episode.set_action_prefix(actions, min(inference_delay or 0, len(actions)))
         return torch.from_numpy(act(self.model, rows, self.config.flow_steps))
 
     def supports_rtc(self) -> bool:
         """Whether a chunk can be chosen while another is executed: of flows that need not know what was executed."""
-        return self.model.agrees and self.model.require_processor().past_actions == 0
+        return self.model.supports_rtc and self.model.require_processor().past_actions == 0
 
     def _see(self, batch: Mapping[str, Any]) -> list[Row]:
         states = batch[STATE].float().cpu().numpy()
-        pictures = {
-            camera.name: _as_uint8(batch[picture_key(camera, batch)]) for camera in self.model.embodiment.cameras
-        }
+        images = {camera.name: _as_uint8(batch[image_key(camera, batch)]) for camera in self.model.embodiment.cameras}
         demo = np.zeros(len(states), bool)
         if IS_DEMO in batch:
             demo = batch[IS_DEMO].reshape(len(states), -1)[:, 0].cpu().numpy() > 0.5
@@ -154,13 +152,15 @@ class MMEVLAPolicy(PreTrainedPolicy):
             self._rows = [Row(self.model.start_episode(goal, seed=self.config.seed)) for goal in goals]
         for i, row in enumerate(self._rows):
             row.episode.goal = goals[i]
-            row.see({name: views[i] for name, views in pictures.items()}, states[i], bool(demo[i]))
+            row.see({name: views[i] for name, views in images.items()}, states[i], bool(demo[i]))
         return self._rows
 
     # Folders: LeRobot's files, and beside them mme-vla's
 
-    def _save_pretrained(self, save_directory: Path, **given: Any) -> None:  # 0.6.1 hands over a state_dict, later none
-        super()._save_pretrained(save_directory, **given)
+    def _save_pretrained(
+        self, save_directory: Path, **options: Any
+    ) -> None:  # 0.6.1 hands over a state_dict, later none
+        super()._save_pretrained(save_directory, **options)
         write_sums(save_directory, [WEIGHTS, *self.model.require_processor().save(save_directory)])
 
     @classmethod
@@ -205,7 +205,7 @@ def _built(config: MMEVLAConfig) -> Policy:
     return model
 
 
-def _as_uint8(pictures: Tensor) -> np.ndarray:
+def _as_uint8(images: Tensor) -> np.ndarray:
     """LeRobot's pictures [b, 3, H, W] in [0, 1] as they were, [b, H, W, 3] uint8."""
-    whole = pictures if pictures.dtype == torch.uint8 else (pictures.float() * 255).round().to(torch.uint8)
-    return whole.permute(0, 2, 3, 1).cpu().numpy()
+    converted = images if images.dtype == torch.uint8 else (images.float() * 255).round().to(torch.uint8)
+    return converted.permute(0, 2, 3, 1).cpu().numpy()

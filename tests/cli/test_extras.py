@@ -1,0 +1,308 @@
+"""Each extra suffices alone: every command runs where the packages of all other extras cannot be imported.
+
+Which packages those are follows from pyproject.toml and from what is installed. A command that needs an extra names it,
+and the words that install it.
+"""
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from functools import cache
+from importlib.metadata import Distribution, distributions
+from pathlib import Path
+from typing import NamedTuple
+
+import forked
+import pytest
+from h5_files import write_file
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from mme_vla.errors import UserError
+from mme_vla.evaluation.store import find_records, read_folders
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+FOLDER = REPOSITORY / "tests" / "extras"
+NEW = "uv sync --inexact --extra {}"
+
+
+# The first test to run waits for all commands.
+pytestmark = pytest.mark.timeout(600)
+
+
+class Case(NamedTuple):
+    """A command, the extras that are there, and how it ends: `says` is a text it prints."""
+
+    extras: tuple[str, ...]
+    words: str
+    says: str
+    code: int = 0
+    wait: str = ""  # stop the command once it has printed this
+    draws: bool = False  # it needs a Vulkan driver
+
+
+TINY = "backbone.vision.depth=1 backbone.vision.image_size=16 backbone.vision.patch_size=1"
+TRAIN = f"mme_vla.train model=pi05 {TINY} train.steps=1 train.val_samples=1 train.open_loop_chunks=1"
+PLAY = "mme_vla.play task=StopCube episodes=1 max_choices=1 output=played"
+STEP = "run/checkpoints/step_000001"
+NANO = (
+    "task=VideoUnmask model=framesamp_modul demonstrations.easy=2 demonstrations.medium=0 demonstrations.hard=0 "
+    "train.steps=20 train.batch_size=4 train.val_every=10 episodes=2 max_steps=20 beside=[] also=[] drawn_for=[] "
+    "output=nano"
+)
+"""The whole way of nanoMME, small: two demonstrations, twenty updates, two episodes."""
+
+# In this order: some read what an earlier one wrote.
+SUFFICE = [
+    Case((), f"{TRAIN} output=run", "checkpoint"),
+    Case((), "mme_vla.inspect dataset=sample episode=0 step=20", ".png"),
+    Case((), f"mme_vla cache model=framesamp_modul {TINY} data.cache.root=kept", "frames"),
+    Case((), "mme_vla convert input=record_dataset_Alpha.h5 output=converted images=png", "2 episodes"),
+    Case((), "mme_vla exec-starts input=record_dataset_Alpha.h5 output=starts.json", "2 episodes"),
+    Case((), f"mme_vla weights {STEP} lerobot --to lerobot", ""),
+    Case((), "mme_vla subgoal-build input=sample output=rows sets=[simple]", "simple"),
+    Case((), "mme_vla.results --demo --brief", "Made-up records"),
+    Case((), "mme_vla.analyse selection --output kept.mp4 --every 128", "wrote kept.mp4"),
+    Case((), "mme_vla train-tokenizer run", "tokenizer.model"),
+    Case((), "mme_vla sample --help", "full"),
+    Case((), f"mme_vla.probe model=framesamp_modul backbone=tiny {TINY} recordings=sample recorded=1 with=[shuffle] "
+             "draws=2 moments=1 scan=false output=probed", "shuffle"),
+    Case(("serve",), "mme_vla.serve model=pi05 backbone=tiny port=0", "stopped", wait="ready at"),
+    Case(("harness",), "mme_vla harness --help", "flow_steps"),
+    Case(("orbax",), f"mme_vla weights {STEP} jax --to released", ""),
+    Case(("baselines",), "mme_vla.train model=diffusion_policy train.steps=1 train.batch_size=1 train.val_samples=0 "
+                         "train.open_loop_chunks=0 output=diffused", "checkpoint"),
+    Case(("viz",), "mme_vla.analyse selection --output seen.mp4 --every 64 --rerun seen.rrd", "seen"),
+    Case(("vlm",), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned steps=1 workers=0 device=cpu "
+                   "batch=1 per_device_batch=1 gradient_checkpointing=false", ""),
+    Case(("sweep",), "mme_vla.evaluate model=pi05 launcher=joblib --cfg hydra", "hydra_joblib_launcher"),
+    Case(("sim",), f"mme_vla.evaluate model=pi05 backbone=tiny {TINY} tasks=[StopCube] episodes=1 max_steps=1 "
+                   "workers=1 render=false output=evaluated execute=1 flow_steps=1", "timeout"),
+    Case(("sim",), f"mme_vla.nano {NANO}", "page", draws=True),
+    Case(("sim",), "mme_vla vision-pretrain tasks=StopCube scenes=2 arrangements=1 steps=1 batch_size=1 "
+                   "output=tower", "nano_vision.safetensors", draws=True),
+    Case(("sim",), "mme_vla record task=PatternLock episodes=1 frames=[0] workers=1 output=recorded",
+         "recorded: 1 episodes", draws=True),
+    Case(("sim",), "mme_vla gallery task=StopCube episodes=1 tiles=2 output=shown", "1 tasks", draws=True),
+    Case(("sim",), f"{PLAY} player=random", "records:"),
+    Case(("sim", "play"), f"{PLAY}2 port=0", "open http", wait="ready at http"),
+]  # fmt: skip
+
+NEED = [
+    Case((), "mme_vla.evaluate model=pi05 backbone=tiny", "sim", 2),
+    Case((), "mme_vla record task=PickXtimes episodes=1 output=recorded2", "sim", 2),
+    Case((), "mme_vla gallery task=PickXtimes", "sim", 2),
+    Case((), f"{PLAY} player=random", "sim", 2),
+    Case(("play",), PLAY, "sim", 2),
+    Case(("sim",), PLAY, "play", 2),
+    Case((), f"{PLAY} player=qwenvl", "vlm", 2),
+    Case((), f"{PLAY} player=gemini", "gemini", 2),
+    Case(("gemini",), f"{PLAY} player=gemini", "sim", 2),
+    Case((), f"{PLAY} player=openai", "openai", 2),
+    Case((), "mme_vla.serve model=pi05 backbone=tiny", "serve", 2),
+    Case((), "mme_vla harness --help", "harness", 2),
+    Case((), f"mme_vla weights {STEP} jax2 --to released", "orbax", 2),
+    Case((), "mme_vla subgoal-train rows=rows/simple.jsonl vlm=tiny output=tuned2", "vlm", 2),
+    Case((), f"{TRAIN} output=run2 finetune=lora", "vlm", 2),
+    Case((), f"{TRAIN} output=run3 logger=wandb", "wandb", 2),
+    Case((), "mme_vla.train model=diffusion_policy output=run4", "baselines", 2),
+    Case((), "mme_vla.evaluate model=pi05 launcher=joblib --multirun", "sweep", 2),
+    Case((), "mme_vla.analyse selection --output seen2.mp4 --rerun seen2.rrd", "viz", 2),
+]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the commands are run."""
+    return tmp_path_factory.mktemp("extras")
+
+
+@pytest.fixture(scope="module")
+def ended(folder: Path) -> dict[Case, tuple[int, str]]:
+    """How every command ended, and what it said."""
+    drawn = can_draw()
+    there = [
+        case for case in [*SUFFICE, *NEED] if all(is_installed(e) for e in case.extras) and (drawn or not case.draws)
+    ]
+    asked = [[case.words.split(), hidden(case.extras), case.wait] for case in there]
+    write_file(folder / "record_dataset_Alpha.h5", [9, 7])
+    path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
+    variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(())), "HF_HUB_OFFLINE": "1",
+                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
+                 "OPENAI_API_KEY": "none"}  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", str(FOLDER / "commands.py")], input=json.dumps(asked), env=variables,
+        cwd=folder, capture_output=True, text=True, timeout=550,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    answers = [tuple(answer) for answer in json.loads(done.stdout.splitlines()[-1])]
+    return dict(zip(there, answers, strict=True))
+
+
+def can_draw() -> bool:
+    from mme_vla.envs.rendering import render_backend
+
+    try:
+        render_backend()
+    except (UserError, ImportError):
+        return False
+    return True
+
+
+def name_of(case: Case) -> str:
+    return f"{'+'.join(case.extras) or 'none'}:{case.words.split()[0].removeprefix('mme_vla.')}:{case.says}"
+
+
+@pytest.mark.parametrize("case", SUFFICE, ids=name_of)
+def test_the_command_runs_with_this_extra_alone(ended: dict[Case, tuple[int, str]], case: Case) -> None:
+    if case not in ended:
+        driver = "; scripts/install_vulkan.sh installs the driver" if case.draws else ""
+        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}{driver}")
+    code, said = ended[case]
+    assert code == case.code and case.says in said, said[-3000:]
+
+
+@pytest.mark.parametrize("case", NEED, ids=name_of)
+def test_a_command_names_the_extra_that_it_needs(ended: dict[Case, tuple[int, str]], case: Case) -> None:
+    if case not in ended:
+        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
+    code, said = ended[case]
+    assert code == case.code and "Traceback" not in said, said[-3000:]
+    assert f"extra `{case.says}`" in said and NEW.format(case.says) in said
+
+
+def test_nano_goes_from_nothing_to_a_page_and_again_without_doing_anything_twice(
+    ended: dict[Case, tuple[int, str]], folder: Path
+) -> None:
+    if not any(case.words.endswith(NANO) for case in ended):
+        pytest.skip(f"needs the simulator, {NEW.format('sim')}, and a driver: scripts/install_vulkan.sh")
+    made = folder / "nano"
+    records = read_folders(find_records([made / "framesamp_modul"]))
+    assert [record.episode for record in sorted(records, key=lambda r: r.episode)] == [0, 1]
+    assert {record.action_space for record in records} == {"waypoint"}
+    page = (made / "page.md").read_text()
+    assert "| framesamp_modul" in page and "| planner" in page and (made / "learning.png").is_file()
+    films = list(made.glob("films/failure/**/*.mp4"))
+    assert len(films) == 1 and films[0].name in page
+    written = {path: path.stat().st_mtime_ns for path in made.rglob("*.npz")}
+    assert forked.run("mme_vla.nano", *NANO.split(), cwd=folder).returncode == 0
+    assert {path: path.stat().st_mtime_ns for path in made.rglob("*.npz")} == written
+    assert len(read_folders(find_records([made / "framesamp_modul"]))) == 2
+
+
+def test_every_command_is_among_the_cases() -> None:
+    commands = {command_of(file) for file in (REPOSITORY / "mme_vla").rglob("*.py") if is_command(file)}
+    assert "mme_vla.evaluate" in commands
+    # `python -m mme_vla` runs the same commands by another name.
+    assert commands - {"mme_vla"} == {case.words.split()[0] for case in SUFFICE}
+
+
+def test_each_extra_is_among_the_cases() -> None:
+    # What is behind an address answers only to who has a key.
+    assert {e for case in SUFFICE for e in case.extras} == set(needs()) - {"dev", "gemini", "openai", "wandb"}
+
+
+def test_what_is_hidden_is_what_only_other_extras_bring() -> None:
+    assert {"websockets", "msgpack"} <= set(hidden(("sim",))) or not is_installed("serve")
+    for extra in filter(is_installed, needs()):
+        assert {module_of(name) for name in needs()[extra]} & set(hidden((extra,))) == set()
+    assert {"torch", "lerobot", "hydra", "google.protobuf"} & set(hidden(())) == set()
+
+
+def command_of(file: Path) -> str:
+    return ".".join(file.relative_to(REPOSITORY).with_suffix("").parts).removesuffix(".__main__")
+
+
+def is_command(file: Path) -> bool:
+    """Whether the file is run as a command; a doctest that mentions `__main__` makes none."""
+    tests = [ast.unparse(node.test) for node in ast.parse(file.read_text()).body if isinstance(node, ast.If)]
+    return any("__main__" in test for test in tests)
+
+
+@cache
+def installed() -> dict[str, Distribution]:
+    return {canonicalize_name(found.metadata["Name"]): found for found in distributions()}
+
+
+@cache
+def needs() -> dict[str, list[str]]:
+    """The packages that each extra names."""
+    found: dict[str, list[str]] = {}
+    for requirement in required("mme-vla"):
+        named = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
+        if named:
+            found.setdefault(named[1], []).append(canonicalize_name(requirement.name))
+    return found
+
+
+@cache
+def required(name: str) -> list[Requirement]:
+    return [Requirement(line) for line in installed()[name].requires or []]
+
+
+def is_installed(extra: str) -> bool:
+    return all(name in installed() for name in needs()[extra])
+
+
+def closure(names: Iterable[tuple[str, str]]) -> set[str]:
+    """Distributions, and all that they need; each with the extra that is asked of it."""
+    seen: set[tuple[str, str]] = set()
+    rest = list(names)
+    while rest:
+        name, extra = rest.pop()
+        if (name, extra) in seen or name not in installed():
+            continue
+        seen.add((name, extra))
+        for wanted in required(name):
+            if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):
+                rest += [(canonicalize_name(wanted.name), each) for each in ("", *wanted.extras)]
+    return {name for name, _ in seen}
+
+
+@cache
+def modules() -> dict[str, set[str]]:
+    """Each module and package, down to the first folder with an `__init__`, and the distributions that bring it."""
+    owners: dict[str, set[str]] = {}
+    listed = {name: (found.read_text("RECORD") or "").splitlines() for name, found in installed().items()}
+    files = {name: {line.partition(",")[0] for line in lines} for name, lines in listed.items()}
+    packages = {file.removesuffix("/__init__.py") for each in files.values() for file in each}
+    for name, each in files.items():
+        for file in each:
+            if not file.endswith((".py", ".so")) or file.startswith("..") or ".dist-info/" in file:
+                continue
+            inside = ""
+            for part in file.split("/"):
+                inside = f"{inside}/{part}".lstrip("/")
+                owners.setdefault(dotted(inside), set()).add(name)
+                if inside in packages:
+                    break
+    return owners
+
+
+def dotted(file: str) -> str:
+    """The module that a file is: `a/b.cpython-312.so` is `a.b`."""
+    folder, _, name = file.rpartition("/")
+    return f"{folder.replace('/', '.')}.{name.partition('.')[0]}".lstrip(".")
+
+
+@cache
+def hidden(extras: Sequence[str]) -> list[str]:
+    """Modules that would not be there if only these extras were installed."""
+    there = closure([("mme-vla", ""), *(("mme-vla", extra) for extra in extras)])
+    return sorted(module for module, owners in modules().items() if not owners & there)
+
+
+def module_of(distribution: str) -> str:
+    return next((m for m, owners in modules().items() if distribution in owners and "." not in m), distribution)
+
+
+def test_install_lines_name_what_a_clone_has_and_no_index() -> None:
+    pages = [REPOSITORY / "README.md", *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("mme_vla/**/*.py")]
+    text = {page.name: page.read_text() for page in pages}
+    assert [name for name, found in text.items() if re.search(r"pip install \S*mme-vla", found)] == []
+    named = {extra for found in text.values() for extra in re.findall(r"--extra ([a-z]\w*)", found)}
+    assert {"sim", "serve"} <= named <= set(needs())

@@ -1,0 +1,251 @@
+"""The HTTP form of the protocol on the same port, and the command that serves."""
+
+import asyncio
+import http.client
+import json
+import logging
+import re
+import socket
+from types import SimpleNamespace
+
+import forked
+import numpy as np
+import pytest
+from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
+
+from mme_vla.cli.loading import load_policy
+from mme_vla.config.composition import compose
+from mme_vla.errors import UserError
+from mme_vla.serving import Client, Limits, pack, unpack
+from mme_vla.serving.requests import AddBuffer, Reset
+from mme_vla.serving.session import BusyError, NoEpisodeError
+
+LOGGER = logging.getLogger(__name__)
+CLOSE = {"rtol": 1e-4, "atol": 1e-5}
+
+
+@pytest.fixture(scope="module")
+def policy():
+    return serving_policy()
+
+
+@pytest.fixture(scope="module")
+def served(policy):
+    with Served(policy) as server:
+        yield server
+
+
+def ask(served: Served, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, str, bytes]:
+    connection = http.client.HTTPConnection(*served.address, timeout=60)
+    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    found = answer.status, answer.headers["Content-Type"], answer.read()
+    connection.close()
+    return found
+
+
+def by_http(served: Served, parts: list, **headers: str) -> list[np.ndarray]:
+    status, kind, body = ask(served, "POST", "/reset", pack({"reset": True}), **headers)
+    assert (status, kind) == (200, "application/msgpack") and unpack(body)["reset_finished"] is True
+    chunks = []
+    for index, part in enumerate(parts):
+        status, _, body = ask(served, "POST", "/infer", pack(challenge(*part, first=index == 0)), **headers)
+        assert status == 200, body
+        chunks.append(unpack(body)["actions"])
+    return chunks
+
+
+def test_health_metadata_and_statistics(served):
+    assert ask(served, "GET", "/healthz") == (200, "text/plain; charset=utf-8", b"OK\n")
+    status, kind, body = ask(served, "GET", "/metadata")
+    assert (status, kind) == (200, "application/msgpack") and unpack(body)["action_space"] == "joint_angle"
+    by_http(served, course())
+    stats = json.loads(ask(served, "GET", "/stats")[2])
+    assert stats["counts"]["infer"] == 3 and stats["counts"]["batched"] == 3
+    assert 0 < stats["latency_ms"]["infer"]["p50"] <= stats["latency_ms"]["infer"]["p95"]
+
+
+def test_an_episode_by_http_is_the_episode_itself(policy, served):
+    parts = course()
+    for chunk, answer in zip(acted_directly(policy, parts), by_http(served, parts), strict=True):
+        np.testing.assert_allclose(answer, chunk[:16], **CLOSE)
+
+
+def test_many_requests_travel_on_one_connection(served):
+    connection = http.client.HTTPConnection(*served.address, timeout=60)
+    for index, part in enumerate(course()):
+        connection.request("POST", "/infer", pack(challenge(*part, first=index == 0)))
+        answer = connection.getresponse()
+        assert answer.status == 200 and unpack(answer.read())["actions"].shape == (16, 8)
+    connection.close()
+
+
+def test_sessions_of_one_address_are_told_apart_by_the_header(policy, served):
+    ours, theirs = course(1), course(2)
+    wanted = acted_directly(policy, ours)
+    for index in range(3):  # the two episodes in turn
+        for name, parts in (("ours", ours), ("theirs", theirs)):
+            body = pack(challenge(*parts[index], first=index == 0))
+            status, _, answer = ask(served, "POST", "/infer", body, X_Session=name)
+            assert status == 200
+            if name == "ours":
+                np.testing.assert_allclose(unpack(answer)["actions"], wanted[index][:16], **CLOSE)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status", "said"),
+    [
+        ("POST", "/infer", b"", 400, b"empty"),
+        ("POST", "/infer", b"garbage", 400, b"msgpack"),
+        ("POST", "/infer", pack({"x": 1}), 400, b"Known"),
+        ("GET", "/infer", None, 405, b"POST"),
+        ("GET", "/etc/passwd", None, 404, b"healthz"),
+        ("DELETE", "/healthz", None, 405, b"GET"),
+        ("POST", "/infer", b"\0" * 2_000_000, 413, b"limits.message_mib"),
+    ],
+)
+def test_wrong_requests_get_a_status_and_a_reason(policy, method, path, body, status, said):
+    with Served(policy, limits=Limits(message_mib=1)) as served:
+        found, kind, answer = ask(served, method, path, body)
+        assert (found, kind) == (status, "text/plain; charset=utf-8")
+        assert said in answer and b"Traceback" not in answer
+        assert ask(served, "GET", "/healthz")[0] == 200
+
+
+def test_what_the_policy_cannot_do_is_a_500(policy):
+    with Served(policy) as served:
+        policy.act = lambda *_: 1 / 0
+        try:
+            status, _, answer = ask(served, "POST", "/infer", pack(challenge(*course()[0], first=True)))
+        finally:
+            del policy.act
+        assert status == 500 and b"ZeroDivisionError" in answer and b"Traceback" not in answer
+        status, _, answer = ask(served, "POST", "/infer", pack(challenge(*course()[1], first=False)))
+        assert status == 409 and b"begin the episode again" in answer, "an error ends the episode"
+
+
+def test_a_key_is_asked_for_but_not_for_health_and_metadata(policy):
+    with Served(policy, api_key="right") as served:
+        for path in ("/healthz", "/metadata"):  # the challenge's client asks for the metadata without its key
+            assert ask(served, "GET", path)[0] == 200
+        for given in (None, "Api-Key wrong", "Bearer right", "Api-Key rïght"):
+            assert ask(served, "GET", "/stats", **({"Authorization": given} if given else {}))[0] == 401
+        assert ask(served, "GET", "/stats", Authorization="Api-Key right")[0] == 200
+        assert ask(served, "POST", "/infer", b"x")[0] == 401
+
+
+def test_a_page_in_a_browser_is_refused(served):
+    assert ask(served, "POST", "/reset", pack({"reset": True}), Origin="http://example.com")[0] == 403
+
+
+def test_silent_sessions_are_freed(policy):
+    with Served(policy, limits=Limits(idle_s=4)) as served:
+        by_http(served, course()[:1])
+        assert len(served.server.sessions.entries) == 1
+        wait_until(lambda: not served.server.sessions.entries)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [b"\x16\x03\x01\x02\x00\x01", b"GET\r\n\r\n", b"A" * 100_000, b"POST /infer HTTP/1.1\r\nContent-Length: -4\r\n\r\n",
+     b"POST /infer HTTP/1.1\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello\r\n0\r\n\r\n",
+     b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n", b"GET / HTTP/1.1\r\nbroken header\r\n\r\n",
+     b"POST /infer HTTP/1.1\r\nContent-Length: 100\r\n\r\ncut"],
+)  # fmt: skip
+def test_garbage_on_the_wire_is_answered_and_harms_nobody(served, sent):
+    with socket.create_connection(served.address, timeout=20) as raw:
+        raw.sendall(sent)
+        if not sent.endswith(b"\r\n\r\n"):
+            raw.shutdown(socket.SHUT_WR)
+        answer = b""
+        try:
+            while piece := raw.recv(4096):
+                answer += piece
+        except ConnectionResetError:
+            pass
+    assert answer.startswith(b"HTTP/1.1 4")
+    assert ask(served, "GET", "/healthz")[0] == 200
+
+
+def test_the_command_serves_and_stops_when_told(tmp_path):
+    words = ("mme_vla.serve", "model=framesamp_modul", "backbone=tiny", "port=0")
+    server = forked.Command(*words, env={"OMP_NUM_THREADS": "1", "MME_VLA_API_KEY": "secret"})
+    try:
+        wait_until(lambda: "ready at ws://127.0.0.1:" in server.errors or not server.process.is_alive(), 120)
+        lines = server.errors
+        assert "UNTRAINED" in lines
+        assert "secret" not in lines
+        port = int(lines.split("ready at ws://127.0.0.1:")[1].split()[0])
+        with Client(f"ws://127.0.0.1:{port}", api_key="secret") as client:
+            assert client.metadata["model"] == "framesamp_modul"
+            assert client.infer(challenge(*course()[0], first=True))["actions"].shape == (16, 8)
+            server.process.terminate()
+            done = server.finish(30)
+        assert done.returncode == 0
+        assert "stopped · 0 clients · 1 inferences" in done.stderr.removeprefix(lines)
+    finally:
+        server.process.kill()
+
+
+def test_the_command_says_what_it_needs():
+    for words, said in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
+        with pytest.raises(UserError, match=said):
+            load_policy(compose("serve", words), "serve", LOGGER)
+    done = forked.run("mme_vla.serve", "checkpoint=x", "model=pi05")
+    assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_command_loads_a_checkpoint(policy, tmp_path):
+    policy.save_pretrained(tmp_path)
+    loaded, name, _ = load_policy(compose("serve", [f"checkpoint={tmp_path}"]), "serve", LOGGER)
+    assert name == "tokendrop_expert"
+    parts = course(rounds=0)
+    np.testing.assert_array_equal(acted_directly(loaded, parts)[0], acted_directly(policy, parts)[0])
+
+
+def test_a_new_session_takes_the_place_of_the_longest_silent(served):
+    sessions, settings = served.server.sessions, served.server.settings
+    sessions.entries.clear()
+    names = [("127.0.0.1", str(i)) for i in range(settings.limits.connections)]
+    kept = {name: sessions.find(name, Reset()) for name in names}
+    kept[names[0]].requests = 1  # at work
+    kept[names[3]].used -= 100
+    newcomer = ("127.0.0.1", "new")
+    sessions.find(newcomer, Reset())
+    assert set(sessions.entries) == {*names, newcomer} - {names[3]}
+    for name in names:
+        kept[name].requests = 1
+    sessions.entries[newcomer].requests = 1
+    with pytest.raises(BusyError, match="at work"):
+        sessions.find(("127.0.0.1", "another"), Reset())
+    sessions.entries.clear()
+
+
+def test_a_request_that_waited_does_not_go_on_with_an_episode_that_failed_meanwhile(served):
+    sessions, name = served.server.sessions, ("127.0.0.1", "twice")
+
+    async def meet():
+        first = sessions.find(name, Reset())
+        await first.turn.acquire()
+        waiting = asyncio.ensure_future(sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0))
+        await asyncio.sleep(0)
+        assert first.requests == 1
+        sessions.drop(name)  # as an error of the request before it does
+        second = sessions.find(name, Reset())
+        first.turn.release()
+        with pytest.raises(NoEpisodeError, match="begin the episode again"):
+            await waiting
+        return sessions.entries.pop(name) is second
+
+    assert served.on_loop(meet())
+
+
+@pytest.mark.parametrize(
+    "word", ["policy.compute_dtype=bfloat16", "policy.history_dtype=float32", "token_budget=64", "+subgoal_text.kind=x"]
+)
+def test_what_a_checkpoint_brings_cannot_be_set_beside_it(word, monkeypatch):
+    overrides = SimpleNamespace(overrides=SimpleNamespace(task=["checkpoint=x", word]))
+    monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.initialized", lambda: True)
+    monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.get", lambda: overrides)
+    with pytest.raises(UserError, match=f"leave out {re.escape(word)}"):
+        load_policy(compose("serve", ["checkpoint=x"]), "serve", LOGGER)
