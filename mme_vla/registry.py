@@ -30,11 +30,7 @@ class Registry[T]:
         self._shipped = dict(shipped or {})
 
     def register(self, name: str) -> Callable[[Any], Any]:
-        """Return a decorator that files a class or function under `name`.
-
-        Raises:
-            UserError: another object already has this name.
-        """
+        """Return a decorator that files a class or function under `name`."""
 
         def decorate(entry: Any) -> Any:
             taken = self._entries.get(name)
@@ -61,9 +57,6 @@ class Registry[T]:
 
         Args:
             section: `name`, and the options. args, fixed: what the caller adds; no option may say the same.
-
-        Raises:
-            UserError: no name, an unknown one, an option the constructor does not take, or one that is missing.
         """
         options = {key: value for key, value in section.items() if key != "name"}
         if not isinstance(section.get("name"), str):

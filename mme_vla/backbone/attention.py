@@ -50,11 +50,7 @@ def _padded(visible: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def check_backend(name: str) -> str:
-    """The name of a backend.
-
-    Raises:
-        UserError: there is none of that name.
-    """
+    """The name of a backend."""
     if name not in BACKENDS:
         raise UserError(f"policy.attention={name!r}. {did_you_mean(str(name), BACKENDS)}")
     return name

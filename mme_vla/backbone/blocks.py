@@ -46,11 +46,7 @@ class Span(NamedTuple):
 
 
 def row_of(name: str, table: Visibility) -> frozenset[str] | set[str]:
-    """What a block of this name may look at.
-
-    Raises:
-        UserError: it has no row in the table.
-    """
+    """What a block of this name may look at."""
     if name not in table:
         raise UserError(f"Block {name!r} has no row in the visibility table; it has rows {sorted(table)}.")
     return table[name]
@@ -68,9 +64,6 @@ def attention_mask(
 
     Returns:
         [b, q, k] bool.
-
-    Raises:
-        UserError: a block has no row in the table.
     """
     device = key_mask.device
     rows = []
@@ -116,9 +109,6 @@ class MaskLayout(NamedTuple):
 
         Args:
             queries, keys: blocks in sequence order. valid: [b, k] bool, of the keys. table: the visibility table.
-
-        Raises:
-            UserError: a block has no row in the table.
         """
         runs: list[tuple[int, list[bool]]] = []
         for query in queries:

@@ -20,11 +20,7 @@ LARGEST, DEEPEST = 2**24, 2**10
 
 
 def check_positive(config: Any, prefix: str) -> None:
-    """Make sure that every number of a dataclass is one a network can have.
-
-    Raises:
-        UserError: a whole one below 1 or larger than any network's, or a fraction that is not between 0 and 1.
-    """
+    """Make sure that every number of a dataclass is one a network can have."""
     for name, value in vars(config).items():
         if isinstance(value, float) and not 0 < value < 1:
             raise UserError(f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
@@ -117,21 +113,13 @@ class _Undrawn(TorchFunctionMode):
 
 
 def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
-    """The class that the section `backbone` names, and its sizes.
-
-    Raises:
-        UserError: an unknown backbone or size.
-    """
+    """The class that the section `backbone` names, and its sizes."""
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
     return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:
-    """The backbone of a section without weights (on the device `meta`), to be asked for its sizes.
-
-    Raises:
-        UserError: an unknown backbone or size.
-    """
+    """The backbone of a section without weights (on the device `meta`), to be asked for its sizes."""
     shape: tuple[Any, Any] = read_backbone(section)
     try:
         hash(shape)

@@ -105,11 +105,7 @@ class ConvTower(nn.Module):
 
 
 def load_shipped(tower: ConvTower) -> None:
-    """Give a tower the weights that ship with the library.
-
-    Raises:
-        UserError: it has other sizes than these weights.
-    """
+    """Give a tower the weights that ship with the library."""
     from safetensors.torch import load
 
     state = {name: value.float() for name, value in load(files("mme_vla").joinpath(WEIGHTS).read_bytes()).items()}

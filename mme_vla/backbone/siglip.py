@@ -128,9 +128,6 @@ def pool_grid(tokens: Tensor, grid: int, pooling: str = "mean") -> Tensor:
     Args:
         tokens: row-major. grid: the new side; must divide s.
         pooling: `mean` as released, or `max` (paper, section 4.2).
-
-    Raises:
-        UserError: `grid` does not divide s, or the pooling is unknown.
     """
     side = int(tokens.shape[-2] ** 0.5)
     if side % grid:

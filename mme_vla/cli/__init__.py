@@ -26,6 +26,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "weights": ("weights", "a checkpoint from one format to another"),
     "subgoal-build": ("subgoal_build", "training data of the subgoal predictors"),
     "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
+    "sample": ("sample", "the dataset that the package ships, from a full one"),
+    "train-tokenizer": ("train_tokenizer", "the small tokenizer that the package ships"),
 }
 """Name on the command line → module of this room, and what it does in a line."""
 

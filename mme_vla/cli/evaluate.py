@@ -32,11 +32,7 @@ SUBGOAL_MODES = ("inline", "background")
 
 @cli("evaluate")
 def main(cfg: DictConfig) -> None:
-    """Run the episodes that have no result yet.
-
-    Raises:
-        UserError: anything in the settings, the checkpoint or the machine that cannot work.
-    """
+    """Run the episodes that have no result yet."""
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
@@ -129,9 +125,6 @@ def choose_subgoals(
     Args:
         section: the section `subgoal` of the configuration. mode: `inline`, or `background`.
         device: the policy's; a predictor with `device: auto` runs there too. None leaves the choice to the predictor.
-
-    Raises:
-        UserError: an unknown predictor, option or mode, or a policy that reads no subgoal, or another kind.
     """
     from mme_vla.evaluation.rollout.evaluation import check_subgoals
     from mme_vla.processing.prompt import subgoal_kind

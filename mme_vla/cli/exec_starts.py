@@ -12,11 +12,7 @@ from mme_vla.utils import write_json
 
 @cli("exec_starts")
 def main(cfg: DictConfig) -> None:
-    """Write the side file as configs/exec_starts.yaml and the command line say.
-
-    Raises:
-        UserError: the file exists, or an episode of the dataset is not among the recordings.
-    """
+    """Write the side file as configs/exec_starts.yaml and the command line say."""
     output = Path(cfg.output)
     if output.exists():
         raise UserError(f"{output} exists: name a new file, nothing is ever written over.")

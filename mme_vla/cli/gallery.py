@@ -86,11 +86,7 @@ def page(entries: Sequence[tuple[str, str, str]]) -> str:
 
 
 def run(cfg: "DictConfig") -> None:
-    """Draw the gallery as configs/show.yaml and the command line say.
-
-    Raises:
-        UserError: an unknown task, split or episode, too few tiles, or no simulator or renderer.
-    """
+    """Draw the gallery as configs/show.yaml and the command line say."""
     from mme_vla.data.console import progress
 
     specs = choose_episodes(named_tasks(cfg), cfg.episodes, cfg.split)

@@ -2,11 +2,7 @@
 
 
 def main() -> None:
-    """Serve as the harness's own model servers do; `--help` lists its words.
-
-    Raises:
-        UserError: the extra `harness` is not installed, or a checkpoint that cannot be served.
-    """
+    """Serve as the harness's own model servers do; `--help` lists its words."""
     from mme_vla.serving.harness import run_server
 
     run_server()

@@ -21,11 +21,7 @@ if TYPE_CHECKING:
 
 @cli("inspect")
 def main(cfg: DictConfig) -> None:
-    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its memory.
-
-    Raises:
-        UserError: nothing to inspect is named, or it cannot be read.
-    """
+    """Print what `checkpoint`, `dataset` or `episode` holds; for an episode, also draw its memory."""
     from rich.console import Console
 
     console = Console(markup=False)
@@ -96,11 +92,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
 
 
 def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) -> None:
-    """Print a dataset's episodes, at most `most` of them, and its totals.
-
-    Raises:
-        UserError: a file is not what its checksum says; all of them are compared.
-    """
+    """Print a dataset's episodes, at most `most` of them, and its totals."""
     from mme_vla.data.lerobot_files import SAMPLE
 
     compared = source.verify()
@@ -148,11 +140,7 @@ def show_episode(source: "EpisodeSource", episode: int, step: int, console: "Con
 
 
 def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tuple[int, int]:
-    """The episode and step asked for; the last step by default.
-
-    Raises:
-        UserError: the dataset has no such episode, or the episode no such step.
-    """
+    """The episode and step asked for; the last step by default."""
     if not isinstance(episode, int) or not 0 <= episode < len(source):
         raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
     length = int(source.lengths[episode])
@@ -163,11 +151,7 @@ def check_place(source: "EpisodeSource", episode: int, step: int | None) -> tupl
 
 
 def build_memory(cfg: DictConfig) -> "Memory":
-    """The memory the configuration names, of any width: it is only asked to select.
-
-    Raises:
-        UserError: an unknown backbone, memory or option.
-    """
+    """The memory the configuration names, of any width: it is only asked to select."""
     from mme_vla.backbone.config import shape_of
     from mme_vla.policy import mme
 

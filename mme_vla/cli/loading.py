@@ -45,9 +45,6 @@ def load_policy(
     Args:
         cfg: with `checkpoint`, `revision`, `device`, `dtype` and what a model is built from.
         verb: what the command does with it, for messages. device: instead of the configured one.
-
-    Raises:
-        UserError: neither a checkpoint nor a model is named, or both (or a part of one), or there is no such device.
     """
     from mme_vla.policy.base import Policy
     from mme_vla.policy.build import build_from_config
@@ -84,11 +81,7 @@ SAMPLING = ("auto", "eager", "graph", "compiled")
 
 
 def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) -> None:
-    """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU.
-
-    Raises:
-        UserError: an unknown way, or one that this policy or device has not.
-    """
+    """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
     if sampling not in SAMPLING:
         raise UserError(f"sampling={sampling!r}. {did_you_mean(str(sampling), SAMPLING)}")
     on_gpu = policy.device.type == "cuda"

@@ -52,11 +52,7 @@ def with_settings(words: Sequence[str]) -> list[str]:
 
 @cli("nano")
 def command(cfg: DictConfig) -> None:
-    """Record, train, evaluate and write the page, each as far as it is not there.
-
-    Raises:
-        UserError: anything in the settings or on the machine that cannot work.
-    """
+    """Record, train, evaluate and write the page, each as far as it is not there."""
     from mme_vla.envs.make import check_names, require_simulator
 
     config = OmegaConf.to_container(cfg, resolve=True)
@@ -143,11 +139,7 @@ def plan_all(config: Mapping[str, Any], folder: Path) -> "list[EpisodeRecord]":
 
 
 def check_counts(counts: Any) -> None:
-    """Make sure that demonstrations are asked for as difficulty: how many.
-
-    Raises:
-        UserError: another form, an unknown difficulty, or fewer than two in all.
-    """
+    """Make sure that demonstrations are asked for as difficulty: how many."""
     known = ("easy", "medium", "hard")
     if not isinstance(counts, Mapping) or not all(isinstance(n, int) and n >= 0 for n in counts.values()):
         raise UserError(f"demonstrations={brief(counts)}: write how many of each difficulty, such as {{easy: 100}}.")
@@ -165,9 +157,6 @@ def record_all(
 
     Args:
         choices: what the memories that will train on them read. robot: the one that does.
-
-    Raises:
-        UserError: scene after scene without a demonstration that succeeds.
     """
     from mme_vla.data.console import progress
     from mme_vla.nano.demonstrations import Scene
@@ -189,11 +178,7 @@ def record_all(
 def demonstrate(
     scenes: "Iterator[Scene]", count: int, workers: int = 1, advance: Callable[[int], None] = lambda _: None
 ) -> list[Path]:
-    """The files of the first demonstrations of these scenes that succeed; what is there is not made again, nor tried.
-
-    Raises:
-        UserError: scene after scene without one.
-    """
+    """The files of the first demonstrations of these scenes that succeed; what is there is not made again, nor tried."""
     from mme_vla.cli.record import carry_out
     from mme_vla.nano.demonstrations import demonstrated
 

@@ -22,11 +22,7 @@ HUMAN = "human"
 
 @cli("play")
 def main(cfg: DictConfig) -> None:
-    """Play the episodes that are not played yet, on the page or by a model, and compare with the paper.
-
-    Raises:
-        UserError: anything in the settings that cannot work, before an episode begins.
-    """
+    """Play the episodes that are not played yet, on the page or by a model, and compare with the paper."""
     from mme_vla.envs.make import ENVS
     from mme_vla.play import build_player
     from mme_vla.play.web import require_page

@@ -24,11 +24,7 @@ logger = logging.getLogger("mme_vla.probe")
 
 @cli("probe")
 def main(cfg: DictConfig) -> None:
-    """Probe what has no result yet, and write the page.
-
-    Raises:
-        UserError: anything in the settings, the checkpoint, the data or the machine that cannot work.
-    """
+    """Probe what has no result yet, and write the page."""
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
     from mme_vla.evaluation.rollout.evaluation import (

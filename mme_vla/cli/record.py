@@ -39,9 +39,6 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
-
-    Raises:
-        UserError: none of the seeds succeeded.
     """
     from mme_vla.envs.recording.outputs import EpisodeWriter
     from mme_vla.envs.recording.recorder import Recorder
@@ -176,11 +173,7 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
 
 
 def plan(cfg: "DictConfig") -> list[Job]:
-    """The episodes that a configuration names.
-
-    Raises:
-        UserError: an unknown task or split, an episode that does not exist, or a number that is not positive.
-    """
+    """The episodes that a configuration names."""
     for name in ("workers", "retries"):
         if not isinstance(cfg[name], int) or cfg[name] < 1:
             raise UserError(f"{name}={cfg[name]!r}: expected a positive integer.")
@@ -204,11 +197,7 @@ def _frame_choice(cfg: "DictConfig") -> FrameChoice | None:
 
 
 def run(cfg: "DictConfig") -> None:
-    """Record as configs/record.yaml and the command line say; what the same words have recorded stays as it is.
-
-    Raises:
-        UserError: something that the configuration asks for is not possible; nothing that exists is overwritten.
-    """
+    """Record as configs/record.yaml and the command line say; what the same words have recorded stays as it is."""
     from mme_vla.config.sections import read_section
     from mme_vla.data.convert import ConvertOptions
 

@@ -60,11 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Do what the parsed command line says.
-
-    Raises:
-        UserError: nothing to read, records that contradict each other, or an unknown task, method or split.
-    """
+    """Do what the parsed command line says."""
     from rich.console import Console
 
     if args.demo == bool(args.runs):

@@ -22,11 +22,7 @@ logger = logging.getLogger("mme_vla.serving")
 
 @cli("serve")
 def main(cfg: DictConfig) -> None:
-    """Serve `checkpoint`, or a fresh `model`, until it is told to stop.
-
-    Raises:
-        UserError: anything in the settings or the checkpoint that cannot work, before a client is accepted.
-    """
+    """Serve `checkpoint`, or a fresh `model`, until it is told to stop."""
     from mme_vla.serving.server import PolicyServer
     from mme_vla.serving.settings import ServeSettings
 

@@ -27,11 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 @cli("train")
 def main(cfg: DictConfig) -> None:
-    """Train from the beginning, or go on with a run that was interrupted.
-
-    Raises:
-        UserError: anything in the settings, the data or a checkpoint that cannot work, before training begins.
-    """
+    """Train from the beginning, or go on with a run that was interrupted."""
     from hydra.core.hydra_config import HydraConfig
 
     begun, named = time.perf_counter(), True

@@ -20,11 +20,7 @@ VOCAB_SIZE = 1024
 
 
 def train_tokenizer(sentences: Iterable[str], vocab_size: int = VOCAB_SIZE) -> bytes:
-    """Return a SentencePiece model of `vocab_size` pieces made from these sentences.
-
-    Raises:
-        UserError: the sentences do not hold enough different words for that many pieces.
-    """
+    """Return a SentencePiece model of `vocab_size` pieces made from these sentences."""
     from sentencepiece import SentencePieceTrainer
 
     model = io.BytesIO()

@@ -140,10 +140,6 @@ def convert(
     """Convert a checkpoint; the destination appears whole or not at all.
 
     With `trust_plugins` the modules that a checkpoint names are imported: code of whoever wrote it.
-
-    Raises:
-        UserError: the destination exists, the source is no checkpoint or does not fit the model, or the target format
-            has no place for the model.
     """
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
     if not dry_run and target.exists():

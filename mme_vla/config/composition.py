@@ -45,9 +45,6 @@ def compose(
         overrides: as on the command line: `["model=framesamp_modul", "train.lr=1e-4"]`.
         directory: the tree; the library's own by default.
         extra_dirs: further trees searched after it, as `--config-dir` adds them.
-
-    Raises:
-        UserError: a name or key that does not exist, a value of the wrong kind, or a file that cannot be read.
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
     words = tuple(several_memories(overrides))
@@ -87,11 +84,7 @@ def check_overrides(
     directory: Path | None = None,
     extra_dirs: Sequence[Path] = (),
 ) -> None:
-    """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included.
-
-    Raises:
-        UserError: as `compose`.
-    """
+    """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included."""
     columns = [_choices(override) for override in parse(overrides)]
     for row in zip_longest(*columns) if columns else [()]:
         # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
@@ -121,11 +114,7 @@ OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
 
 
 def import_plugins(cfg: DictConfig) -> None:
-    """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`.
-
-    Raises:
-        UserError: there is no such module.
-    """
+    """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`."""
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
 
 
@@ -207,9 +196,6 @@ def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> 
 
     Args:
         trees: folders of YAML files, the library's first.
-
-    Raises:
-        UserError: a word that is neither a group nor an override that fits.
     """
 
     def selected_groups(overrides: Sequence[str]) -> dict[str, str]:

@@ -192,11 +192,7 @@ class ConfigTree:
         return _unknown_key(key, defaults, self.loader.list_groups(""))
 
     def check_kinds(self) -> None:
-        """Refuse a value that cannot stand for the default: text for a number, a value for a section.
-
-        Raises:
-            UserError: naming the override and what was expected.
-        """
+        """Refuse a value that cannot stand for the default: text for a number, a value for a section."""
         defaults = self.defaults() if self.values else {}
         for override in self.values:
             default = _select(defaults, override.key_or_group)

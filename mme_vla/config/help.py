@@ -144,9 +144,6 @@ def help_page(config_name: str, words: Sequence[str], trees: Sequence[Path], sel
     Args:
         config_name: the command's file. words: what stands beside `--help`: names of groups, and overrides.
         trees: folders of YAML files, the library's first. select: composes.
-
-    Raises:
-        UserError: a word that is neither a group nor `key=value`.
     """
     file = next(tree / f"{config_name}.yaml" for tree in trees if (tree / f"{config_name}.yaml").is_file())
     overrides = [word for word in words if "=" in word]

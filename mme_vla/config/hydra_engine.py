@@ -148,11 +148,7 @@ _parser = cache(OverridesParser.create)
 
 
 def parse(overrides: Sequence[str]) -> list[Override]:
-    """Overrides under Hydra's grammar.
-
-    Raises:
-        UserError: one that it cannot read, or without a key.
-    """
+    """Overrides under Hydra's grammar."""
     try:
         parsed = _parser().parse_overrides(list(overrides))
         for override in parsed:

@@ -29,9 +29,6 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
         values: the section. where: its dotted name in messages; empty for the top level.
         others: whether keys of other purposes may stand in it; they are left aside.
         fixed: fields that the section does not decide.
-
-    Raises:
-        UserError: no mapping, an unknown or missing key, a value of another kind; and whatever `kind` itself refuses.
     """
     specs = {spec.name: spec for spec in fields(kind) if spec.init and spec.name not in fixed}  # type: ignore[arg-type]
     needed = [n for n, spec in specs.items() if spec.default is MISSING and spec.default_factory is MISSING]
@@ -53,11 +50,7 @@ def read_section[T](kind: type[T], values: Any, where: str = "", *, others: bool
 
 
 def section_keys(values: Any, where: str, known: Iterable[str], required: Iterable[str] = ()) -> dict[str, Any]:
-    """A mapping with no unknown key, and with a value for every required one.
-
-    Raises:
-        UserError: it is something else; `where` names it.
-    """
+    """A mapping with no unknown key, and with a value for every required one."""
     if not isinstance(values, Mapping):
         raise UserError(f"{where or 'the configuration'} must be a section of keys, got {brief(values)}.")
     for key in values:

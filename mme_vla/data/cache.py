@@ -46,9 +46,6 @@ def fingerprint(source: EpisodeSource, spec: StorageSpec, encoder: str, dtype: s
         source: the dataset. spec: what a memory stores of each frame.
         encoder: hash of the vision tower's weights (`policy.vision_fingerprint()`).
         dtype: `bfloat16` or `float32`.
-
-    Raises:
-        UserError: another dtype.
     """
     if dtype not in DTYPES:
         raise UserError(f"A cache holds {' or '.join(DTYPES)} tokens, not {dtype!r}.")
@@ -135,11 +132,7 @@ class VisionCache:
         self._verified: set[int] = set()
 
     def history(self, episode: int) -> CachedHistory:
-        """The stored tokens of a whole episode.
-
-        Raises:
-            UserError: its files are not what was written.
-        """
+        """The stored tokens of a whole episode."""
         if episode not in self._histories:
             self.verify(episode)
             length = int(self._lengths[episode])
@@ -157,11 +150,7 @@ class VisionCache:
         return self._histories[episode]
 
     def verify(self, episode: int) -> None:
-        """Compare an episode's files with the checksums that were written with them, the first time it is asked for.
-
-        Raises:
-            UserError: a file is not what was written.
-        """
+        """Compare an episode's files with the checksums that were written with them, the first time it is asked for."""
         if episode in self._verified:
             return
         sums = Sums(self.folder, sum_file(self.folder, episode).name, self._remedy)

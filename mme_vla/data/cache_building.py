@@ -58,11 +58,7 @@ def process_rank() -> tuple[int, int]:
 
 
 def clear_cache(folder: Path) -> None:
-    """Remove the files of a cache, and nothing else.
-
-    Raises:
-        UserError: the folder is not a vision cache.
-    """
+    """Remove the files of a cache, and nothing else."""
     if not folder.exists():
         return
     if not (folder / FINGERPRINT).is_file() and any(folder.iterdir()):
@@ -86,9 +82,6 @@ def build_cache(
 
     Stopped at any moment, it continues with the next call. Processes share the work: of the episodes, each takes those
     whose number is its rank modulo the world size.
-
-    Raises:
-        UserError: the folder holds something else (`check_fingerprint`).
     """
     rank, world = process_rank() if shard is None else shard
     folder.mkdir(parents=True, exist_ok=True)
@@ -260,9 +253,6 @@ def ensure_cache(
         dtype: of the stored tokens. batch_size: frames encoded at once.
         max_build_frames: datasets of more frames are not built here: that is worth a command of its own.
         command: that command, for messages.
-
-    Raises:
-        UserError: the dataset is larger than that and its cache is not there, or the cache is stale or damaged.
     """
     coded = source.lossy.get(source.robot.memory_camera)
     if coded is not None and memory.make_scorer() is not None:

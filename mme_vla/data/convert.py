@@ -167,10 +167,6 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
 
     A run that was interrupted is continued by calling again with the same arguments. The files are told by their
     content, so one that has changed since is noticed.
-
-    Raises:
-        UserError: `output` holds something else, a partial run had other episodes or options, another process converts
-            into it, or an episode is damaged. Nothing that exists is overwritten.
     """
     if not episodes:
         raise UserError("There is no episode to convert.")
@@ -189,11 +185,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
 
 
 def drop_work(output: Path) -> None:
-    """Remove what a conversion left beside `output` that was killed after it had moved its result there.
-
-    Raises:
-        UserError: another process converts into it.
-    """
+    """Remove what a conversion left beside `output` that was killed after it had moved its result there."""
     partial = _work_folder(output)
     if partial.exists():
         with FolderLock(partial, "conversion"):

@@ -78,9 +78,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             jitter: hand the memory a random generator, for memories that vary their selection in training.
             subgoal: picks the prompt's subgoal out of a step's texts; None trains without subgoals.
             seed: of all randomness.
-
-        Raises:
-            UserError: a memory without caches, an impossible offset, or no execution step at all.
         """
         if memory is not None and (caches is None or len(caches) != len(sources)):
             raise UserError(
@@ -145,9 +142,6 @@ class TrainingDataset(Dataset[dict[str, Any]]):
         """The item of a frame; frames at which the robot does not decide share their episode's items evenly.
 
         Such are those of the conditioning video, for a sampler that draws from all frames alike.
-
-        Raises:
-            UserError: none of this episode's frames is an item.
         """
         at = np.flatnonzero((self._source == source) & (self._episode == episode))
         decisions = np.asarray(self.decisions(source, episode))

@@ -65,10 +65,6 @@ class EpisodeSource:
             name: short name, which the validation split and the cache folder use; by default the folder's.
             max_open_videos: most video files kept open.
             robot: says which columns hold its pictures, states and actions.
-
-        Raises:
-            UserError: not a v3.0 dataset, a feature is missing, the demonstration flag is missing and no side file
-                is given, or the parts of the dataset contradict each other.
         """
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
@@ -126,11 +122,7 @@ class EpisodeSource:
 
     @cached_property
     def records(self) -> list[dict[str, Any]]:
-        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty.
-
-        Raises:
-            UserError: the file is damaged.
-        """
+        """What the converter knows of each episode beside the columns: task, seed, difficulty, …; may be empty."""
         side = self.root / SIDE_FILE
         if not side.exists() and not side.is_symlink():
             return []
@@ -158,9 +150,6 @@ class EpisodeSource:
 
         Returns:
             The number of files compared, 0 for a dataset that was written without checksums.
-
-        Raises:
-            UserError: a file is missing or is not what was written.
         """
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
         for name in sums.table:
@@ -179,11 +168,7 @@ class EpisodeSource:
         return self._goals[episode]
 
     def options(self, episode: int) -> tuple[Option, ...]:
-        """What the robot could choose among in an episode; none where it does not choose.
-
-        Raises:
-            UserError: the dataset does not tell.
-        """
+        """What the robot could choose among in an episode; none where it does not choose."""
         letters = len(self.robot.action.choice)
         if not letters:
             return ()
@@ -286,12 +271,7 @@ class EpisodeSource:
         return {name: str(_flat(row[name])[0].as_py()).lower() for name in self.subgoal_names}
 
     def frames(self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        """Decode pictures [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory.
-
-        Raises:
-            UserError: no such camera, a frame outside the episode or one that was not drawn, or a damaged or missing
-                video.
-        """
+        """Decode pictures [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory."""
         indices = np.asarray(indices, np.int64)
         length = int(self.lengths[episode])
         if not len(indices) or indices.min() < 0 or indices.max() >= length:

@@ -33,11 +33,7 @@ class AnnotatedEpisode:
 
 
 def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
-    """All episodes, in order, of official HDF5 files or folders of them, and of LeRobot datasets that mark the video.
-
-    Raises:
-        UserError: an input is neither, or a file is damaged.
-    """
+    """All episodes, in order, of official HDF5 files or folders of them, and of LeRobot datasets that mark the video."""
     episodes: list[AnnotatedEpisode] = []
     for path in inputs:
         annotated = _of_dataset(Path(path)) if (Path(path) / "meta").is_dir() else _of_files(path)
@@ -59,11 +55,7 @@ def _of_files(path: str | Path) -> Iterator[AnnotatedEpisode]:
 
 
 def first_frames(dataset: str | Path, annotated: Sequence[AnnotatedEpisode]) -> list[int]:
-    """The first execution frame of every episode of a dataset that does not mark its videos.
-
-    Raises:
-        UserError: an episode is not among the marked ones, or two of these fit it that differ.
-    """
+    """The first execution frame of every episode of a dataset that does not mark its videos."""
     source = EpisodeSource(dataset, robot=_UNMARKED)
     return [_start_of(source, episode, annotated) for episode in range(len(source))]
 

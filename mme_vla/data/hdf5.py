@@ -12,11 +12,7 @@ from mme_vla.utils import decoding, require_file
 
 
 def find_files(inputs: Sequence[str | Path]) -> list[Path]:
-    """Expand files and folders into HDF5 files, sorted by name.
-
-    Raises:
-        UserError: an input does not exist, or a folder holds no .h5 file.
-    """
+    """Expand files and folders into HDF5 files, sorted by name."""
     files: set[Path] = set()
     for entry in map(Path, inputs):
         matches = sorted(entry.glob("*.h5")) if entry.is_dir() else [entry]
@@ -33,11 +29,7 @@ def find_files(inputs: Sequence[str | Path]) -> list[Path]:
 
 
 def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
-    """All episodes of these files: file by file, each in numerical order.
-
-    Raises:
-        UserError: a file is no HDF5 file or has no episode_<number> group.
-    """
+    """All episodes of these files: file by file, each in numerical order."""
     refs = []
     for file in files:
         task = re.sub(r"^record_dataset_", "", file.stem)
@@ -89,11 +81,7 @@ def any_selected_frames(refs: Sequence[EpisodeRef]) -> bool:
 
 @contextmanager
 def open_episode(ref: EpisodeRef) -> Iterator[RawEpisode]:
-    """Open one episode for reading.
-
-    Raises:
-        UserError: the file or the episode is damaged or has another layout; the message names the place.
-    """
+    """Open one episode for reading."""
     with _open(ref.file) as handle:
         with decoding(ref.file, "HDF5", REMEDY):
             group = handle.get(ref.group)

@@ -33,11 +33,7 @@ class EpisodeRef:
 
 
 class StoredValues:
-    """Reads the datasets below one episode's group.
-
-    Raises:
-        UserError: from every method, where a value is absent, damaged or of another form; it names the place.
-    """
+    """Reads the datasets below one episode's group."""
 
     def __init__(self, ref: EpisodeRef, group: Any) -> None:
         self.ref = ref
@@ -226,9 +222,6 @@ class RawEpisode(StoredValues):
 
         Of waypoints, which are noted when a motion begins: the one under way, and before the first one of the video
         or the execution that first one; a part without any is one motion to where it ends.
-
-        Raises:
-            UserError: a step has no 7 numbers, or none that are finite where there is no motion to take them from.
         """
         steps = [self._numbers(k, POSE_ACTIONS[column], 7, finite=False)[:7] for k in range(self.length)]
         return known_poses(
@@ -236,20 +229,12 @@ class RawEpisode(StoredValues):
         )
 
     def tool_poses(self) -> np.ndarray:
-        """Where the tool was at every step: position and roll, pitch, yaw, [t, 6] float32.
-
-        Raises:
-            UserError: a step has no 6 finite numbers.
-        """
+        """Where the tool was at every step: position and roll, pitch, yaw, [t, 6] float32."""
         steps = [self._numbers(k, f"obs/{POSE_STATE}", POSE_WIDTH)[:POSE_WIDTH] for k in range(self.length)]
         return np.stack(steps).astype(np.float32)
 
     def choice_actions(self) -> np.ndarray:
-        """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at all others.
-
-        Raises:
-            UserError: a step holds something that is no choice.
-        """
+        """What was chosen among `options`, [t, 10] float32: at the first frame of each, zeros at all others."""
         rows = np.zeros((self.length, len(CHOICE_NUMBERS)), np.float32)
         for k in range(self.length):
             begins = self._flag(k, "info/is_subgoal_boundary") and not self._flag(k, "info/is_completed")
@@ -264,11 +249,7 @@ class RawEpisode(StoredValues):
 
     @cached_property
     def options(self) -> list[dict[str, Any]]:
-        """What could be chosen: `label`, `action` and `need_parameter` of each option.
-
-        Raises:
-            UserError: the file holds something else.
-        """
+        """What could be chosen: `label`, `action` and `need_parameter` of each option."""
         place = f"{self.ref.file} {self.ref.group}/{CHOICES[0]}"
         values = parse_json(self._text(self._value(CHOICES[0])), place, list)
         try:
@@ -283,9 +264,6 @@ class RawEpisode(StoredValues):
         Returns:
             `colours` [H, W, 3] uint8; `depth` [H, W] float32 in millimetres; `intrinsic` [3, 3] and the world-to-camera
             `extrinsic` [3, 4] float64.
-
-        Raises:
-            UserError: the episode holds no depth or no poses of cameras, or something else in their place.
         """
         colours = self._image(step, camera)
         parts = {"depth": f"timestep_{step}/obs/{camera}_depth", "intrinsic": f"setup/{camera}_camera_intrinsic",

@@ -48,11 +48,7 @@ def motions_of(episode: RawEpisode) -> Motions:
 
 
 def write_keyframes(episode: RawEpisode, path: Path, side: int = SIDE) -> int:
-    """Keep the keyframes of a recorded episode; returns how many frames those are.
-
-    Raises:
-        UserError: the recording has no depth, camera poses or waypoints.
-    """
+    """Keep the keyframes of a recorded episode; returns how many frames those are."""
     motions = motions_of(episode)
     frames = np.union1d(np.arange(0, episode.length, ENTRY_EVERY), motions.decisions)
     arrays: dict[str, list[np.ndarray]] = {name: [] for name in ("colours", "depth", "intrinsic", "extrinsic")}
@@ -213,9 +209,6 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
             length: k; keyframes of a sample.
             episodes: which of each source's episodes to use; None uses all.
             sampled: whether a sample is drawn anew each epoch; else it is the place of its number.
-
-        Raises:
-            UserError: an episode has no keyframes beside it, or no chain has `length` of them.
         """
         self.sources, self.processor, self.length = list(sources), processor, length
         self.seed, self.epoch = seed, 0

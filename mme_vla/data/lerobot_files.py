@@ -47,11 +47,7 @@ class Columns:
 
 
 def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: Embodiment) -> Columns:
-    """Match a robot with a dataset.
-
-    Raises:
-        UserError: a feature is absent, or the numbers are more or fewer than the robot's; `root` is for the message.
-    """
+    """Match a robot with a dataset."""
     matches = {
         **{camera.name: _first(_spellings_of(camera), features) for camera in robot.cameras},
         **{key: _first((key, f"observation.{key}"), features) for key in robot.state.key},
@@ -144,11 +140,7 @@ SAMPLE = Path(__file__).resolve().parent.parent / "assets" / "sample"
 
 
 def resolve_root(root: str | Path) -> Path:
-    """Return the dataset folder; `sample` names the one in the package.
-
-    Raises:
-        UserError: there is no such folder, or it is no LeRobot v3.0 dataset.
-    """
+    """Return the dataset folder; `sample` names the one in the package."""
     path = SAMPLE if str(root) == "sample" else Path(root).expanduser()
     info = path / "meta" / "info.json"
     if not info.is_file():
@@ -171,11 +163,7 @@ def resolve_root(root: str | Path) -> Path:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return `meta/info.json`: features with a `dtype` and a `shape` of whole numbers, frames per second, and others.
-
-    Raises:
-        UserError: it is not JSON, or does not describe features.
-    """
+    """Return `meta/info.json`: features with a `dtype` and a `shape` of whole numbers, frames per second, and others."""
     path = root / "meta" / "info.json"
     info = read_json(path, "a dataset's description")
     features = info.get("features")
@@ -212,9 +200,6 @@ def read_exec_starts(file: Path, episodes: int) -> np.ndarray:
 
     Returns:
         int64 [episodes].
-
-    Raises:
-        UserError: the file is absent, of another form, or does not cover every episode.
     """
     expected = (
         'Expected JSON {"<episode_index>": <exec_start_idx>, …} or a parquet table with the columns episode_index and '

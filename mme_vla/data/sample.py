@@ -48,11 +48,7 @@ shows motion as it was; use it where motion matters. Results on this sample say 
 
 
 def make_sample(full: Path, thinned: Path, output: Path = SAMPLE) -> int:
-    """Write the sample and return its size in bytes.
-
-    Raises:
-        UserError: an episode is not where it should be, `output` holds something else, or the result is too large.
-    """
+    """Write the sample and return its size in bytes."""
     folders = {"full": full, "thinned": thinned}
     refs = [EpisodeRef(folders[kind] / f"record_dataset_{task}.h5", number, task) for kind, task, number in EPISODES]
     for ref in refs:

@@ -32,9 +32,6 @@ def split_episodes(
     names holds out exactly those. Of any other, episode e validates if the first eight
     bytes of SHA-256("<source name>/<e>"), read as a fraction of 2⁶⁴, are below `val_fraction`: the choice does not
     change when data are added, and needs no random numbers.
-
-    Raises:
-        UserError: an unknown source or episode, a fraction outside [0, 1), or nothing left to train on.
     """
     named = _by_source(val_episodes or [], sources)
     unknown = set(named) - {source.name for source in sources}
@@ -97,9 +94,6 @@ def open_sources(
     """Open the datasets of `data.sources`: folders, `sample`, or mappings with root, name and exec_starts.
 
     `robot` says which columns hold its pictures, states and actions.
-
-    Raises:
-        UserError: no source, an unknown key, two sources of one name, or a dataset that cannot be used.
     """
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
     if not listed:

@@ -40,9 +40,6 @@ def compute_norm_stats(
         every: count every execution step, in the data's order. extremes: keep the smallest and largest values too.
         exact: quantiles of all rows at once (linear interpolation), not of their histogram.
         video: count the conditioning video's steps too.
-
-    Raises:
-        UserError: fewer than two execution steps.
     """
     steps = _counted_steps(sources, episodes, video)
     if len(steps) < 2:

@@ -26,11 +26,7 @@ _FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("
 
 
 def parquet_files(root: Path, folder: str) -> list[Path]:
-    """The parquet files of `folder`, two levels down as in LeRobot v3.0, in order.
-
-    Raises:
-        UserError: something else has the name of one.
-    """
+    """The parquet files of `folder`, two levels down as in LeRobot v3.0, in order."""
     return [require_file(path, "a parquet table") for path in sorted((root / folder).glob("*/*.parquet"))]
 
 
@@ -40,9 +36,6 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
     Returns:
         `starts` and `lengths`, [e] int64 rows of the tables; `goals`, [e] texts, lower-case; and for every view
         `<view>/chunk_index`, `<view>/file_index` [e] int64 and `<view>/from_timestamp` [e] float64, seconds.
-
-    Raises:
-        UserError: a table is damaged, lacks a column, or says what cannot be.
     """
     import pyarrow as pa
 
@@ -83,11 +76,7 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
 
 
 def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> Any:
-    """Memory-map these columns of all tables, as LeRobot does, through the cache folder of the `datasets` library.
-
-    Raises:
-        UserError: a table is damaged, lacks a column, or holds another kind of values in it.
-    """
+    """Memory-map these columns of all tables, as LeRobot does, through the cache folder of the `datasets` library."""
     from datasets import Dataset, Features
     from lerobot.utils.utils import SuppressProgressBars
 
@@ -116,11 +105,7 @@ def _kind(dtype: str, shape: tuple[int, ...], **_: Any) -> Any:
 
 
 def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
-    """Make sure that every row of a column is `width` finite numbers; one alone may stand without a list around it.
-
-    Raises:
-        UserError: a row is absent, shorter or longer, or holds NaN or an infinity; the first one is named.
-    """
+    """Make sure that every row of a column is `width` finite numbers; one alone may stand without a list around it."""
     import pyarrow.compute as pc
 
     first = 0
@@ -141,11 +126,7 @@ def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
 
 
 def video_file(root: Path, template: object, view: str, chunk: int, file: int) -> Path:
-    """The place of a video: `video_path` of meta/info.json, filled in.
-
-    Raises:
-        UserError: the template is no text with plain fields, or leads out of the dataset.
-    """
+    """The place of a video: `video_path` of meta/info.json, filled in."""
     info = root / "meta" / "info.json"
     try:
         fields = [

@@ -34,11 +34,7 @@ class VideoReader:
         self._may_hold: int | None = None
 
     def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
-        """Return the pictures nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for.
-
-        Raises:
-            UserError: the file cannot be decoded, or holds no picture within half a frame of a time stamp.
-        """
+        """Return the pictures nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for."""
         order = np.argsort(np.asarray(timestamps), kind="stable")
         targets = np.asarray(timestamps, np.float64)[order]
         images: list[np.ndarray] = []

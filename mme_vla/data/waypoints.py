@@ -82,11 +82,7 @@ CHOICE_NUMBERS = [*(f"choice_{letter}" for letter in LETTERS), "point_y", "point
 
 
 def row_of(text: str) -> np.ndarray | None:
-    """A recorded choice, `{"choice": "A", "point": [y, x]}` in pixels, as a row; None where no letter was chosen.
-
-    Raises:
-        UserError: something else.
-    """
+    """A recorded choice, `{"choice": "A", "point": [y, x]}` in pixels, as a row; None where no letter was chosen."""
     try:
         choice = parse_json(text, "a recorded choice")
         letter, point = choice["choice"].strip().lower(), np.asarray(choice.get("point") or (), np.float64)

@@ -93,9 +93,6 @@ def read_options(value: Any, letters: int) -> tuple[Option, ...]:
 
     Args:
         letters: how many there can be.
-
-    Raises:
-        UserError: not such a list, a letter twice, or one that comes after the last.
     """
     known = ascii_lowercase[:letters]
     expected = f'a list of {{"label": "a", "action": "…", "need_parameter": false}}, labels {known[0]} to {known[-1]}'
@@ -172,11 +169,7 @@ class ActionSpace:
 
     @classmethod
     def from_dict(cls, section: Any, state_width: int) -> Self:
-        """Read the section `embodiment.action`.
-
-        Raises:
-            UserError: an unknown or missing key, or a value that cannot be.
-        """
+        """Read the section `embodiment.action`."""
         where = "embodiment.action"
         values = section_keys(section, where, _KEYS, required=("width",))
         width = integer(values["width"], f"{where}.width")
@@ -276,11 +269,7 @@ class ActionSpace:
         return out
 
     def worded(self, goal: str, options: Sequence[Option]) -> str:
-        """The goal as the policy reads it: where it chooses among options, they stand behind it.
-
-        Raises:
-            UserError: the episode says nothing of its options.
-        """
+        """The goal as the policy reads it: where it chooses among options, they stand behind it."""
         if not self.choice:
             return goal
         _require(options)
@@ -294,9 +283,6 @@ class ActionSpace:
 
         Returns:
             [..., w], the point within the picture; `actions` themselves where nothing is chosen.
-
-        Raises:
-            UserError: the episode says nothing of its options.
         """
         if not self.choice:
             return actions

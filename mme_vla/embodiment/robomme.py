@@ -42,11 +42,7 @@ ROBOMME_JOINT = Embodiment(
 
 
 def embodiment_of(config: Mapping[str, Any]) -> Embodiment:
-    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots could be chosen.
-
-    Raises:
-        UserError: a section `embodiment` that cannot be, or that does not fit the section `backbone`.
-    """
+    """The robot of a policy's configuration; RoboMME's Panda where it names none, as before robots could be chosen."""
     backbone = config.get("backbone", {})
     if config.get("embodiment") is None:
         return ROBOMME_JOINT.with_horizon(backbone.get("horizon", ROBOMME_JOINT.action.horizon))
@@ -95,11 +91,7 @@ def benchmark_state(joints: Sequence[float] | np.ndarray, fingers: Sequence[floa
 
 
 def check_benchmark(robot: Embodiment, spaces: Sequence[str]) -> None:
-    """Make sure that a robot can take part in the benchmark.
-
-    Raises:
-        UserError: it has no action space of `spaces`, other cameras, or another state than the benchmark's.
-    """
+    """Make sure that a robot can take part in the benchmark."""
     if robot.action.space not in spaces:
         raise UserError(
             f"The robot {robot.name!r} cannot be evaluated on the benchmark: its action space is "

@@ -25,10 +25,10 @@ __all__ = [
 
 _HOMES = {
     "EpisodeSpec": "metadata",
-    "Job": "vector.jobs",
-    "Reply": "vector.jobs",
+    "Job": "vector.pool",
+    "Reply": "vector.pool",
     "RoboMMEEnv": "interface",
-    "TASK_NAMES": "task_names",
+    "TASK_NAMES": "metadata",
     "VecEnv": "vector.pool",
     "episode": "metadata",
     "episodes": "metadata",

@@ -19,9 +19,6 @@ def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
     Args:
         tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names; tasks of
             one's own are named, after the plugin that registers them was imported.
-
-    Raises:
-        UserError: an unknown task, one named twice, or none.
     """
     names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
     names = [str(name).strip() for name in names]
@@ -41,9 +38,6 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
         episodes: None or `all` for all there are, a number for the first so many, a list of numbers, or text of
             numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three alone, `3` the first three.
         count: how many episodes there are. what: of what, for messages.
-
-    Raises:
-        UserError: a number that there is not, one named twice, none, or another form.
     """
     if episodes is None or episodes == ALL:
         return list(range(count))
@@ -63,11 +57,7 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
 
 
 def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, split: str = "test") -> list[EpisodeSpec]:
-    """The episodes of a run, task by task.
-
-    Raises:
-        UserError: an unknown task or split, or as `choose_numbers`.
-    """
+    """The episodes of a run, task by task."""
     specs = []
     for task in choose_tasks(tasks):
         known = metadata.episodes(task, split)
@@ -80,9 +70,6 @@ def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
 
     Args:
         config: a command's; `tasks` is `all` by default where the command needs no tasks, else None.
-
-    Raises:
-        UserError: both are given and differ, or neither is.
     """
     tasks, task = (config.get(key) for key in ("tasks", "task"))
     if task is not None and tasks not in (None, ALL, task):
@@ -98,9 +85,6 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
 
     Args:
         key: what they were given as, and `grammar` what may stand there, for messages.
-
-    Raises:
-        UserError: another form.
     """
     if isinstance(value, str):
         parts: list[Any] = value.split(",")

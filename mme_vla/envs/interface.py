@@ -84,9 +84,6 @@ class RoboMMEEnv(gymnasium.Env):
     Attributes:
         on_frame: called with every frame that is returned, for recording.
         drawing: which frames have pictures, from the next call on; None for all. The others' are None in the lists.
-
-    Raises:
-        UserError: an unknown action space or reward, or a limit that is no positive integer.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -135,9 +132,6 @@ class RoboMMEEnv(gymnasium.Env):
 
         Returns:
             Observation lists (conditioning video, then the present frame) and the info of the present frame.
-
-        Raises:
-            UserError: the environment is closed, or an option is not known.
         """
         task = self._open_task()
         options = {"video": True} | (options or {})
@@ -170,9 +164,6 @@ class RoboMMEEnv(gymnasium.Env):
             Observation lists, reward, terminated, truncated (0-d tensors) and the info of the last frame.
             After an exception `(None, 0.0, True, False, info)` with the status `error`; after failed inverse kinematics
             the observation is `{}`.
-
-        Raises:
-            UserError: the environment is closed, or was never reset.
         """
         self._open_task()
         run = self._require_run()
@@ -193,11 +184,7 @@ class RoboMMEEnv(gymnasium.Env):
         return observation, reward, run.terminated, run.truncated, dict(run.info)
 
     def save_state(self) -> EpisodeState:
-        """Where the running episode stands, for `restore_state`; it costs next to nothing.
-
-        Raises:
-            UserError: the environment is closed, or was never reset.
-        """
+        """Where the running episode stands, for `restore_state`; it costs next to nothing."""
         run = self._require_run()
         return self.state_of(run.options, run.actions)
 
@@ -210,9 +197,6 @@ class RoboMMEEnv(gymnasium.Env):
         Returns:
             Observation lists and info, as the last `reset` or `step` before `save_state` returned them, pictures of the
             newest frame alone.
-
-        Raises:
-            UserError: the state is of another scene, action space or limit, or the environment is closed.
         """
         return play_again(self, state)
 

@@ -85,11 +85,7 @@ def make_env(
 
 
 def check_sessions(split: str, sessions: int) -> None:
-    """Refuse a split with sessions before each episode where nobody shows them.
-
-    Raises:
-        UserError: fewer or more are shown than the split asks for.
-    """
+    """Refuse a split with sessions before each episode where nobody shows them."""
     variant = read_variant(split)
     required = 0 if variant is None else variant.sessions
     if required != sessions:
@@ -101,11 +97,7 @@ def check_sessions(split: str, sessions: int) -> None:
 
 
 def check_names(task: str, env: str, action_space: str, difficulty: str | None, seed: int | None) -> None:
-    """Refuse what can be refused without the simulator.
-
-    Raises:
-        UserError: an unknown task, environment, action space or difficulty, or a difficulty without a seed.
-    """
+    """Refuse what can be refused without the simulator."""
     if task not in TASK_NAMES and task not in TASKS:
         raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
     for kind, value, known in (("environment", env, ENVS), ("action space", action_space, ACTION_SPACES)):
@@ -118,11 +110,7 @@ def check_names(task: str, env: str, action_space: str, difficulty: str | None, 
 
 
 def require_simulator() -> None:
-    """Refuse to go on without the simulator's packages.
-
-    Raises:
-        UserError: mani-skill is not installed.
-    """
+    """Refuse to go on without the simulator's packages."""
     if find_spec("mani_skill") is None:
         raise missing_extra("The simulator", "sim")
 
@@ -132,9 +120,6 @@ def load_tasks(*tasks: str) -> None:
 
     >>> load_tasks()  # doctest: +SKIP
     >>> gymnasium.make("StopCube", seed=0, difficulty="easy", obs_mode="rgb")  # doctest: +SKIP
-
-    Raises:
-        UserError: the simulator is missing.
     """
     require_simulator()
     from mme_vla.envs.tasks import module_name
@@ -151,9 +136,6 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
         render: build what is there to be seen; otherwise no Vulkan is needed.
         obs_mode: ManiSkill's observation mode.
         options: `seed`, `difficulty`, `recovery`, and what ManiSkill's `BaseEnv` takes.
-
-    Raises:
-        UserError: the simulator is missing, rendering is not possible here, or no such task is registered.
     """
     if task in TASK_NAMES:
         load_tasks(task)

@@ -74,11 +74,7 @@ class Variant:
         return self.turned if self.dial == SESSIONS else 0
 
     def check(self, task: str) -> None:
-        """Make sure that a task of the benchmark can be varied so.
-
-        Raises:
-            UserError: it is another task, or has not this dial.
-        """
+        """Make sure that a task of the benchmark can be varied so."""
         if task not in TASK_NAMES:
             raise UserError(f"split={TWIN} and split={STRESS}:… vary the benchmark's tasks alone, and {task} is none.")
         if self.dial and self.dial != SESSIONS and task not in DIALS[self.dial]:
@@ -90,11 +86,7 @@ class Variant:
 
 
 def read_variant(split: str) -> Variant | None:
-    """What a split varies; None for one that varies nothing, or is none.
-
-    Raises:
-        UserError: a stress split without a dial and how far it is turned, or with an unknown one.
-    """
+    """What a split varies; None for one that varies nothing, or is none."""
     if split == TWIN:
         return Variant(twin=True)
     if not str(split).startswith(STRESS):
@@ -174,9 +166,6 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
             `further_medium`, `further_hard`, 400 of one difficulty by the same rule.
         folder: official metadata, laid out as `<split>/record_dataset_<Task>_metadata.json`; by default the one that
             `MME_VLA_ROBOMME_METADATA` names, then the installed official package's, then the shipped table.
-
-    Raises:
-        UserError: an unknown task or split, or a folder without the file, or a file that is not of that layout.
     """
     if task not in TASK_NAMES and task not in TASKS:
         raise UserError(f"Unknown task {task!r}. {did_you_mean(str(task), [*TASK_NAMES, *TASKS])}")
@@ -196,11 +185,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
 
 def check_split(split: str) -> Variant | None:
-    """Make sure that a split exists; what it varies, where it is a variant of the test split.
-
-    Raises:
-        UserError: there is no such split.
-    """
+    """Make sure that a split exists; what it varies, where it is a variant of the test split."""
     variant = read_variant(split)
     if variant is None and split not in _COUNTS:
         raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), [*_COUNTS, TWIN, STRESS])}")
@@ -208,11 +193,7 @@ def check_split(split: str) -> Variant | None:
 
 
 def episode(task: str, split: str = "test", index: int = 0, folder: str | Path | None = None) -> EpisodeSpec:
-    """One episode of a split.
-
-    Raises:
-        UserError: as `episodes`, or an episode number the split does not have.
-    """
+    """One episode of a split."""
     known = episodes(task, split, folder)
     if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(known):
         raise UserError(f"Unknown episode {index!r} of {task}, split {split!r}; expected 0 to {len(known) - 1}.")
@@ -260,11 +241,7 @@ def _numbers_of(record: object, path: Path) -> tuple[int, int, str]:
 
 
 def read_official(path: Path, task: str, split: str) -> list[EpisodeSpec]:
-    """The episodes that an official metadata file describes, in order.
-
-    Raises:
-        UserError: the file is missing, or of another layout.
-    """
+    """The episodes that an official metadata file describes, in order."""
     records = read_json(path, f"official metadata of {task}, split {split!r}").get("records")
     if not isinstance(records, list) or not records:
         raise UserError(f"{path} is not official metadata: it has no list of records. Get the file again.")

@@ -44,11 +44,7 @@ class Include:
 
     @classmethod
     def from_options(cls, options: dict[str, Any]) -> "Include":
-        """Read `include_front_depth=True` and the like.
-
-        Raises:
-            UserError: an option that does not exist, or a value that is not a bool.
-        """
+        """Read `include_front_depth=True` and the like."""
         known = {f"include_{field.name}" for field in fields(cls)}
         for name, value in options.items():
             if name not in known:

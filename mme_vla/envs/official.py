@@ -40,22 +40,14 @@ class OfficialEnv:
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
-        """Begin the episode; `seed` and `options` have no effect.
-
-        Raises:
-            UserError: the environment is closed.
-        """
+        """Begin the episode; `seed` and `options` have no effect."""
         observation, info = self._open().reset()
         self._started = True
         self._keep_newest(observation)
         return observation, _flat(info)
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """Perform one action.
-
-        Raises:
-            UserError: the environment is closed, or was never reset.
-        """
+        """Perform one action."""
         env = self._open()
         if not self._started:
             raise UserError("step() before reset(): call reset() first.")
@@ -87,11 +79,7 @@ class OfficialEnv:
 def make_official_env(
     task: str, split: str, episode: int, action_space: str, max_steps: int, options: dict[str, Any]
 ) -> OfficialEnv:
-    """Make an episode of the official package.
-
-    Raises:
-        UserError: the package is not installed, an unknown option, or an episode the split does not have.
-    """
+    """Make an episode of the official package."""
     include = Include.from_options(options)
     if find_spec("robomme") is None:
         raise UserError(_INSTALL_HINT)

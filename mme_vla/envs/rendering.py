@@ -139,11 +139,7 @@ OLDEST_MESA = 24
 
 @cache
 def render_backend() -> str:
-    """The simulator's name for the device that renders: the GPU if there is one, else the CPU.
-
-    Raises:
-        UserError: there is no Vulkan driver, or it is too old; the message says what to install.
-    """
+    """The simulator's name for the device that renders: the GPU if there is one, else the CPU."""
     import sapien
 
     try:

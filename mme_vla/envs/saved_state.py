@@ -34,11 +34,7 @@ class EpisodeState:
     actions: tuple[Any, ...]
 
     def check(self, other: "EpisodeState") -> None:
-        """Make sure that an environment whose own state is `other` can go on from here.
-
-        Raises:
-            UserError: it has another scene, action space or limit; they are named.
-        """
+        """Make sure that an environment whose own state is `other` can go on from here."""
         places = [field.name for field in fields(self) if field.name not in ("options", "actions")]
         differ = [name for name in places if getattr(self, name) != getattr(other, name)]
         if differ:

@@ -34,11 +34,7 @@ REWARDS: dict[str, Earned] = {"none": _nothing, "sparse": _success, "subtask": _
 
 
 def earned_by(reward: str) -> Earned:
-    """How a reward counts.
-
-    Raises:
-        UserError: no such reward.
-    """
+    """How a reward counts."""
     if reward not in REWARDS:
         raise UserError(f"Unknown reward {reward!r}. {did_you_mean(str(reward), REWARDS)}")
     return REWARDS[reward]
@@ -76,11 +72,7 @@ class ProcessScore:
 
     @classmethod
     def from_dict(cls, value: Any) -> "ProcessScore":
-        """Read what `to_dict` made.
-
-        Raises:
-            UserError: it is something else.
-        """
+        """Read what `to_dict` made."""
         try:
             score = cls(**value)
         except TypeError:

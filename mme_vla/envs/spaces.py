@@ -155,11 +155,7 @@ SPACES: dict[str, ActionSpace] = {
 
 
 def action_space(name: str) -> ActionSpace:
-    """The action space of that name.
-
-    Raises:
-        UserError: no such action space.
-    """
+    """The action space of that name."""
     if name not in SPACES:
         raise UserError(f"Unknown action space {name!r}. {did_you_mean(str(name), SPACES)}")
     return SPACES[name]

@@ -13,11 +13,7 @@ from mme_vla.evaluation.store import find_records, read_records
 
 
 def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
-    """Records of episodes that ended by themselves: in a file or folder that was named, else in `output` and beside it.
-
-    Raises:
-        UserError: the place was named, and holds none.
-    """
+    """Records of episodes that ended by themselves: in a file or folder that was named, else in `output` and beside it."""
     if named is not None:
         records = [record for path in find_records([named]) for record in read_records(path)]
     else:

@@ -128,11 +128,7 @@ class EpisodeRecord:
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:
-        """Read a line.
-
-        Raises:
-            UserError: it is not JSON, not a record (fields are missing, unknown or wrong), or not what was written.
-        """
+        """Read a line."""
         # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
         values = verified(parse_json(line, "an episode record", finite=False), "an episode record")
         known = {member.name for member in fields(cls)}
@@ -169,9 +165,6 @@ def merge(records: Iterable[EpisodeRecord], conflicts: str = "refuse") -> list[E
 
     Args:
         records: of one or many files. conflicts: `refuse`, or keep the `first` or the `last` by time.
-
-    Raises:
-        UserError: conflicting outcomes, or two runs of an episode that are not of the same environment.
     """
     if conflicts not in ("refuse", "first", "last"):
         raise UserError(f"conflicts={conflicts!r}. {did_you_mean(conflicts, ('refuse', 'first', 'last'))}")
@@ -217,11 +210,7 @@ def complete_compositions(records: Sequence[EpisodeRecord]) -> list[EpisodeRecor
 
 
 def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]]:
-    """Group merged records.
-
-    Raises:
-        UserError: one run mixes step limits or action spaces, so its episodes cannot be averaged.
-    """
+    """Group merged records."""
     runs: dict[RunKey, list[EpisodeRecord]] = {}
     for record in records:
         runs.setdefault(record.run, []).append(record)

@@ -55,9 +55,6 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
 
     Returns:
         What `run.json` holds. Several shards may claim the same folder at once: the first writes it.
-
-    Raises:
-        UserError: the folder holds a run with other settings; each difference is named.
     """
     settings = to_json(settings)  # as they will be read back
     content = {
@@ -82,11 +79,7 @@ def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any
 
 
 def read_run(folder: Path) -> dict[str, Any]:
-    """Read a folder's `run.json`.
-
-    Raises:
-        UserError: it is missing or damaged.
-    """
+    """Read a folder's `run.json`."""
     path = folder / RUN_FILE
     content = read_json(path, "a run's settings", finite=False)
     if not isinstance(content.get("settings"), dict) or not isinstance(content.get("fingerprint"), str):
@@ -158,11 +151,7 @@ class RecordLog:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open or create `path`, and remove a half-written last line.
-
-        Raises:
-            UserError: another process is writing to it.
-        """
+        """Open or create `path`, and remove a half-written last line."""
         self.path = path
         path.parent.mkdir(parents=True, exist_ok=True)
         self._file: IO[bytes] = path.open("ab+")
@@ -211,11 +200,7 @@ class RecordLog:
 
 
 def read_records(path: Path) -> list[EpisodeRecord]:
-    """Read a file of records; a half-written last line is ignored with a warning.
-
-    Raises:
-        UserError: the file is not there, or another line is not a record.
-    """
+    """Read a file of records; a half-written last line is ignored with a warning."""
     content = read_bytes(path, "episode records", LOG_LIMIT)
     *lines, last_line = content.split(b"\n")
     records = []
@@ -233,11 +218,7 @@ def read_records(path: Path) -> list[EpisodeRecord]:
 
 
 def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
-    """Read files of records; those of one folder belong together (`complete_compositions`).
-
-    Raises:
-        UserError: as `read_records`.
-    """
+    """Read files of records; those of one folder belong together (`complete_compositions`)."""
     folders: dict[Path, list[EpisodeRecord]] = {}
     for path in paths:
         folders.setdefault(path.resolve().parent, []).extend(read_records(path))
@@ -245,11 +226,7 @@ def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:
 
 
 def find_records(paths: Iterable[Path]) -> list[Path]:
-    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl` below it.
-
-    Raises:
-        UserError: a path is not there, or a folder holds no records.
-    """
+    """The files behind a list of files and folders; of a folder, every `episodes*.jsonl` below it."""
     files: list[Path] = []
     for path in paths:
         if path.is_dir():

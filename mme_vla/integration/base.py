@@ -29,11 +29,7 @@ POSITIONS = ("slot", "time")
 
 
 def checked_position(memory_position: str) -> str:
-    """The value of `integration.memory_position`.
-
-    Raises:
-        UserError: it is neither `slot` nor `time`.
-    """
+    """The value of `integration.memory_position`."""
     if memory_position not in POSITIONS:
         known = did_you_mean(str(memory_position), POSITIONS)
         raise UserError(f"integration.memory_position={brief(memory_position)}: choose slot or time. {known}")

@@ -42,9 +42,6 @@ class Context(Integration):
                 positions before the images as their frames lie in the past.
             mutual: memory stands between images and prompt, and all three see each other, as LeRobot's tokens of past
                 states do.
-
-        Raises:
-            UserError: a choice that there is not, or that this backbone does not have.
         """
         super().__init__(backbone)
         if not prompt_sees_memory and getattr(backbone, "everything_sees_everything", False):

@@ -30,9 +30,6 @@ class FiLM(PooledIntegration):
 
         Args:
             backbone: sizes, of no concern here. width: of the memory tokens and of the vector.
-
-        Raises:
-            UserError: a width that is not positive.
         """
         super().__init__(backbone)
         if isinstance(width, bool) or not isinstance(width, int) or width < 1:

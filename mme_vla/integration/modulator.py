@@ -74,9 +74,6 @@ class Modulator(Integration):
             exact_identity: start as the memoryless policy to the bit; as released (False) it starts near it.
             memory_position: `slot` numbers memory tokens one after the other, as released; `time` places a token as
                 many positions before the first action as its frame lies in the past, and one.
-
-        Raises:
-            UserError: a choice of `memory_position` that there is not.
         """
         super().__init__(backbone)
         self.memory_width, self.memory_position = backbone.action.width, checked_position(memory_position)

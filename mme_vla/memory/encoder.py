@@ -22,9 +22,6 @@ def position_features(positions: Tensor, dim: int) -> Tensor:
 
     Returns:
         [..., dim] float32, computed where the positions are.
-
-    Raises:
-        UserError: `dim` cannot be split in six.
     """
     w = dim // 6
     if dim % 6 or w < 2:

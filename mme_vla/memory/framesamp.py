@@ -35,9 +35,6 @@ class FrameSamp(PerceptualMemory):
 
         Args:
             every: frames 0 and k·every − 1 can be remembered; the others are neither drawn nor encoded. 1: all.
-
-        Raises:
-            UserError: the budget is not a whole number of frames.
         """
         if budget % grid**2 or budget < grid**2:
             raise UserError(

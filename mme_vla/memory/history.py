@@ -100,11 +100,7 @@ class History:
         raise NotImplementedError
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch).
-
-        Raises:
-            UserError: a frame lies beyond the history or was not kept.
-        """
+        """Return tokens [n, d_vision] at `indices` [n, 2] of (frame, patch)."""
         raise NotImplementedError
 
     def stored(self, indices: np.ndarray) -> Tensor:
@@ -112,11 +108,7 @@ class History:
         return self.gather(indices)
 
     def motion_rows(self, frames: np.ndarray) -> Tensor:
-        """What the robot felt and did at frames [n]: [n, w] float32.
-
-        Raises:
-            UserError: nobody noted it.
-        """
+        """What the robot felt and did at frames [n]: [n, w] float32."""
         if self.motion is None:
             raise UserError(
                 "This memory reads the robot's own states and actions, and this history has none of them: give states "
@@ -125,11 +117,7 @@ class History:
         return self.motion(frames)
 
     def proprio(self, frames: np.ndarray) -> Tensor:
-        """The robot's states at frames [n], normalised: [n, s] float32.
-
-        Raises:
-            UserError: nobody noted them.
-        """
+        """The robot's states at frames [n], normalised: [n, s] float32."""
         return self.motion_rows(frames)[:, : self.state_width]
 
     def _row_of(self, frames: np.ndarray, stored: np.ndarray) -> np.ndarray:

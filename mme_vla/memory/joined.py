@@ -36,9 +36,6 @@ class JoinedMemory(Memory):
             d_vision: width of a vision token. width: of a memory token, given by the integration.
             members: names, or sections with `name` and the memory's own options.
             budget: most memory tokens of all together. Members that name no budget share evenly what the others leave.
-
-        Raises:
-            UserError: fewer than two members, more budget than there is, or members that want frames stored unlike.
         """
         super().__init__()
         sections = shares(members, budget)
@@ -207,11 +204,7 @@ def finer(indices: np.ndarray, grid: int, fine: int) -> np.ndarray:
 
 
 def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict[str, Any]]:
-    """Every member's section, with a budget: its own, or an even share of what the others leave.
-
-    Raises:
-        UserError: fewer than two members, one that is no memory's section, or more budget than there is.
-    """
+    """Every member's section, with a budget: its own, or an even share of what the others leave."""
     if isinstance(members, str | Mapping) or len(members) < 2:
         raise UserError(f"memory.members={brief(members)}: name at least two, such as [framesamp, ttt].")
     sections: list[dict[str, Any]] = [dict(m) if isinstance(m, Mapping) else {"name": m} for m in members]
@@ -231,11 +224,7 @@ def shares(members: Sequence[str | Mapping[str, Any]], budget: int) -> list[dict
 
 
 def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
-    """What has to be stored so that every one of these memories finds what it wants.
-
-    Raises:
-        UserError: they pool differently, or more than one scores frames.
-    """
+    """What has to be stored so that every one of these memories finds what it wants."""
     (first, one), *_ = specs.items()
     for name, other in specs.items():
         if other.pooling != one.pooling:
@@ -255,11 +244,7 @@ def common_storage(specs: Mapping[str, StorageSpec]) -> StorageSpec:
 
 
 def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewSpec | None:
-    """What the one member gives that looks back; None where none does.
-
-    Raises:
-        UserError: several do, and a tower looks back in one way.
-    """
+    """What the one member gives that looks back; None where none does."""
     defined = {name: spec for name, spec in specs.items() if spec is not None}
     if len(defined) > 1:
         raise UserError(f"{' and '.join(defined)} each give the vision tower past views: join only one of them.")

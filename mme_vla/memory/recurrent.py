@@ -149,9 +149,6 @@ class RecurrentMemory(Memory):
                 randomness (`data.jitter`).
             chunk: frames that are recomputed together in the backward pass; windows are padded to a multiple of it.
             position_dim, position_hidden: widths of the position features and their layer; None follows `d_vision`.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         super().__init__()
         sizes = {"max_steps": max_steps, "max_video": max_video, "stride": stride, "chunk": chunk}

@@ -163,9 +163,6 @@ class RMT(RecurrentMemory):
                 imaginary part of the rotary table.
             attention_dtype: what queries, keys and values are cast to; `bfloat16` as released; `float32` takes
                 the fused kernel, which keeps no weights: less memory.
-
-        Raises:
-            UserError: sizes that do not fit together, or an unknown choice.
         """
         if budget < 1:
             raise UserError(f"memory.budget={budget} must be at least 1.")

@@ -24,11 +24,7 @@ class ChangeScorer:
         self._reference: np.ndarray | None = None
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
-        """Score one frame [H, W, 3] uint8, or keep it as a reference.
-
-        Raises:
-            UserError: the frame does not divide into grid×grid patches.
-        """
+        """Score one frame [H, W, 3] uint8, or keep it as a reference."""
         if frame_index and (frame_index + 1) % self.stride:
             return None
         height, width, _ = frame.shape
@@ -67,9 +63,6 @@ class TokenDrop(PerceptualMemory):
             candidates: length of the list of best patches that is kept along an episode.
             causal: only frames up to the current one compete for that list. False lets the whole episode compete,
                 as the released offline preprocessing does; it needs a finished episode.
-
-        Raises:
-            UserError: the budget does not hold the first frame, or exceeds the candidates.
         """
         if stride < 1:
             raise UserError(f"memory.stride={stride} must be at least 1: the frames between two that are scored.")

@@ -196,9 +196,6 @@ class TTT(RecurrentMemory):
             hidden: width of the recurrence; None is a quarter of `d_vision`, at least 64. heads: inner models.
             base_rate: inner learning rate at the start. max_rate: its ceiling, per token and head.
             max_grad_norm: ceiling of an inner gradient's norm.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         if not 0 < budget <= max_steps * grid**2:
             raise UserError(

@@ -26,11 +26,7 @@ class GoalEncoder:
         self._known: dict[str, Tensor] = {}
 
     def __call__(self, text: str) -> Tensor:
-        """What a text becomes.
-
-        Raises:
-            UserError: it is no text, or the encoder cannot be had.
-        """
+        """What a text becomes."""
         if checked_text(text, "the goal") not in self._known:
             self._known[text] = self.encode(text)
         return self._known[text]
@@ -54,9 +50,6 @@ def load_with_goal_encoder[P: PolicyProcessor](
     Args:
         name: of this kind of processor. encoder: in place of what `processor.json` names. trusted: encoders that are
             taken on a checkpoint's word.
-
-    Raises:
-        UserError: `folder` holds no such processor, a damaged one, or one that names an encoder elsewhere.
     """
     settings = read_settings(folder)
     if settings.pop("name", None) != name:

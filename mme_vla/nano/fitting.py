@@ -44,9 +44,6 @@ def compose_policy(
         model: a file of configs/model. memories: settings of each memory by its name, used where the model has it.
         words: overrides that all models share, such as `embodiment=robomme_waypoint_front`.
         extra_dirs: further trees, as `--config-dir` adds them. plugins: modules that the model needs beside its own.
-
-    Raises:
-        UserError: as `compose` and `import_plugins`.
     """
     base = compose("policy", [f"model={model}", *words], extra_dirs=extra_dirs)
     memory = None if base.memory is None else str(base.memory.name)

@@ -94,9 +94,6 @@ class Decisions(Dataset[int]):
             policy: with the vision weights it trains with, and statistics.
             often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
                 is elsewhere. noise, blur: see the class.
-
-        Raises:
-            UserError: there is no decision, or a frame that the memory remembers was not drawn.
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
@@ -187,11 +184,7 @@ def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tens
 
 
 def statistics(demonstrations: Iterable[Demonstration], policy: MMEPolicy) -> NormStats:
-    """What states and motions are normalised by; numbers that hardly move keep their size.
-
-    Raises:
-        UserError: fewer than two decisions.
-    """
+    """What states and motions are normalised by; numbers that hardly move keep their size."""
     states, actions = RunningStats(), RunningStats()
     space = policy.embodiment.action
     for demonstration in demonstrations:

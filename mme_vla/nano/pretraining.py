@@ -80,11 +80,7 @@ def class_words() -> Tensor:
 
 
 def load_scenes(files: Sequence[Path]) -> tuple[Tensor, Tensor]:
-    """Pictures [n, 3, s, s] uint8 and labels [n, 64, 64] uint8 of recorded scenes.
-
-    Raises:
-        UserError: there are none.
-    """
+    """Pictures [n, 3, s, s] uint8 and labels [n, 64, 64] uint8 of recorded scenes."""
     if not files:
         raise UserError("There is no recorded scene to learn from.")
     images, labels = [], []

@@ -107,11 +107,7 @@ class ChoiceSession:
     # Playing ------------------------------------------------------------------------------------------------------
 
     def start(self) -> Reveal:
-        """Reset the environment, which shows the conditioning video, if any, and then the present frame.
-
-        Raises:
-            UserError: it was started before, or the environment shows no pictures or no options.
-        """
+        """Reset the environment, which shows the conditioning video, if any, and then the present frame."""
         if self.reveals:
             raise UserError("This session has begun; make a new one for another episode.")
         started = self._clock()
@@ -135,10 +131,6 @@ class ChoiceSession:
 
         Returns:
             The frames of the motion; none where nothing moved, or the environment could not do it.
-
-        Raises:
-            UserError: the episode is not under way, no such option, or a point is missing or outside of the picture.
-                Nothing has happened then, and another choice can be made.
         """
         option, point = self.check(action)
         self._policy_seconds += (seconds := self._clock() - self._displayed_at)
@@ -159,11 +151,7 @@ class ChoiceSession:
         return self.reveals[-1]
 
     def check(self, action: Mapping[str, Any]) -> tuple[Option, tuple[float, float] | None]:
-        """The option and point that an action means.
-
-        Raises:
-            UserError: as `choose`.
-        """
+        """The option and point that an action means."""
         if self.status != ONGOING:
             raise UserError(f"No choice can be made: the episode is over ({self.status})." if self.reveals
                             else "No choice can be made before start().")  # fmt: skip
@@ -181,9 +169,6 @@ class ChoiceSession:
 
         Args:
             outcome: what it counts as. reason: why, kept in the record.
-
-        Raises:
-            UserError: no such outcome, or the episode is over.
         """
         if outcome not in OUTCOMES:
             raise UserError(f"Unknown outcome {outcome!r}. {did_you_mean(outcome, OUTCOMES)}")
@@ -207,11 +192,7 @@ class ChoiceSession:
 
     @property
     def frame(self) -> np.ndarray:
-        """The present front picture [256, 256, 3]: points are pixels of it.
-
-        Raises:
-            UserError: the session was not started.
-        """
+        """The present front picture [256, 256, 3]: points are pixels of it."""
         if not self.reveals:
             raise UserError("There is no picture before start().")
         return next(reveal.frames[-1] for reveal in reversed(self.reveals) if len(reveal.frames))
@@ -224,11 +205,7 @@ class ChoiceSession:
     def record(
         self, model: str, checkpoint: int | str = 0, model_seed: int = 0, max_steps: int = 1300, **extra: Any
     ) -> EpisodeRecord:
-        """The episode as evaluation keeps it, its decisions in `extra`.
-
-        Raises:
-            UserError: it is not over.
-        """
+        """The episode as evaluation keeps it, its decisions in `extra`."""
         if not self.over:
             raise UserError(f"The episode is not over ({self.status}); there is nothing to record yet.")
         which = self.episode
@@ -265,11 +242,7 @@ class ChoiceSession:
 
 
 def checked_point(point: Any, option: Option) -> tuple[float, float]:
-    """A pixel (row, column) of the front picture.
-
-    Raises:
-        UserError: it is missing, malformed or outside.
-    """
+    """A pixel (row, column) of the front picture."""
     what = f"Option {option.label!r} ({option.action})"
     if point is None or (isinstance(point, Sequence) and not len(point)):
         raise UserError(f"{what} needs a point: the pixel [row, column] of the object meant.")

@@ -102,11 +102,7 @@ class OraclePlayer(Player):
     needs_images = False
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
-        """See `Player`.
-
-        Raises:
-            UserError: the environment is not of this library, so that its script is not known.
-        """
+        """See `Player`."""
         from mme_vla.envs.grounding import project
 
         task = getattr(session.env, "task", None)
@@ -138,10 +134,6 @@ def _stuck(reason: str) -> NoReturn:
 
 
 def build_player(config: Mapping[str, Any]) -> Player:
-    """Build from the section `player` of a configuration.
-
-    Raises:
-        UserError: an unknown player or option.
-    """
+    """Build from the section `player` of a configuration."""
     player: Player = PLAYERS.build(config)
     return player

@@ -20,9 +20,6 @@ def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int,
     Args:
         episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out.
         images: whether the player looks at them; the official environment renders in any case.
-
-    Raises:
-        UserError: as `make_env`.
     """
     from mme_vla.envs import make_env
 
@@ -55,9 +52,6 @@ class PlayRun:
         wanted: episodes to play, in order. identity: whose.
         make: makes the session of an episode.
         retry_errors: play episodes again that ended in an error.
-
-    Raises:
-        UserError: the folder holds a run with other settings, or another process writes to it.
     """
 
     def __init__(
@@ -139,10 +133,6 @@ class PlayRun:
 
 
 def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str) -> list[EpisodeId]:
-    """The episodes that the command line names, task by task, by the grammar of all commands (`mme_vla.envs.episodes`).
-
-    Raises:
-        UserError: an unknown task or split, or episodes that the split has not.
-    """
+    """The episodes that the command line names, task by task, by the grammar of all commands (`mme_vla.envs.episodes`)."""
     specs = choose_specs(tasks, episodes, split)
     return [EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty) for spec in specs]

@@ -28,11 +28,7 @@ HEADERS = (
 
 
 def require_page() -> None:
-    """Refuse to go on without the packages the page needs.
-
-    Raises:
-        UserError: the extra `play` is not installed.
-    """
+    """Refuse to go on without the packages the page needs."""
     if find_spec("starlette") is None or find_spec("uvicorn") is None:
         raise missing_extra("The page", "play")
 
@@ -43,9 +39,6 @@ def make_app(desk: Desk, local: bool = True) -> Any:
     Args:
         local: answer only requests that name this machine as their host, so that no foreign page a browser has open can
             reach the desk under a name of its own.
-
-    Raises:
-        UserError: the extra `play` is not installed.
     """
     require_page()
     from starlette.applications import Starlette
@@ -165,11 +158,7 @@ def _host_of(scope: Any) -> str:
 
 
 def make_server(desk: Desk, local: bool = True) -> Any:
-    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or `should_exit`.
-
-    Raises:
-        UserError: the extra `play` is not installed.
-    """
+    """A `uvicorn.Server`; its `run(sockets=[…])` returns after SIGINT, SIGTERM, or `should_exit`."""
     app = make_app(desk, local)
     import uvicorn
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -200,11 +189,7 @@ def make_server(desk: Desk, local: bool = True) -> Any:
 
 
 def serve(desk: Desk, host: str, port: int) -> None:
-    """Serve the page until Ctrl-C.
-
-    Raises:
-        UserError: as `listen` and `make_server`.
-    """
+    """Serve the page until Ctrl-C."""
     server = make_server(desk, is_local(host))
     with listen(host, port) as bound:
         display_host = f"[{host}]" if ":" in host else host

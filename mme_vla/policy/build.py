@@ -26,9 +26,6 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
 
     Args:
         d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
-
-    Raises:
-        UserError: an unknown memory or option, or a grid to which a view's cannot be pooled.
     """
     memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
     memory.check_grid(grid)
@@ -38,12 +35,7 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
 def check_integrated(
     config: Mapping[str, Any], integration: Integration, memory: Memory | None, supports: Set[str]
 ) -> None:
-    """Make sure that memory and integration go together, and that the backbone has a place for what they bring.
-
-    Raises:
-        UserError: one of them without the other, memory tokens in time that have none, or past views for a tower that
-            sees one picture at a time.
-    """
+    """Make sure that memory and integration go together, and that the backbone has a place for what they bring."""
     speaks = memory is not None and memory.budget > 0
     if speaks != (integration.memory_width > 0):
         if memory is not None and not speaks:
@@ -60,11 +52,7 @@ def check_integrated(
 
 
 def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
-    """Make sure that a memory that gives past views has a backbone whose vision tower looks at them.
-
-    Raises:
-        UserError: that of this backbone sees one picture at a time.
-    """
+    """Make sure that a memory that gives past views has a backbone whose vision tower looks at them."""
     if memory.past_view_spec is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
@@ -158,11 +146,7 @@ def build_from_config(
 
 
 def check_token_budget(sections: Mapping[str, Any]) -> None:
-    """Make sure that memory and subgoal together stay within `token_budget`, where there is one.
-
-    Raises:
-        UserError: they do not, or the subgoal has no limit.
-    """
+    """Make sure that memory and subgoal together stay within `token_budget`, where there is one."""
     budget = sections.get("token_budget")
     if budget is None:
         return
@@ -179,11 +163,7 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
 
 
 def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
-    """Build the processor of a composed configuration (`processor.name`), at its backbone's sizes.
-
-    Raises:
-        UserError: no processor, an unknown one or setting, or a tokenizer that cannot be had.
-    """
+    """Build the processor of a composed configuration (`processor.name`), at its backbone's sizes."""
     if not sections.get("processor"):
         raise UserError(
             f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under `defaults` of its file "

@@ -75,9 +75,6 @@ def apply_finetuning(
 
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
-
-    Raises:
-        UserError: an unknown mode or dtype, or a name that matches nothing.
     """
     if mode not in MODES:
         raise UserError(f"finetune.mode={mode!r}. {did_you_mean(str(mode), MODES)}")
@@ -104,11 +101,7 @@ def apply_finetuning(
 
 
 def check_frozen_dtype(policy: Tunable, name: str | None) -> None:
-    """Make sure that a policy can compute with frozen weights of this dtype (None: as they are).
-
-    Raises:
-        UserError: it is none, or the policy computes in float32.
-    """
+    """Make sure that a policy can compute with frozen weights of this dtype (None: as they are)."""
     if name is None:
         return
     if dtype_of(name, "finetune.frozen_dtype") != torch.float32 and policy.compute_dtype == torch.float32:
@@ -135,12 +128,7 @@ def add_adapters(
     init: str = "uniform",
     targets: Sequence[str] | None = None,
 ) -> None:
-    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again.
-
-    Raises:
-        UserError: peft is not installed, the policy has adapters already, a size that is not positive, or a target that
-            matches no linear layer or one an adapter cannot reach.
-    """
+    """Wrap layers with LoRA adapters, in place; `save_pretrained` keeps them apart, and they load again."""
     if policy.config.get("adapters") and _has_adapters(policy):
         raise UserError("This policy has adapters already: merge_adapters() first.")
     if rank < 1 or alpha <= 0 or not 0 <= dropout < 1:
@@ -176,11 +164,7 @@ def merge_adapters(policy: Tunable) -> None:
 
 
 def merge_state(tensors: Mapping[str, Tensor], adapters: Mapping[str, Any] | None) -> dict[str, Tensor]:
-    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes.
-
-    Raises:
-        UserError: what is said of the adapters does not fit the weights.
-    """
+    """Fold the adapters of saved weights, as `merge_adapters` does of a policy; without adapters nothing changes."""
     merged = {name.replace(".base_layer.", "."): tensor for name, tensor in tensors.items() if ".lora_" not in name}
     if not adapters:
         return merged

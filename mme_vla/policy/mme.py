@@ -404,11 +404,7 @@ class MMEPolicy(Policy):
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:
-    """The policy, where it is made of backbone, memory and integration.
-
-    Raises:
-        UserError: it is of another kind; `what` says what cannot be done with it.
-    """
+    """The policy, where it is made of backbone, memory and integration."""
     if not isinstance(policy, MMEPolicy):
         raise UserError(
             f"{what} looks inside a backbone that a memory is integrated with; {policy.config.get('name', 'this')} is "

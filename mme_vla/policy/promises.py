@@ -23,11 +23,7 @@ class ActionPrefix:
 
 
 def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) -> ActionPrefix:
-    """A promise of a chunk of `horizon` actions of `width` numbers.
-
-    Raises:
-        UserError: actions of another form, more than a chunk, or a delay that they do not cover.
-    """
+    """A promise of a chunk of `horizon` actions of `width` numbers."""
     values = finite_array(actions, "the promised actions")
     if values.ndim != 2 or values.shape[1] != width or not 1 <= len(values) <= horizon:
         raise UserError(

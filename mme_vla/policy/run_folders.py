@@ -39,9 +39,6 @@ def find_run(path: Path) -> Path:
     """`path`, the newest run where it ends in `latest`, or the shipped checkpoint where it is `nano`.
 
     A file or folder of that name goes first.
-
-    Raises:
-        UserError: `latest`, and there is no run with a checkpoint beside it.
     """
     if path.exists():
         return path
@@ -61,9 +58,6 @@ def resolve_checkpoint(path: Path) -> Path:
     """A checkpoint folder from what a user gives: itself, its run folder or the `checkpoints` folder (then the newest).
 
     A path that ends in `latest` means the newest run of its folder, and `nano` the shipped checkpoint.
-
-    Raises:
-        UserError: there is no checkpoint.
     """
     newest = newest_checkpoint(path)
     if newest != path or (path / "config.json").is_file():
@@ -87,21 +81,13 @@ def _is_released(path: Path) -> bool:
 
 
 def newest_checkpoint(path: Path) -> Path:
-    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself.
-
-    Raises:
-        UserError: `latest`, and there is no run with a checkpoint beside it.
-    """
+    """The newest checkpoint of a run, of its `checkpoints` folder or of a name of `find_run`; else `path` itself."""
     path = find_run(path)
     checkpoints = checkpoints_in(path) or checkpoints_in(path / CHECKPOINTS)
     return checkpoints[-1] if checkpoints else path
 
 
 def locate_checkpoint(source: str | Path) -> str:
-    """The checkpoint folder that `source` names; `source` itself where it is none on this machine, but on the hub.
-
-    Raises:
-        UserError: a folder without a checkpoint.
-    """
+    """The checkpoint folder that `source` names; `source` itself where it is none on this machine, but on the hub."""
     path = find_run(Path(source).expanduser())
     return str(resolve_checkpoint(path)) if path.exists() else str(source)

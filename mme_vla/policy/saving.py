@@ -49,11 +49,7 @@ DEFAULT = "mme"
 
 
 def policy_name(config: Mapping[str, Any]) -> str:
-    """What the section `policy` of a configuration calls its class.
-
-    Raises:
-        UserError: the section is no section.
-    """
+    """What the section `policy` of a configuration calls its class."""
     section = config.get("policy") or {}
     if not isinstance(section, Mapping):
         raise UserError(f"policy={brief(section)} must be a section.")
@@ -61,21 +57,13 @@ def policy_name(config: Mapping[str, Any]) -> str:
 
 
 def policy_class(config: Mapping[str, Any]) -> type[Any]:
-    """The class of the policy that a configuration describes.
-
-    Raises:
-        UserError: there is no policy of that name.
-    """
+    """The class of the policy that a configuration describes."""
     kind: type[Any] = POLICIES[policy_name(config)]
     return kind
 
 
 def policy_class_for[P](requested: type[P], config: Mapping[str, Any], source: str) -> type[P]:
-    """The class to load a checkpoint with, where `asked.from_pretrained` was called.
-
-    Raises:
-        UserError: the checkpoint holds a policy of another class than was asked for.
-    """
+    """The class to load a checkpoint with, where `asked.from_pretrained` was called."""
     kind = policy_class(config)
     if issubclass(requested, kind):
         return requested
@@ -91,9 +79,6 @@ def policy_options(cls: type, config: Mapping[str, Any]) -> dict[str, Any]:
     """The section `policy`, whose keys beside `name` are the constructor's keyword-only arguments.
 
     Where a constructor takes `**options`, those of its parent class count too.
-
-    Raises:
-        UserError: another key.
     """
     options = {key: value for key, value in config.get("policy", {}).items() if key != "name"}
     known = _keyword_options(cls)
@@ -128,9 +113,6 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
         source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no other is fetched.
         revision: branch, tag or commit of the repository; its main branch by default.
         token: for private repositories; the one stored by `hf auth login` by default.
-
-    Raises:
-        UserError: neither a path nor a repository that can be reached.
     """
     path = newest_checkpoint(Path(source).expanduser())
     place = _PLACE.fullmatch(str(source))
@@ -164,11 +146,7 @@ def local_folder(source: str | Path, revision: str | None = None, token: str | N
 def push_folder(
     folder: Path, repo_id: str, *, private: bool, token: str | None, revision: str | None, message: str
 ) -> str:
-    """Create the repository if need be, upload the folder's files as one commit, and return its address.
-
-    Raises:
-        UserError: the id is not `owner/name`, or the hub refuses.
-    """
+    """Create the repository if need be, upload the folder's files as one commit, and return its address."""
     if not _REPOSITORY.fullmatch(repo_id):
         raise UserError(f"repo_id={repo_id!r} must read owner/name, such as my-group/framesamp-modul.")
     import huggingface_hub
@@ -189,11 +167,7 @@ CONFIG = "config.json"
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported.
-
-    Raises:
-        UserError: it is missing, damaged, or a link out of the folder.
-    """
+    """Read `config.json` of a checkpoint, as plain values: nothing in it is resolved or imported."""
     path = inside(folder, CONFIG)
     check_sums(folder, [CONFIG])
     config: dict[str, Any] = read_json(path, "a policy's configuration", limit=2**20)
@@ -226,9 +200,6 @@ class Saved(nn.Module):
             dtype: what the weights are stored in: `float32`, or `bfloat16` at half the size and eight bits of mantissa.
             card: facts for the model card, kept in the configuration: `data` (words), `recipe`, `results` (tables),
                 `license`, `base_model`, `datasets` (ids on the hub).
-
-        Raises:
-            UserError: an unknown dtype.
         """
         kind, folder = dtype_of(dtype), Path(folder)
         if card is not None:
@@ -270,10 +241,6 @@ class Saved(nn.Module):
             trust_plugins: import the modules that the checkpoint names under `plugins`: code of whoever wrote it.
             tokenizer: in place of the one the checkpoint names, which is fetched from the hub only if it is π0.5's own.
             policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
-
-        Raises:
-            UserError: no checkpoint there, one of another kind of policy, a damaged file, a name that leads out of
-                the folder, plugins that are not trusted, or weights that do not fit the configuration.
         """
         from mme_vla.processing.base import load_processor
 
@@ -308,9 +275,6 @@ class Saved(nn.Module):
         Args:
             config: plain sections. source: where they are from, for messages.
             policy: overrides of its section `policy`.
-
-        Raises:
-            UserError: they describe nothing that can be built.
         """
         options = config.get("policy", {})
         if not isinstance(options, dict):
@@ -353,11 +317,7 @@ class Saved(nn.Module):
             setattr(self.get_submodule(path), name, value)
 
     def check_processor(self, source: str) -> None:
-        """Make sure that the network and its processor speak of the same sizes.
-
-        Raises:
-            UserError: they do not.
-        """
+        """Make sure that the network and its processor speak of the same sizes."""
         raise NotImplementedError
 
     def push_to_hub(
@@ -380,9 +340,6 @@ class Saved(nn.Module):
 
         Returns:
             The repository's address.
-
-        Raises:
-            UserError: the id is malformed, or the hub refuses.
         """
         with tempfile.TemporaryDirectory() as folder:
             self.save_pretrained(folder, dtype=dtype, card=card)

@@ -32,20 +32,12 @@ def save_tensors(
 
 
 def load_tensors(folder: Path) -> dict[str, Tensor]:
-    """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until used).
-
-    Raises:
-        UserError: no weights there, or a file that is missing, damaged, outside of the folder or not safetensors.
-    """
+    """Read a folder's `model.safetensors`, or the shards its index names (memory-mapped until used)."""
     return read_files(folder, weight_files(folder))
 
 
 def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
-    """Read safetensors files of a folder as one table, each compared with its checksum where there is one.
-
-    Raises:
-        UserError: a file that is missing, damaged or not safetensors, or a tensor that stands in two of them.
-    """
+    """Read safetensors files of a folder as one table, each compared with its checksum where there is one."""
     files = list(files)
     check_sums(folder, [file.relative_to(folder).as_posix() for file in files])
     tensors: dict[str, Tensor] = {}
@@ -59,11 +51,7 @@ def read_files(folder: Path, files: Iterable[Path]) -> dict[str, Tensor]:
 
 
 def weight_files(folder: Path) -> list[Path]:
-    """The safetensors files that hold a folder's weights.
-
-    Raises:
-        UserError: there are none, or the index is damaged or names files outside of the folder.
-    """
+    """The safetensors files that hold a folder's weights."""
     if (folder / INDEX).is_file():
         check_sums(folder, [INDEX])
         table = read_json(inside(folder, INDEX), "an index of safetensors files").get("weight_map")
@@ -82,11 +70,7 @@ def list_weight_files(folder: Path) -> list[str]:
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:
-    """Read one safetensors file.
-
-    Raises:
-        UserError: it is missing, cut short or something else.
-    """
+    """Read one safetensors file."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -100,11 +84,7 @@ def read_safetensors(file: Path) -> dict[str, Tensor]:
 
 
 def check_header(file: Path) -> None:
-    """Make sure that a safetensors file is one, and that its header is of a size worth parsing.
-
-    Raises:
-        UserError: it is missing, a folder, a device or a pipe, or its header cannot be one.
-    """
+    """Make sure that a safetensors file is one, and that its header is of a size worth parsing."""
     try:
         about = file.stat()
         if not stat.S_ISREG(about.st_mode):
@@ -127,11 +107,7 @@ def cast(tensor: Tensor, dtype: torch.dtype | None) -> Tensor:
 
 
 def dtype_of(name: str, what: str = "dtype") -> torch.dtype:
-    """Look up `float32` or `bfloat16`.
-
-    Raises:
-        UserError: another name.
-    """
+    """Look up `float32` or `bfloat16`."""
     if not isinstance(name, str) or name not in DTYPES:
         raise UserError(f"{what}={brief(name)}: choose one of {', '.join(DTYPES)}.")
     return DTYPES[name]
@@ -143,11 +119,7 @@ def check_fit(
     source: str,
     optional: Collection[str] = (),
 ) -> None:
-    """Compare names and shapes.
-
-    Raises:
-        UserError: lists the tensors that are missing (and not `optional`), left over or misshapen; of many, the first.
-    """
+    """Compare names and shapes."""
     missing = sorted(set(expected) - set(tensors) - set(optional))
     unexpected = sorted(set(tensors) - set(expected))
     misshapen = [
@@ -165,11 +137,7 @@ def check_fit(
 
 
 def check_values(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Make sure that tensors hold numbers a network can compute with.
-
-    Raises:
-        UserError: names the tensors that hold NaN or infinities.
-    """
+    """Make sure that tensors hold numbers a network can compute with."""
     broken = [name for name, tensor in tensors.items() if not _finite(tensor)]
     if broken:
         raise UserError(
@@ -184,10 +152,6 @@ def assign_tensors(
     """Give a module (on meta or not) these tensors as its parameters; nothing may be missing, left over or misshapen.
 
     `dtype` is what floating-point tensors are brought to; by default each keeps its own.
-
-    Raises:
-        UserError: lists the tensors that do not fit, are of another kind of number, or hold NaN, before anything is
-            changed.
     """
     state = module.state_dict()
     check_fit(tensors, {name: tuple(tensor.shape) for name, tensor in state.items()}, source)
@@ -211,11 +175,7 @@ def take_memory(module: nn.Module) -> None:
 
 
 def check_kinds(tensors: Mapping[str, Tensor], expected: Mapping[str, Tensor], source: str) -> None:
-    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are.
-
-    Raises:
-        UserError: names the tensors that are not.
-    """
+    """Make sure that tensors are of the kind of number (real, whole, complex) that those of the same name are."""
     wrong = [
         f"{name}: {str(tensor.dtype).removeprefix('torch.')} instead of "
         f"{str(expected[name].dtype).removeprefix('torch.')}"

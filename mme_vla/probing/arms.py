@@ -44,11 +44,7 @@ class Arm:
         return "entries" in self.needs
 
     def only(self, moment: Moment) -> np.ndarray | None:
-        """The frames that may be remembered; of several such interventions those that all of them allow.
-
-        Raises:
-            UserError: they leave none.
-        """
+        """The frames that may be remembered; of several such interventions those that all of them allow."""
         allowed = [frames for part in self.parts if (frames := part.only(moment)) is not None]
         if not allowed:
             return None
@@ -83,11 +79,7 @@ UNPROBED = Arm("unprobed")
 
 
 def read_arm(spec: Any) -> Arm:
-    """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`.
-
-    Raises:
-        UserError: an unknown intervention, or a dial or option that cannot be.
-    """
+    """An arm from a word such as `drop:2` or `nodemo+shuffle`, or from `{name: drop, count: 2, which: oldest}`."""
     if isinstance(spec, Mapping):
         part: Intervention = INTERVENTIONS.build(spec)
         options = ",".join(f"{key}={value}" for key, value in spec.items() if key != "name")
@@ -113,11 +105,7 @@ def _read_part(word: str) -> Intervention:
 
 
 def read_arms(specs: Any) -> list[Arm]:
-    """Arms of `with`, each once.
-
-    Raises:
-        UserError: as `read_arm`; or one twice.
-    """
+    """Arms of `with`, each once."""
     words = [specs] if isinstance(specs, str | Mapping) else list(specs)
     arms = [read_arm(word) for word in words]
     names = [arm.name for arm in arms]
@@ -153,11 +141,7 @@ def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boun
 def choose_arms(
     specs: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
 ) -> tuple[list[Arm], list[str]]:
-    """The arms asked for; unasked, those of `USUAL` that this policy and these data allow, and why not the others.
-
-    Raises:
-        UserError: an arm that was asked for by name is not possible.
-    """
+    """The arms asked for; unasked, those of `USUAL` that this policy and these data allow, and why not the others."""
     arms, left_out = [], []
     for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
         why = lacking(arm, policy, channel, recordings, boundaries=boundaries)

@@ -122,11 +122,7 @@ class Intervention:
 
 
 def check_integer(name: str, value: Any, least: int) -> None:
-    """Make sure that a dial is a whole number.
-
-    Raises:
-        UserError: it is not, or too small.
-    """
+    """Make sure that a dial is a whole number."""
     if isinstance(value, bool) or not isinstance(value, int) or value < least:
         raise UserError(f"{name}={value!r} must be a whole number, at least {least}.")
 

@@ -86,11 +86,7 @@ def _complete_length(content: bytes) -> int:
 
 
 def read(path: Path) -> tuple[list[Line], set[str]]:
-    """The lines of recorded episodes that are done, and which these are; nothing where there is no file.
-
-    Raises:
-        UserError: a line in the middle is none.
-    """
+    """The lines of recorded episodes that are done, and which these are; nothing where there is no file."""
     if not path.is_file():
         return [], set()
     *complete, incomplete = read_bytes(path, "lines of a probe", LIMIT).split(b"\n")
@@ -109,11 +105,7 @@ def read(path: Path) -> tuple[list[Line], set[str]]:
 
 
 def read_all(folder: Path) -> list[Line]:
-    """The lines of every shard.
-
-    Raises:
-        UserError: a line that is none.
-    """
+    """The lines of every shard."""
     return [line for path in sorted(folder.glob(LINES)) for line in read(path)[0]]
 
 

@@ -76,11 +76,7 @@ class OfflineSettings:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Read the keys of a configuration that are settings; others are ignored.
-
-        Raises:
-            UserError: a value that cannot be.
-        """
+        """Read the keys of a configuration that are settings; others are ignored."""
         return read_section(cls, config, others=True)
 
 
@@ -98,9 +94,6 @@ def probe_offline(
     Args:
         recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines.
         after: told of each episode that is done.
-
-    Raises:
-        UserError: the policy reads depth, and the data keep none.
     """
     _, done = lines.read(path)
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None

@@ -46,9 +46,6 @@ def probe_online(
 
     Args:
         lend: recorded episodes: the sessions shown before, and where contents are taken from.
-
-    Raises:
-        UserError: as `evaluate`.
     """
     records: list[EpisodeRecord] = []
     for arm in [UNPROBED, *arms]:
@@ -97,10 +94,6 @@ def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -
 
     Args:
         recordings: episodes to show.
-
-    Raises:
-        UserError: the split asks for more than there are, or the policy cannot be shown recorded episodes; or there are
-            recordings and the split asks for none.
     """
     variant = read_variant(split)
     if variant is None or variant.dial != SESSIONS:

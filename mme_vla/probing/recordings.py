@@ -78,9 +78,6 @@ class Recording:
         Args:
             required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
                 robot that reads depth is shown the frames that the dataset keeps depth of.
-
-        Raises:
-            UserError: it reads depth, and the dataset keeps none.
         """
         robot = self.source.robot
         if robot.readings:

@@ -73,11 +73,7 @@ def run_probe(
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
 ) -> Probe:
-    """Do what is asked for and is not there, and write the page.
-
-    Raises:
-        UserError: an arm that this policy or these data do not allow, or a folder that holds another probe.
-    """
+    """Do what is asked for and is not there, and write the page."""
     notes: list[str] = []
     if plan.recordings:
         notes += _on_recordings(policy, plan, folder / OFFLINE, facts, show_progress)
@@ -133,11 +129,7 @@ def _settings(policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[A
 
 
 def probed_folder(folder: Path) -> Findings:
-    """What a finished probe's folder holds.
-
-    Raises:
-        UserError: it holds none.
-    """
+    """What a finished probe's folder holds."""
     findings = Findings.of(lines.read_all(folder / OFFLINE))
     if not findings.moments:
         raise UserError(f"{folder} holds no probe on recorded episodes: no {OFFLINE}/offline.jsonl with lines in it.")

@@ -38,9 +38,6 @@ def augment_views(images: Tensor, augmentations: Sequence[str], draws: Tensor) -
 
     Returns:
         [b, v, 3, s, s] float32 in [-1, 1].
-
-    Raises:
-        UserError: shape and `augmentations` do not fit together, or the images are not square.
     """
     if images.ndim != 5 or images.shape[2] != 3 or images.shape[-1] != images.shape[-2]:
         raise UserError(f"Expected square images [b, v, 3, s, s], got {list(images.shape)}.")

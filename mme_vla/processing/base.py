@@ -191,9 +191,6 @@ class PolicyProcessor:
 
         Returns:
             [state | action relative to it | known], normalised; actions are 0 where they are not known.
-
-        Raises:
-            UserError: there are no statistics.
         """
         stats = self.require_stats()
         proprio = torch.from_numpy(np.asarray(states, np.float32))
@@ -247,11 +244,7 @@ class PolicyProcessor:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """What `processor.json` of a checkpoint says.
-
-    Raises:
-        UserError: there is none, or it is damaged.
-    """
+    """What `processor.json` of a checkpoint says."""
     if not (folder / CONFIG_FILE).is_file():
         raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
     check_sums(folder, [CONFIG_FILE])
@@ -260,11 +253,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def load_processor(folder: Path | str, tokenizer: Path | str | None = None) -> PolicyProcessor:
-    """Read the processor of a checkpoint, of whatever kind.
-
-    Raises:
-        UserError: no processor there, a damaged one, one of an unknown kind, or one that names files elsewhere.
-    """
+    """Read the processor of a checkpoint, of whatever kind."""
     folder = Path(folder)
     kind: type[PolicyProcessor] = PROCESSORS[read_settings(folder).get("name", DEFAULT)]
     return kind.load(folder, tokenizer)

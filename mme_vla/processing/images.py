@@ -25,9 +25,6 @@ def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np
 
     Returns:
         [..., h, w, 3] uint8; `frames` itself when they have this size already.
-
-    Raises:
-        UserError: `frames` is not uint8 with three channels last.
     """
     from PIL import Image
 
@@ -53,9 +50,6 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
 
     Returns:
         [n, 3, h, w] float32 in [-1, 1], on the device of `images`.
-
-    Raises:
-        UserError: `images` is not a batch of images with three channels last.
     """
     if images.ndim != 4 or images.shape[-1] != 3:
         raise UserError(f"Expected images [n, height, width, 3], got {list(images.shape)}.")
@@ -82,9 +76,6 @@ def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
     """Bring one picture, or a stack of them, into the form the resize expects: uint8, channels last.
 
     Accepts uint8, or float in [0, 1] (mapped by truncating 255·x, as released), with the channels last or first.
-
-    Raises:
-        UserError: neither end of the shape holds three channels, or the values lie outside the range.
     """
     array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     if array.ndim not in (3, 4):
@@ -143,11 +134,7 @@ class PastImages:
         self._frames = {frame: images for frame, images in self._frames.items() if frame >= oldest}
 
     def at(self, step: int, prepare: Prepare) -> PastViews:
-        """Past views of a step, unbatched: `images` [k, v, 3, s, s] uint8 and `mask` [k].
-
-        Raises:
-            UserError: one of these frames was not drawn.
-        """
+        """Past views of a step, unbatched: `images` [k, v, 3, s, s] uint8 and `mask` [k]."""
         return past_views(self.spec, step, self._read, prepare)
 
     def _read(self, frames: np.ndarray) -> list[np.ndarray]:

@@ -33,11 +33,7 @@ class QuantileStats:
         return len(self.q01)
 
     def bounds(self, kind: str) -> tuple[np.ndarray, np.ndarray]:
-        """What becomes −1 and 1: `quantiles` or `extremes`.
-
-        Raises:
-            UserError: the extremes were not kept.
-        """
+        """What becomes −1 and 1: `quantiles` or `extremes`."""
         if kind == "quantiles":
             return self.q01, self.q99
         if self.min is None or self.max is None:
@@ -54,11 +50,7 @@ class QuantileStats:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any], name: str = "statistics") -> Self:
-        """Read what `to_dict` writes.
-
-        Raises:
-            UserError: an entry is missing, not a list of finite numbers, or of another length than the rest.
-        """
+        """Read what `to_dict` writes."""
         arrays = {}
         for field in fields(cls):
             if data.get(field.name) is None:
@@ -95,11 +87,7 @@ class NormStats:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Self:
-        """Read the layout of openpi's `norm_stats.json`.
-
-        Raises:
-            UserError: the layout is another one, or a list is missing or damaged.
-        """
+        """Read the layout of openpi's `norm_stats.json`."""
         inner = data.get("norm_stats")
         if not isinstance(inner, dict) or not all(isinstance(inner.get(key), dict) for key in ("state", "actions")):
             raise UserError(
@@ -114,11 +102,7 @@ class NormStats:
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read `norm_stats.json`.
-
-        Raises:
-            UserError: there is no such file, or it does not hold these statistics.
-        """
+        """Read `norm_stats.json`."""
         path = Path(path)
         if not path.is_file():
             raise UserError(f"No normalisation statistics at {path}.")
@@ -133,9 +117,6 @@ def normalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
     """Map [q01, q99] to [-1, 1] in the first `len(stats)` dimensions of x [..., d]; the others pass.
 
     Nothing is clipped. With `by="extremes"` it is [min, max] that is mapped.
-
-    Raises:
-        UserError: x has fewer dimensions than the statistics, or these lack the extremes.
     """
     low, span = _range(x, stats, by)
     n = len(stats)
@@ -173,11 +154,7 @@ class ExactStats:
         self._rows.append(np.asarray(x, np.float64).reshape(-1, x.shape[-1]))
 
     def result(self, extremes: bool = False) -> QuantileStats:
-        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value.
-
-        Raises:
-            UserError: fewer than two rows went in.
-        """
+        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
         count = sum(map(len, self._rows))
         if count < 2:
             raise UserError(f"Statistics need at least two rows, got {count}.")
@@ -209,11 +186,7 @@ class RunningStats:
         return self._count
 
     def update(self, batch: np.ndarray) -> None:
-        """Add rows [..., d].
-
-        Raises:
-            UserError: values that are not finite, or another d than before.
-        """
+        """Add rows [..., d]."""
         rows = np.asarray(batch, dtype=np.float64)
         rows = rows.reshape(-1, rows.shape[-1])
         if not len(rows):
@@ -240,11 +213,7 @@ class RunningStats:
             counts += np.histogram(column, edges)[0]
 
     def result(self, extremes: bool = False) -> QuantileStats:
-        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value.
-
-        Raises:
-            UserError: fewer than two rows went in.
-        """
+        """Return the statistics of everything so far, with `extremes` also the smallest and the largest value."""
         if self._count < 2:
             raise UserError(f"Statistics need at least two rows, got {self._count}.")
         std = np.sqrt(np.maximum(self._square - self._mean**2, 0))
@@ -266,11 +235,7 @@ REACH = 100  # multiples of the widest range; a broken driver says 1e30, a robot
 
 
 def finite_array(values: object, what: str) -> np.ndarray:
-    """`values` as float32.
-
-    Raises:
-        UserError: they are not numbers, not all finite, or not as many in every row.
-    """
+    """`values` as float32."""
     try:
         array = np.asarray(values, np.float32)
     except (TypeError, ValueError, OverflowError):
@@ -284,9 +249,6 @@ def check_reach(values: np.ndarray, stats: QuantileStats | None, what: str) -> N
     """Refuse values [..., d] that lie further from the middle than `REACH` times the widest range q01…q99.
 
     The widest range of all dimensions counts, so that one which hardly moved in training (a gripper) may move.
-
-    Raises:
-        UserError: one does; it is named.
     """
     if stats is None or values.shape[-1] != len(stats):
         return

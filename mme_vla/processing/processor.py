@@ -31,9 +31,6 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
 
     Args:
         arguments: the constructor's, by name.
-
-    Raises:
-        UserError: an unknown, missing or impossible entry.
     """
     settings = dict(config)
     known = {*arguments, "tokenizer_fingerprint", "views"}
@@ -64,9 +61,6 @@ def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]
 
     Args:
         tokenizer: in place of the one it names.
-
-    Raises:
-        UserError: `folder` holds no processor, or one that names files elsewhere.
     """
     config = read_settings(folder)
     named, stats = config.get("tokenizer", ""), config.get("stats")
@@ -87,11 +81,7 @@ def saved_file(folder: Path, name: Any, what: str) -> Path:
 
 
 def saved_tokenizer(folder: Path, name: Any) -> str | Path:
-    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address.
-
-    Raises:
-        UserError: it names another file of the hub, which nothing is asked for on a stranger's word.
-    """
+    """Which tokenizer a checkpoint means: one that ships, a file of its own, or π0.5's on the hub; no other address."""
     if name in (SAMPLE, PALIGEMMA):
         return str(name)
     if isinstance(name, str) and name.startswith(HUB):
@@ -122,9 +112,6 @@ class Processor(PolicyProcessor):
         horizon: h; steps in a chunk; None for the embodiment's.
         embodiment: the robot: its cameras, in the order the network sees them, its state and its actions.
         stats: normalisation statistics; without them everything works but states and actions.
-
-    Raises:
-        UserError: an unknown prompt format, a size that is not positive, or actions wider than the network's.
     """
 
     def __init__(
@@ -164,11 +151,7 @@ class Processor(PolicyProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes.
-
-        Raises:
-            UserError: a tokenizer that cannot be had, or that has more entries than the backbone.
-        """
+        """Build the processor of a composed configuration, at its backbone's sizes."""
         backbone = shape_of(sections["backbone"])
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
@@ -215,9 +198,6 @@ class Processor(PolicyProcessor):
 
         Returns:
             [v, 3, s, s] uint8, or [n, v, 3, s, s].
-
-        Raises:
-            UserError: a camera too many or too few, or pictures of another form.
         """
         names = self.embodiment.camera_names
         if len(views) != len(names):
@@ -251,9 +231,6 @@ class Processor(PolicyProcessor):
 
         Returns:
             ids [l] int64 and mask [l] bool.
-
-        Raises:
-            UserError: the format needs a state or actions that are not given, or statistics to normalise them.
         """
         normalised, past = None, None
         if state is not None and self.prompt_format.reads_state:
@@ -276,9 +253,6 @@ class Processor(PolicyProcessor):
 
         Returns:
             [h, action_dim] float32: relative where the embodiment says so, quantile-normalised, padded with zeros.
-
-        Raises:
-            UserError: there are no statistics, or the shapes do not fit.
         """
         stats = self.require_stats()
         chunk, state = _float(chunk), _float(state)
@@ -299,9 +273,6 @@ class Processor(PolicyProcessor):
 
         Returns:
             [..., h, w] float32 on the device of `chunk`.
-
-        Raises:
-            UserError: there are no statistics.
         """
         stats = self.require_stats()
         relative = unnormalize(chunk.float()[..., : len(stats.actions)], stats.actions)
@@ -348,9 +319,6 @@ class Processor(PolicyProcessor):
             config: the constructor's arguments by name, some in words: `tokenizer` as `Tokenizer.load` takes it,
                 `stats` as the path of a `norm_stats.json` or None, `embodiment` as `Embodiment.to_dict` writes it (left
                 out: RoboMME's Panda, as before). `tokenizer_fingerprint`, if given, is checked.
-
-        Raises:
-            UserError: an unknown, missing or impossible entry.
         """
         return cls(**constructor_settings(config, inspect.signature(cls).parameters))
 
@@ -369,9 +337,6 @@ class Processor(PolicyProcessor):
         Args:
             folder: of a checkpoint, which may be a stranger's.
             tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes it.
-
-        Raises:
-            UserError: `folder` holds no processor, a damaged one, or one that names files elsewhere.
         """
         config = saved_settings(Path(folder), tokenizer)
         try:

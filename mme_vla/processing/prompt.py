@@ -73,11 +73,7 @@ class State(PromptFormat):
     reads_state = True
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
-        """Return one text.
-
-        Raises:
-            UserError: there is no state.
-        """
+        """Return one text."""
         if inputs.state is None:
             raise UserError(
                 "The prompt format 'state' needs the robot's state; give one, or choose the format 'plain'."
@@ -125,11 +121,7 @@ class PastActions(PromptFormat):
     past_actions = 16
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
-        """Return one text.
-
-        Raises:
-            UserError: it was not told which actions were executed.
-        """
+        """Return one text."""
         if inputs.past_actions is None:
             raise UserError(
                 "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, w])."
@@ -173,11 +165,7 @@ def discretize(values: np.ndarray) -> list[int]:
 
 
 def checked_text(text: object, what: str) -> str:
-    """`text`, if a tokenizer can take it.
-
-    Raises:
-        UserError: it is no text, or holds half a character (a lone surrogate), which no UTF-8 has.
-    """
+    """`text`, if a tokenizer can take it."""
     if not isinstance(text, str):
         raise UserError(f"{what} must be a text, got {brief(text)}.")
     if not is_text(text):

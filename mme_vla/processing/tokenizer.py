@@ -41,9 +41,6 @@ class Tokenizer:
         Args:
             spec: "sample" for the small model shipped with the library, the path of a `.model` file, or
                 "hf://owner/repository/path/in/it.model" for a file on the Hugging Face hub.
-
-        Raises:
-            UserError: there is no such file, it is no SentencePiece model, or the hub cannot give it.
         """
         spec = str(spec)
         if spec == SAMPLE:
@@ -68,11 +65,7 @@ class Tokenizer:
         return self._processor.encode(text, add_bos=bos)
 
     def piece(self, text: str) -> int:
-        """The id of one piece, as the model spells it (`▁` stands for a space).
-
-        Raises:
-            UserError: the model has no such piece.
-        """
+        """The id of one piece, as the model spells it (`▁` stands for a space)."""
         index = self._processor.piece_to_id(text)
         if index == self._processor.unk_id():
             raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
@@ -80,11 +73,7 @@ class Tokenizer:
 
     @property
     def end(self) -> int:
-        """The id that ends a text.
-
-        Raises:
-            UserError: the model has none.
-        """
+        """The id that ends a text."""
         if self._processor.eos_id() < 0:
             raise UserError(f"Tokenizer {self.spec!r} has no end-of-sequence token, which this policy's prompts need.")
         return self._processor.eos_id()

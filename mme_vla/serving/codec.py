@@ -23,11 +23,7 @@ except ImportError as error:  # the extra is missing: say which
 
 
 def pack(message: Any) -> bytes:
-    """Encode a message.
-
-    Raises:
-        UserError: it holds something msgpack has no form for, such as an array of objects.
-    """
+    """Encode a message."""
     try:
         packed = msgpack.packb(message, default=_encode)
     except (TypeError, ValueError, OverflowError) as error:
@@ -37,12 +33,7 @@ def pack(message: Any) -> bytes:
 
 
 def unpack(data: bytes | bytearray | memoryview) -> Any:
-    """Decode a message. Arrays are read-only views on `data`: copy what is written to.
-
-    Raises:
-        UserError: it is no msgpack, it is cut short, it holds more than `MOST_OBJECTS` values, or an array in it is not
-            what it says.
-    """
+    """Decode a message. Arrays are read-only views on `data`: copy what is written to."""
     check_size(data)
     try:
         return msgpack.unpackb(
@@ -87,9 +78,6 @@ def check_size(data: bytes | bytearray | memoryview, most: int = MOST_OBJECTS) -
     """Count the values of a message without making any: an empty map takes one byte here and 64 in memory.
 
     A message that is cut short or malformed passes; `unpack` says what is wrong with it.
-
-    Raises:
-        UserError: there are more than `most`.
     """
     at, end, waiting, announced = 0, len(data), 1, 1
     while waiting and at < end:

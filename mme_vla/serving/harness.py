@@ -55,9 +55,6 @@ class MMEVLAModelServer(PredictModelServer):
         seed: of every episode's noise.
         trust_plugins: import the modules that the checkpoint names: code of whoever wrote it.
         max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of them.
-
-    Raises:
-        UserError: no such checkpoint, or a policy that cannot act from what the harness sends.
     """
 
     def __init__(
@@ -127,11 +124,7 @@ class MMEVLAModelServer(PredictModelServer):
         self.sessions.pop(ctx.session_id, None)
 
     async def on_observation(self, obs: dict[str, Any], ctx: SessionContext) -> None:
-        """Take a frame, and answer with the next action.
-
-        Raises:
-            UserError: it lacks a picture or the state; the harness ends such an episode as an error.
-        """
+        """Take a frame, and answer with the next action."""
         running = self.sessions.get(ctx.session_id)
         if running is None:
             raise UserError("an observation came before the start of an episode.")
@@ -168,11 +161,7 @@ class MMEVLAModelServer(PredictModelServer):
 
 
 def run_server(arguments: Sequence[str] | None = None) -> None:
-    """Serve with the command-line options of the harness's model servers, but on this machine alone by default.
-
-    Raises:
-        UserError: a checkpoint that cannot be served.
-    """
+    """Serve with the command-line options of the harness's model servers, but on this machine alone by default."""
     parser = ArgumentParser(description="A policy behind vla-evaluation-harness.")
     parser.add_argument("--config", action=ActionConfigFile, help="YAML file with these options")
     parser.add_argument("--host", default="127.0.0.1", help="address to listen on; clients send no key")

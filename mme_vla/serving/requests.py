@@ -30,9 +30,6 @@ def read_beside(
     Returns:
         By the robot's names: depth float32 [t, H, W, 1] in millimetres, poses float32 [t, 3, 4] from the world to the
         camera.
-
-    Raises:
-        UserError: one is missing or has another form; it names the key.
     """
     readings = {}
     for camera in robot.cameras:
@@ -132,9 +129,6 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
 
     Args:
         most_frames: longest list of frames taken. robot: the policy's, which says what an observation is made of.
-
-    Raises:
-        UserError: neither schema, a missing key, or a value of the wrong form; it names the key.
     """
     if not isinstance(message, dict):
         raise UserError(f"A request is a map, got {type(message).__name__}.")

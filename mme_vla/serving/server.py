@@ -79,11 +79,7 @@ class PolicyServer:
         self._uvicorn: uvicorn.Server | None = None
 
     async def start(self) -> None:
-        """Warm up, then accept clients.
-
-        Raises:
-            UserError: the port is taken, or the address is not one of this machine.
-        """
+        """Warm up, then accept clients."""
         begun = time.perf_counter()
         await self.engine.call(lambda: warm_up(self.engine.policy, self.settings))
         logger.info("warmed up in %.1f s", time.perf_counter() - begun)

@@ -24,11 +24,7 @@ class NoEpisodeError(UserError):
 
 
 async def read_request(engine: Engine, settings: ServeSettings, data: bytes | bytearray) -> Request:
-    """Decode and check a message; a large one beside the event loop.
-
-    Raises:
-        UserError: the request is malformed.
-    """
+    """Decode and check a message; a large one beside the event loop."""
 
     def read() -> Request:
         return parse(unpack(data), settings.limits.frames, engine.policy.embodiment)
@@ -61,9 +57,6 @@ class Session:
 
         Args:
             begun: when the message was there whole (`time.perf_counter()`); the answer says how long it took.
-
-        Raises:
-            UserError: the request does not fit the episode.
         """
         if isinstance(request, Reset):
             self._begin()

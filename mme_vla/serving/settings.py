@@ -21,11 +21,7 @@ def is_local(host: str) -> bool:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """A socket bound to this address.
-
-    Raises:
-        UserError: no such address, or the port is taken or not allowed.
-    """
+    """A socket bound to this address."""
     if isinstance(port, bool) or not isinstance(port, int) or not 0 <= port < 2**16:
         raise UserError(f"port={port!r} is no port; choose 0 (any free one) to 65535.")
     bound = None
@@ -65,11 +61,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class ServeSettings:
-    """How to serve; the keys and their meaning are those of configs/serve.yaml.
-
-    Raises:
-        UserError: a value that cannot work, named with its key.
-    """
+    """How to serve; the keys and their meaning are those of configs/serve.yaml."""
 
     host: str = "127.0.0.1"
     port: int = 8001
@@ -118,11 +110,7 @@ class ServeSettings:
         return min(self.execute or robot.action.execute, robot.action.horizon)
 
     def check_robot(self, robot: Embodiment, past_actions: int = 0) -> None:
-        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this.
-
-        Raises:
-            UserError: it answers in another action space, or would have to know what no request tells.
-        """
+        """Make sure that a policy for this robot, whose prompt reads so many past actions, can be served like this."""
         if past_actions and robot.action.frames is None:
             raise UserError(
                 f"This policy reads which motions were executed, and the frames that a client sends do not tell how "

@@ -94,9 +94,6 @@ class SubgoalEpisode:
         Args:
             frames: of the front camera. The first call brings the first frame that is no video.
             info: the environment's report on the last of them (the oracle reads its subgoal there).
-
-        Raises:
-            UserError: frames of another form.
         """
         frames = _checked(frames, "frames")
         if len(frames):
@@ -111,11 +108,7 @@ class SubgoalEpisode:
 
     @property
     def frame(self) -> np.ndarray:
-        """The current front picture.
-
-        Raises:
-            UserError: nothing was observed yet.
-        """
+        """The current front picture."""
         if self._frame is None:
             raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
         return self._frame
@@ -198,11 +191,7 @@ def problem_of(reply: str, error: MalformedReply) -> tuple[str, str]:
 
 
 def build_predictor(config: Mapping[str, Any] | None) -> SubgoalPredictor | None:
-    """Build from the section `subgoal` of a configuration, or return None where there is none.
-
-    Raises:
-        UserError: an unknown predictor or option.
-    """
+    """Build from the section `subgoal` of a configuration, or return None where there is none."""
     if not config or config.get("name") in (None, "none"):
         return None
     built: SubgoalPredictor = SUBGOALS.build(config)

@@ -18,11 +18,7 @@ _REMEDY = "Build the training data again."
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read a picture as [H, W, 3] uint8.
-
-    Raises:
-        UserError: it is missing or damaged.
-    """
+    """Read a picture as [H, W, 3] uint8."""
     from PIL import Image
 
     with decoding(require_file(path, "a picture"), "a picture", _REMEDY), Image.open(path) as image:
@@ -48,11 +44,7 @@ class Clip:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Sample a file; frames that are not looked at are decoded but not turned into pictures.
-
-        Raises:
-            UserError: it is missing or damaged.
-        """
+        """Sample a file; frames that are not looked at are decoded but not turned into pictures."""
         import av
 
         with decoding(require_file(path, "a video"), "a video", _REMEDY), av.open(str(path)) as container:

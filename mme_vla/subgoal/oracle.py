@@ -20,11 +20,7 @@ class Oracle(SubgoalPredictor):
     sees_video = sees_passing = False
 
     def predict_due(self, episodes: Sequence[SubgoalEpisode]) -> list[Subgoal]:
-        """Look the texts up.
-
-        Raises:
-            UserError: the environment reports none.
-        """
+        """Look the texts up."""
         return [self._read(episode) for episode in episodes]
 
     def _read(self, episode: SubgoalEpisode) -> Subgoal:

@@ -141,11 +141,7 @@ def load_policy(checkpoint: Path, policy: Policy) -> None:
 
 
 def restore(folder: Path, policy: Policy, ema: EMA, optimizer: torch.optim.Optimizer) -> None:
-    """Put everything back as it was when `folder` was written.
-
-    Raises:
-        UserError: a damaged file, or tensors that do not fit this policy.
-    """
+    """Put everything back as it was when `folder` was written."""
     parameters = trainable(policy)
     if shard_files(folder):
         moments = read_shards(folder, policy, ema.tensors(), optimizer, parameters)
@@ -181,11 +177,7 @@ def _read_full(folder: Path, policy: Policy, ema: EMA) -> dict[str, Tensor]:
 
 
 def read_state(checkpoint: Path) -> dict[str, Any]:
-    """What `training_state.json` says.
-
-    Raises:
-        UserError: the folder holds weights only, or the file is damaged or of another program.
-    """
+    """What `training_state.json` says."""
     path = checkpoint / STATE
     if not path.is_file():
         raise UserError(
@@ -216,9 +208,6 @@ def check_disk(folder: Path, policy: Policy, keep: KeepRule, sharded: bool = Fal
     """Refuse to begin a run whose first checkpoints would not fit on the disk.
 
     A sharded run's hold the weights twice: the trained ones in parts, and the averages whole.
-
-    Raises:
-        UserError: saying how much is needed and free.
     """
     weights = sum(p.numel() * p.element_size() for p in policy.parameters())
     trained = sum(p.numel() * p.element_size() for p in trainable(policy).values())

@@ -46,9 +46,6 @@ def prepare_data(
         stats_from: a checkpoint folder whose statistics to use; otherwise they are computed over the training split.
         say: takes a line for the user.
         encoder: the policy's `vision_fingerprint`, where this process does not hold the weights; by default asked here.
-
-    Raises:
-        UserError: whatever is wrong with the data, before any training.
     """
     sources = open_sources(data["sources"], policy.embodiment)
     val_episodes = default_val_episodes(sources) if data["val_episodes"] is None else data["val_episodes"]
@@ -105,11 +102,7 @@ def prepare_data(
 
 
 def check_frozen(policy: Policy, freeze_vision: bool) -> None:
-    """Refuse to train the vision tower under a memory, whose cached tokens would not follow it.
-
-    Raises:
-        UserError: that combination.
-    """
+    """Refuse to train the vision tower under a memory, whose cached tokens would not follow it."""
     if policy.memory is not None and not freeze_vision:
         raise UserError(
             "finetune.freeze_vision=false changes the vision tower while the memory reads tokens that were cached "

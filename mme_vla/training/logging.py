@@ -67,9 +67,6 @@ class Window:
 
         Args:
             step: updates done. reduce: averages a tensor over all processes (`Accelerator.reduce`).
-
-        Raises:
-            UserError: the loss is no longer a number.
         """
         averages = {name: total / self._counts[name] for name, total in self._sums.items()}
         measured = {name: average for name, average in averages.items() if isinstance(average, Tensor)}
@@ -248,11 +245,7 @@ class WeightsAndBiases:
 
     @staticmethod
     def check() -> None:
-        """Find out early whether the package is there.
-
-        Raises:
-            UserError: it is not; says how to install it.
-        """
+        """Find out early whether the package is there."""
         try:
             import wandb  # noqa: F401
         except ImportError:
@@ -289,22 +282,14 @@ class Loggers:
 
 
 def check_logger(config: Mapping[str, Any]) -> None:
-    """Make sure, before any long work, that the logger which the section `logger` names can be used.
-
-    Raises:
-        UserError: an unknown logger, or its package is not installed.
-    """
+    """Make sure, before any long work, that the logger which the section `logger` names can be used."""
     section = config.get("logger") or {}
     if section:
         getattr(LOGGERS[section["name"]], "check", lambda: None)()
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:
-    """The JSON-lines file and the logger that the section `logger` names, if any.
-
-    Raises:
-        UserError: an unknown logger or option, or its package is not installed.
-    """
+    """The JSON-lines file and the logger that the section `logger` names, if any."""
     section = dict(config.get("logger") or {})
     folder.mkdir(parents=True, exist_ok=True)
     loggers: list[Logger] = []

@@ -71,9 +71,6 @@ class Trainer:
             policy: with the parameters frozen that shall not learn. samples: the training split.
             validation: held-out samples, if any.
             config: the plain configuration, saved with every checkpoint.
-
-        Raises:
-            UserError: too few samples for the batch, or a checkpoint that does not fit.
         """
         self.settings, self.run_info, self.config = settings, run, config
         self.accelerator, self.validation = accelerator, validation

@@ -37,11 +37,7 @@ class BatchOrder:
         process: int = 0,
         processes: int = 1,
     ) -> None:
-        """Order `samples` samples for the updates `steps`.
-
-        Raises:
-            UserError: too few samples for one batch, or a batch that does not divide over processes and pieces.
-        """
+        """Order `samples` samples for the updates `steps`."""
         if samples < batch_size:
             raise UserError(
                 f"The training split has {samples} samples, fewer than train.batch_size={batch_size}: "

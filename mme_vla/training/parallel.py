@@ -41,11 +41,7 @@ class ParallelSettings:
             raise UserError(f"train.parallel.replicate={self.replicate} must be at least 1, or null.")
 
     def shards(self, device: torch.device) -> bool:
-        """Whether this run shards its weights: where that is asked for, and of itself on several GPUs.
-
-        Raises:
-            UserError: sharding is asked of a process that was not started by a launcher.
-        """
+        """Whether this run shards its weights: where that is asked for, and of itself on several GPUs."""
         started = distributed.is_available() and distributed.is_initialized()
         if self.strategy == "fsdp" and not started:
             raise UserError(
@@ -57,11 +53,7 @@ class ParallelSettings:
         return self.strategy == "fsdp"
 
     def mesh(self, device_type: str) -> DeviceMesh:
-        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis counts those.
-
-        Raises:
-            UserError: the processes do not divide into so many copies.
-        """
+        """The processes: weights are shared along the last axis; with copies (HSDP) the first axis counts those."""
         world = distributed.get_world_size()
         nodes = max(world // int(os.environ.get("LOCAL_WORLD_SIZE", world)), 1)
         copies = nodes if self.replicate is None else self.replicate

@@ -53,9 +53,6 @@ def claim_run(folder: Path, named: bool, resume: str | None, config: Mapping[str
     Args:
         named: whether the user chose `folder`. One that is named after the clock may belong to another run that began
             in the same second: then this run takes the next name, `<folder>-2`.
-
-    Raises:
-        UserError: as `open_run`, or another process trains in the folder.
     """
     for number in range(1, 1000):
         place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
@@ -83,10 +80,6 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     Args:
         folder: of a new run. resume: None, `auto`, or the path of a run or one of its checkpoints.
         config: the composed configuration, plain.
-
-    Raises:
-        UserError: `folder` holds another run, there is nothing to resume, or the configuration differs where it may
-            not.
     """
     if resume is None:
         if _holds_run(folder):
@@ -129,9 +122,6 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
 
     Args:
         checkpoint: it goes on from. now: `SplitData.content`.
-
-    Raises:
-        UserError: a dataset has changed. Checkpoints from before this was noted cannot tell.
     """
     then = read_state(checkpoint)["config"].get("data", {}).get("content")
     if then is not None and list(then) != list(now):
@@ -207,11 +197,7 @@ ASK, NONE = "ask", "none"
 
 
 def weights_to_start_from(init_from: str | None) -> str | None:
-    """What `init_from` names; None for random weights.
-
-    Raises:
-        UserError: a recipe that is meant for trained weights (`init_from: ask`) was given none.
-    """
+    """What `init_from` names; None for random weights."""
     if init_from == ASK:
         raise UserError(
             "This recipe starts from trained weights: give init_from=<checkpoint> (docs/weights.md lists the formats). "
@@ -229,10 +215,6 @@ def start_from(policy: Policy, source: str) -> str:
 
     Returns:
         A sentence that says what was taken, what is new and what was left behind.
-
-    Raises:
-        UserError: no checkpoint, another tokenizer, a weight of another shape, or weights missing that are not the
-            memory's.
     """
     newest = newest_checkpoint(Path(source))
     source = source if newest == Path(source) else str(newest)

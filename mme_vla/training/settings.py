@@ -65,11 +65,7 @@ class TrainSettings:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any], seed: int = 42) -> Self:
-        """Read the section `train` of a composed configuration.
-
-        Raises:
-            UserError: an unknown key or an impossible value.
-        """
+        """Read the section `train` of a composed configuration."""
         return read_section(cls, values, "train", seed=seed)
 
     def __post_init__(self) -> None:

@@ -114,9 +114,6 @@ def read_shards(
 
     Returns:
         Adam's moments and counts as `<name>/<key>`, of those parameters that had any.
-
-    Raises:
-        UserError: a damaged file, or tensors that do not fit this policy.
     """
     tensors = training_tensors(policy, averages, optimizer, trained)
     _load(checkpoint, tensors, alone=not any(isinstance(tensor, DTensor) for tensor in tensors.values()))
@@ -129,11 +126,7 @@ def read_shards(
 
 
 def read_weights(checkpoint: Path, policy: nn.Module) -> dict[str, Tensor]:
-    """The trained weights themselves of a whole policy (built on meta or not), by name, on the CPU.
-
-    Raises:
-        UserError: a damaged file, or tensors that do not fit this policy.
-    """
+    """The trained weights themselves of a whole policy (built on meta or not), by name, on the CPU."""
     tensors = {f"{RAW}/{name}": torch.empty_like(tensor, device="cpu") for name, tensor in policy.state_dict().items()}
     _load(checkpoint, tensors, alone=True, others=True)
     return {name.removeprefix(f"{RAW}/"): tensor for name, tensor in tensors.items()}
@@ -168,11 +161,7 @@ def _load(checkpoint: Path, tensors: dict[str, Tensor], alone: bool, others: boo
 
 
 def _sums_of(checkpoint: Path, file: Path) -> Sums:
-    """The checksum of a shard, which every process writes beside its own.
-
-    Raises:
-        UserError: there is none, or a file that cannot be a shard.
-    """
+    """The checksum of a shard, which every process writes beside its own."""
     note = file.with_suffix(".sha256")
     for path in (file, note):
         inside(checkpoint, path.relative_to(checkpoint).as_posix())

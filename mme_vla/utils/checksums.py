@@ -55,9 +55,6 @@ class Sums:
 
         Args:
             folder: a folder that may hold the list `name`. remedy: what the user can do about a damaged file.
-
-        Raises:
-            UserError: the list is damaged.
         """
         self.folder, self.name, self.remedy = folder, name, remedy
         path = folder / name
@@ -66,11 +63,7 @@ class Sums:
         self._compared: set[str] = set()
 
     def check(self, *names: str) -> None:
-        """Compare these files, each the first time it is asked about; one that is not listed is not checked.
-
-        Raises:
-            UserError: one is missing or its content is not what was written.
-        """
+        """Compare these files, each the first time it is asked about; one that is not listed is not checked."""
         paths = {name: inside(self.folder, name) for name in names if name in self.table and name not in self._compared}
         for path in paths.values():
             if not path.is_file():
@@ -97,9 +90,6 @@ def check_sums(folder: Path, names: Iterable[str] | None = None) -> bool:
 
     Returns:
         Whether there were sums to compare with.
-
-    Raises:
-        UserError: a file is missing or its content is not what was written.
     """
     sums = Sums(folder)
     sums.check(*(sorted(sums.table) if names is None else names))
@@ -132,11 +122,7 @@ def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """`values` without their seal; those that were written without one, by hand or long ago, are taken as they are.
-
-    Raises:
-        UserError: the seal is not that of these values.
-    """
+    """`values` without their seal; those that were written without one, by hand or long ago, are taken as they are."""
     inner = {key: value for key, value in values.items() if key != SEAL}
     if SEAL in values and values[SEAL] != _sum(inner):
         raise UserError(

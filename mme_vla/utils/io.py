@@ -77,11 +77,7 @@ def _number(error: BaseException) -> int | None:
 
 
 def require_file(path: Path, what: str = "a file") -> Path:
-    """Return `path` if it is a regular file, which can be opened without waiting.
-
-    Raises:
-        UserError: it is missing, a folder, a device or a pipe.
-    """
+    """Return `path` if it is a regular file, which can be opened without waiting."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -104,9 +100,6 @@ def decoding(path: Path | str, what: str, remedy: str) -> Iterator[None]:
     """Around a call into another library that parses the file `path`, and nothing else.
 
     Parsers of binary formats raise whatever they stumble over, from KeyError to MemoryError; there is no list of it.
-
-    Raises:
-        UserError: anything was raised.
     """
     try:
         yield
@@ -125,9 +118,6 @@ def inside(folder: Path, name: str, what: str = "file") -> Path:
 
     A snapshot in the hub's cache is made of links to the files of its repository's folder, `../../blobs/…`: these count
     as its own.
-
-    Raises:
-        UserError: the name is empty, absolute, or leads out of the folder, by `..` or by a link.
     """
     place, root = folder / name, folder.resolve()
     try:
@@ -158,11 +148,7 @@ _SAFE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,99}")
 
 
 def safe_name(name: str, what: str = "name") -> str:
-    """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most 100 characters.
-
-    Raises:
-        UserError: it is something else, such as a path.
-    """
+    """Return `name` if it can be a folder's name anywhere: letters, digits, `. _ + = -`, at most 100 characters."""
     if not isinstance(name, str) or not _SAFE_NAME.fullmatch(name):
         raise UserError(
             f"{what}={brief(name)} cannot name a folder: use at most 100 letters, digits and . _ + = -, "
@@ -182,11 +168,7 @@ TEXT_LIMIT = 64 * 2**20  # bytes; the largest files of text here, tables of subg
 
 
 def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes:
-    """Read a regular file of at most `limit` bytes.
-
-    Raises:
-        UserError: it is missing, a folder, a device or a pipe (which could block or never end), too large.
-    """
+    """Read a regular file of at most `limit` bytes."""
     try:
         # A pipe without a writer would block in open(); a device would never end.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
@@ -205,11 +187,7 @@ def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes
 
 
 def read_text(path: Path, what: str = "text", limit: int = TEXT_LIMIT) -> str:
-    """Read a regular file of UTF-8 text of at most `limit` bytes; see `read_bytes`.
-
-    Raises:
-        UserError: as `read_bytes`, or it is not UTF-8.
-    """
+    """Read a regular file of UTF-8 text of at most `limit` bytes; see `read_bytes`."""
     data = read_bytes(path, what, limit)
     try:
         return data.decode()
@@ -240,9 +218,6 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
         source: where it came from, for the message.
         kind: what the outermost value must be.
         finite: whether NaN and infinities, which JSON does not have but Python writes, are refused.
-
-    Raises:
-        UserError: not JSON, nested too deeply, a number out of range, or another kind of value.
     """
     try:
         # Python's own constants are looked at only where they are refused: hooks slow the parser down.
@@ -261,22 +236,14 @@ def parse_json(text: str | bytes, source: str, kind: type | tuple[type, ...] = d
 def read_json(
     path: Path, what: str = "JSON", kind: type | tuple[type, ...] = dict, limit: int = TEXT_LIMIT, finite: bool = True
 ) -> Any:
-    """Read a file of JSON; see `read_text` and `parse_json`.
-
-    Raises:
-        UserError: it is not there or is not what it should be.
-    """
+    """Read a file of JSON; see `read_text` and `parse_json`."""
     return parse_json(read_text(path, what, limit), str(path), kind, finite)
 
 
 def read_json_lines(
     path: Path, what: str = "lines of JSON", limit: int = TEXT_LIMIT, finite: bool = True
 ) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield (line number from 1, object) for every line that is not empty.
-
-    Raises:
-        UserError: as `read_json`, naming the line.
-    """
+    """Yield (line number from 1, object) for every line that is not empty."""
     # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
     for number, line in enumerate(read_text(path, what, limit).split("\n"), start=1):
         if line.strip():

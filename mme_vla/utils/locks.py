@@ -35,9 +35,6 @@ class FolderLock:
     Args:
         folder: made if need be. what: it is for, in the message.
         name: of the lock's file, where several kinds of holders share a folder.
-
-    Raises:
-        UserError: another process holds the folder.
     """
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:

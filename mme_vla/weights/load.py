@@ -88,11 +88,7 @@ def load_weights(
 
 
 def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
-    """Read a checkpoint in the names of a policy of its own variant.
-
-    Raises:
-        UserError: as `load_weights`.
-    """
+    """Read a checkpoint in the names of a policy of its own variant."""
     if source.format == "ours":
         return merge_state(source.tensors(), source.config.get("adapters"))
     if source.format == "lerobot":
@@ -124,9 +120,6 @@ def start_from(policy: Policy, source: str | Path, *, revision: str | None = Non
 
     The source may be memoryless π0.5 in any format, or another variant. Only parameters of the memory (its integration
     and its own expert included) may stay new; they keep the values they have. Statistics are not taken.
-
-    Raises:
-        UserError: no checkpoint, a weight of another shape, or weights missing that are not the memory's.
     """
     return transfer(policy, source, revision=revision).new
 

@@ -42,11 +42,7 @@ class Zipped:
         return f"{self.file} ({self.place or 'at its top'})"
 
     def check(self) -> None:
-        """Compare what lies there with the archive's checksums, which tensorstore does not ask for.
-
-        Raises:
-            UserError: a piece is damaged.
-        """
+        """Compare what lies there with the archive's checksums, which tensorstore does not ask for."""
         with decoding(self.file, "a zip archive", "Download or copy it again."), zipfile.ZipFile(self.file) as opened:
             for name in self.names:
                 with opened.open(self.place + name) as piece:
@@ -80,9 +76,6 @@ def read_orbax(params: Path | Zipped, fits: Callable[[Mapping[str, Tensor]], Non
     Args:
         params: the arrays' folder, or where they are in an archive.
         fits: called with tensors of the arrays' names and shapes on meta, before memory is taken for any.
-
-    Raises:
-        UserError: tensorstore is not installed, or the store is incomplete or damaged, or leads out of its folder.
     """
     ts = _tensorstore()
     if isinstance(params, Zipped):
@@ -137,11 +130,7 @@ def _check_chunks(stores: Mapping[str, Any], params: Path | Zipped) -> None:
 
 
 def write_orbax(tree: Mapping[str, Tensor], params: Path) -> None:
-    """Write a tree as Orbax does (OCDBT, zarr, full keys `params/…/value`), so that Orbax restores it.
-
-    Raises:
-        UserError: tensorstore is not installed.
-    """
+    """Write a tree as Orbax does (OCDBT, zarr, full keys `params/…/value`), so that Orbax restores it."""
     ts = _tensorstore()
     params.mkdir(parents=True)
     leaves: dict[str, Any] = {}

@@ -58,11 +58,7 @@ def is_port(tensor_names: list[str]) -> bool:
 
 
 def from_port(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Bring a port's tensors to the one spelling of the name table, the embedding under its own name.
-
-    Raises:
-        UserError: two tensors that mean the same one, or a checkpoint of π0, whose network is another.
-    """
+    """Bring a port's tensors to the one spelling of the name table, the embedding under its own name."""
     spelled: dict[str, str] = {}
     for name in tensors:
         taken = spelled.setdefault(_respell(name), name)
@@ -95,11 +91,7 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
 
 
 def check_window(policy: Policy, config: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's.
-
-    Raises:
-        UserError: its `config.json` turns on a memory that the policy does not have, or has otherwise.
-    """
+    """Refuse a checkpoint of LeRobot's π0.5 whose short-window memory is not this policy's."""
     has: dict[str, Any] = {setting: bool(config.get(setting)) for setting in WINDOW_MEMORY}
     if not any(has.values()) and policy.memory is not None:
         raise UserError(

@@ -21,11 +21,7 @@ from mme_vla.weights.tables import Adapter, Derived, NameTable, Unread, memory_p
 
 
 def released_adapter(policy: MMEPolicy) -> Adapter:
-    """The released tree of this policy.
-
-    Raises:
-        UserError: memory or integration are not released ones.
-    """
+    """The released tree of this policy."""
     return Adapter(released_table(policy), released_unread(policy), derived=released_derived(policy))
 
 
@@ -52,11 +48,7 @@ def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
 
 
 def released_table(policy: MMEPolicy) -> NameTable:
-    """Every parameter of the policy and the released leaves it is made of.
-
-    Raises:
-        UserError: memory or integration have tensors that no released checkpoint holds.
-    """
+    """Every parameter of the policy and the released leaves it is made of."""
     table = _table(policy)
     unnamed = sorted(memory_parameters(policy) ^ {name for name in table if policy.component_of(name) == "memory"})
     if unnamed:
@@ -88,11 +80,7 @@ def released_derived(policy: MMEPolicy) -> list[Derived]:
 
 
 def from_released(policy: MMEPolicy, tree: Mapping[str, Tensor], source: str = "the released tree") -> MMEPolicy:
-    """Fill a policy (on meta or not) from a released tree.
-
-    Raises:
-        UserError: lists every leaf that is missing, left over or misshapen.
-    """
+    """Fill a policy (on meta or not) from a released tree."""
     assign_tensors(policy, released_adapter(policy).translate(tree, policy.state_dict(), source), source)
     return policy
 

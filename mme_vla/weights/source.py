@@ -48,11 +48,7 @@ def find_archive(folder: Path) -> Path | None:
 
 
 def open_archive(file: Path) -> Archive:
-    """Look through an archive and find the checkpoint in it.
-
-    Raises:
-        UserError: it is damaged, names places outside of itself, unpacks to more than a checkpoint can, or holds none.
-    """
+    """Look through an archive and find the checkpoint in it."""
     with decoding(file, "a zip archive", _REMEDY), zipfile.ZipFile(file) as opened:
         entries = [entry for entry in opened.infolist() if not entry.is_dir()]
         _check(file, entries, opened.start_dir)
@@ -197,9 +193,6 @@ class Source:
         Args:
             fits: where reading takes memory (Orbax), called before with tensors of the same names and shapes on meta;
                 raises where they do not fit.
-
-        Raises:
-            UserError: a file that is damaged, incomplete or of another network.
         """
         if self.params is not None:
             return read_orbax(self.params, fits)
@@ -247,11 +240,7 @@ class Source:
 
 
 def detect_format(source: str | Path) -> str:
-    """Say what `source` is: `ours`, `lerobot`, `openpi` or `released`.
-
-    Raises:
-        UserError: nothing there, or nothing this library knows.
-    """
+    """Say what `source` is: `ours`, `lerobot`, `openpi` or `released`."""
     return open_source(source).format
 
 
@@ -264,9 +253,6 @@ def open_source(
 
     Args:
         base: OpenVLA, for a run of OpenVLA-OFT that holds its adapters alone. A run's own word for it is not followed.
-
-    Raises:
-        UserError: nothing there, or nothing this library knows; adapters without a base, or a base without adapters.
     """
     path = local_folder(source, revision, token)
     if not path.exists():

@@ -29,9 +29,6 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
     Args:
         folder: the checkpoint (for released runs: the step).
         asset: which of several datasets' statistics.
-
-    Raises:
-        UserError: there are several and `asset` does not choose, or a damaged file.
     """
     folder = Path(folder)
     files = stats_files(folder)

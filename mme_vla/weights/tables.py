@@ -86,11 +86,7 @@ def linear(path: str, *, layer: int | None = None, bias: bool = True) -> NameTab
 
 
 def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Translate a foreign checkpoint into our names and layouts.
-
-    Raises:
-        UserError: tensors that the table names are missing; all are listed.
-    """
+    """Translate a foreign checkpoint into our names and layouts."""
     missing = sorted({p.path for pieces in table.values() for p in pieces} - set(source))
     if missing:
         raise UserError(f"The checkpoint lacks {len(missing)} tensors this policy needs: {listed(missing)}")
@@ -106,11 +102,7 @@ def read(table: NameTable, source: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def check(derived: Iterable[Derived], source: Mapping[str, Tensor]) -> None:
-    """Make sure that the constants a checkpoint stores are the ones this configuration gives.
-
-    Raises:
-        UserError: one is not. Real parts count, to bfloat16's precision: some writers rounded or cast them.
-    """
+    """Make sure that the constants a checkpoint stores are the ones this configuration gives."""
     for constant in derived:
         if constant.path in source:
             stored, expected = (x.real.float().cpu() for x in (source[constant.path], constant.make()))
@@ -169,11 +161,7 @@ class Adapter:
         return {piece.path for pieces in self.table.values() for piece in pieces}
 
     def export(self, target: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Write our tensors in the foreign names and layouts, the three lists included.
-
-        Raises:
-            UserError: the policy has tensors that this format has no name for.
-        """
+        """Write our tensors in the foreign names and layouts, the three lists included."""
         homeless = sorted(set(target) - set(self.table))
         if homeless:
             raise UserError(
@@ -191,33 +179,21 @@ class Adapter:
         return {name: tuple(tensor.shape) for name, tensor in released.items()}
 
     def translate(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-        """Read foreign tensors into our names; `target` gives the shapes they must have.
-
-        Raises:
-            UserError: lists every foreign tensor that is missing, left over or misshapen; or a constant is another.
-        """
+        """Read foreign tensors into our names; `target` gives the shapes they must have."""
         self.check_fit(released, target, source)
         check(self.derived, released)
         derived = {constant.path for constant in self.derived}
         return read(self.table, {name: tensor for name, tensor in released.items() if name not in derived})
 
     def check_fit(self, released: Mapping[str, Tensor], target: Mapping[str, Tensor], source: str) -> None:
-        """Compare names and shapes alone, so that foreign tensors may still be on meta: not read yet.
-
-        Raises:
-            UserError: as `translate`.
-        """
+        """Compare names and shapes alone, so that foreign tensors may still be on meta: not read yet."""
         shapes, derived = self.shapes(target), {constant.path for constant in self.derived}
         tensors = {name: tensor for name, tensor in released.items() if name not in derived}
         check_fit(tensors, shapes, source, optional=set(shapes) - self.needed())
 
 
 def pi05_of(policy: Policy) -> Pi05Backbone:
-    """The policy's backbone, where it is π0.5: the only one these formats hold.
-
-    Raises:
-        UserError: it is another.
-    """
+    """The policy's backbone, where it is π0.5: the only one these formats hold."""
     backbone = getattr(policy, "backbone", None)
     if not isinstance(backbone, Pi05Backbone):
         raise UserError(

@@ -19,11 +19,7 @@ def find_torch_files(folder: Path) -> list[Path]:
 
 
 def read_torch_file(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name (of tables by part: part and name), memory-mapped where its layout allows.
-
-    Raises:
-        UserError: the file is damaged, holds more than tensors and plain values, or no table of tensors.
-    """
+    """The tensors of a file, by name (of tables by part: part and name), memory-mapped where its layout allows."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:

@@ -113,11 +113,7 @@ _OF_ONE_METHOD = {
 
 
 def check_target(policy: Policy, fmt: str) -> None:
-    """Refuse a format that has no place for this policy, before anything is read.
-
-    Raises:
-        UserError: a memory in a format of memoryless policies, or one without released names.
-    """
+    """Refuse a format that has no place for this policy, before anything is read."""
     if fmt in ("lerobot", "openpi") and policy.memory is not None:
         raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
     if fmt == "released":

@@ -34,9 +34,6 @@ class FrameChoice:
     memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames, and
         so does the other where the memory gives a backbone past views.
     every: of the decisions, every so many, for a policy that executes so many motions before it is asked again.
-
-    Raises:
-        UserError: `at` is none of these.
     """
 
     at: str | int | Sequence[int | str]

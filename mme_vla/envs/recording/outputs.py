@@ -150,11 +150,7 @@ class RecordingPlan:
         return [*([] if self.dataset is None else [self.dataset]), *map(self._official, official)]
 
     def missing(self, options: "ConvertOptions") -> list[Path]:
-        """The places that are still to be written; what is there holds exactly these episodes.
-
-        Raises:
-            UserError: one of them holds something else, which is never written over.
-        """
+        """The places that are still to be written; what is there holds exactly these episodes."""
         missing = []
         for place in self.places:
             if not place.exists():

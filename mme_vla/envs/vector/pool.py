@@ -109,9 +109,6 @@ class VecEnv:
         factory: makes an environment from `task`, `split`, `episode` and `options`; importable by name.
         options: further arguments of `factory`.
         timeout: seconds after which a command without result counts as hung, and its worker is replaced.
-
-    Raises:
-        UserError: `workers` or `timeout` is not positive.
     """
 
     def __init__(
@@ -167,9 +164,6 @@ class VecEnv:
 
         Args:
             how: arguments of the environment's `reset`.
-
-        Raises:
-            UserError: the environments are closed, or the worker's last reply has not been received.
         """
         state = self._idle(worker)
         state.job, state.resetting = job, True
@@ -177,11 +171,7 @@ class VecEnv:
         self._command(worker, protocol.RESET, arguments, how)
 
     def send(self, worker: int, action: Any) -> None:
-        """Let a worker perform an action; returns at once.
-
-        Raises:
-            UserError: the environments are closed, the worker runs no episode, or its last reply has not been received.
-        """
+        """Let a worker perform an action; returns at once."""
         state = self._idle(worker)
         if state.job is None:
             raise UserError(f"Worker {worker} runs no episode; call start() or start_next() first.")
@@ -199,9 +189,6 @@ class VecEnv:
 
         Returns:
             Replies in the order of the workers; empty when the time is up or nothing is under way.
-
-        Raises:
-            UserError: the environments are closed.
         """
         self._require_open()
         until = time.monotonic() + (float("inf") if timeout is None else timeout)

@@ -33,11 +33,7 @@ class AttentionMass:
     layers: Tensor
 
     def share(self, part: str) -> Tensor:
-        """Mass by layer [depth] of what does not lie on the actions themselves, as the paper's table adds up to 100 %.
-
-        Raises:
-            UserError: there is no such part (a policy without memory, or with a modulator, has no memory tokens).
-        """
+        """Mass by layer [depth] of what does not lie on the actions themselves, as the paper's table adds up to 100 %."""
         if part not in self.parts:
             raise UserError(f"No attention on {part!r}: the sequence holds {', '.join(self.parts)}.")
         self_mass = self.layers[:, self.parts.index("action")]
@@ -84,19 +80,11 @@ class AttentionWatch:
         self._handles = []
 
     def result(self) -> AttentionMass:
-        """What has been seen.
-
-        Raises:
-            UserError: nothing has.
-        """
+        """What has been seen."""
         return self._mass(None, 0)
 
     def lap(self) -> AttentionMass:
-        """What has been seen since the last lap.
-
-        Raises:
-            UserError: nothing has.
-        """
+        """What has been seen since the last lap."""
         mass = self._mass(*self._lap)
         assert self._sums is not None
         self._lap = (self._sums.clone(), self._samples)

@@ -68,9 +68,6 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
 
     Args:
         backbone: a file of `configs/backbone`; by default the one that is the model's full size.
-
-    Raises:
-        UserError: an unknown model, a budget for a model without memory, or a PyTorch that does not count attention.
     """
     _check_attention_is_counted()
     policy = on_meta(model, budget, backbone)
@@ -95,11 +92,7 @@ def flops(work: Callable[[], object]) -> int:
 
 
 def on_meta(model: str, budget: int | None = None, backbone: str | None = None) -> Policy:
-    """A model on the meta device.
-
-    Raises:
-        UserError: an unknown model, or a budget for a model without memory.
-    """
+    """A model on the meta device."""
     if backbone is None:
         backbone = str(compose("policy", [f"model={model}"]).full_size)
     policy = build_policy(model, backbone=backbone, device="meta")

@@ -51,19 +51,11 @@ class ModulationWatch:
         self._handles = []
 
     def result(self) -> ModulationStats:
-        """What has been seen.
-
-        Raises:
-            UserError: nothing has.
-        """
+        """What has been seen."""
         return self._stats({})
 
     def lap(self) -> ModulationStats:
-        """What has been seen since the last lap.
-
-        Raises:
-            UserError: nothing has.
-        """
+        """What has been seen since the last lap."""
         stats = self._stats(self._lap)
         self._lap = dict(self._sums)
         return stats

@@ -30,11 +30,7 @@ class RecurrenceCurves:
 
 @torch.no_grad()
 def recurrence_curves(policy: MMEPolicy, source: EpisodeSource, episode: int, stride: int = STRIDE) -> RecurrenceCurves:
-    """Run the memory over the window it has at an episode's last chunk.
-
-    Raises:
-        UserError: the memory is not recurrent, or there is no such episode.
-    """
+    """Run the memory over the window it has at an episode's last chunk."""
     memory = policy.memory
     if not isinstance(memory, RecurrentMemory):
         raise UserError("This policy has no recurrent memory: choose one such as ttt_modul or rmt_expert.")

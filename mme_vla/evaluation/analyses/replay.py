@@ -28,9 +28,6 @@ def replay(
 
     Yields:
         The step a chunk was just chosen at, and the running episode.
-
-    Raises:
-        UserError: there is no such episode, or it lacks the subgoals this policy reads.
     """
     if not 0 <= episode < len(source):
         raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")

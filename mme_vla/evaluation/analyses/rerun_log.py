@@ -20,11 +20,7 @@ class RerunLog:
     """
 
     def __init__(self, path: Path) -> None:
-        """Begin a file, replacing one of that name.
-
-        Raises:
-            UserError: Rerun is not installed, or `path` has another suffix.
-        """
+        """Begin a file, replacing one of that name."""
         try:
             import rerun
         except ImportError:

@@ -21,9 +21,6 @@ def selection_sheets(
 
     Yields:
         (step, picture); pictures grow with what is remembered.
-
-    Raises:
-        UserError: there is no such episode, or `every` is not positive.
     """
     import torch
 

@@ -204,11 +204,7 @@ class Results:
     notes: list[str]
 
     def method(self, label: str) -> Method:
-        """Find a method.
-
-        Raises:
-            UserError: there is none of this label.
-        """
+        """Find a method."""
         for method in self.methods:
             if method.label == label:
                 return method
@@ -227,9 +223,6 @@ def aggregate(
         records: of any number of runs; they are merged here. protocol: its tasks are `tasks_of(records)` by default.
         split: only these; needed if there are several.
         conflicts: see `merge`.
-
-    Raises:
-        UserError: nothing to average, an unknown task, several splits, or records that contradict each other.
     """
     records = list(records)
     protocol = protocol or Protocol(tasks_of(records))

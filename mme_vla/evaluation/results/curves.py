@@ -39,9 +39,6 @@ def stress_curves(records: Sequence[EpisodeRecord], confidence: float = 0.95, co
     """Success over every dial that records were made with; records of the test split are at its zero.
 
     A point counts the episodes that the model has at every place of the dial, so that one curve is of the same scenes.
-
-    Raises:
-        UserError: none of the records is of a stress split, or they contradict each other.
     """
     groups: dict[tuple[str, str, str], dict[int, list[EpisodeRecord]]] = {}
     merged = merge(records, conflicts)
@@ -111,11 +108,7 @@ CAPTION = (
 
 
 def process_of(record: EpisodeRecord) -> ProcessScore | None:
-    """What a record says of it; None for episodes whose environment did not tell.
-
-    Raises:
-        UserError: the score is damaged.
-    """
+    """What a record says of it; None for episodes whose environment did not tell."""
     value = record.extra.get(EXTRA)
     return None if value is None else ProcessScore.from_dict(value)
 

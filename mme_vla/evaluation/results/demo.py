@@ -27,9 +27,6 @@ def demo_records(
 
     Args:
         methods: (model, subgoal predictor) pairs that the paper reports.
-
-    Raises:
-        UserError: the paper does not report one of them.
     """
     records = []
     for model, subgoal in methods:

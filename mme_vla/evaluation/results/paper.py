@@ -34,11 +34,7 @@ class PaperResult(NamedTuple):
 
 
 def paper_table(name: str) -> list[dict[str, str]]:
-    """Rows of one of the shipped files, by column.
-
-    Raises:
-        UserError: there is no such table.
-    """
+    """Rows of one of the shipped files, by column."""
     path = FOLDER / f"{name}.csv"
     if not path.is_file():
         raise UserError(f"No table {name!r} of the paper. {did_you_mean(name, [f.stem for f in FOLDER.glob('*.csv')])}")
@@ -65,11 +61,7 @@ def paper_method(model: str, subgoal: str | None = None) -> PaperMethod | None:
 
 @cache
 def per_task(method: str) -> dict[str, PaperResult]:
-    """A method's results on the 16 tasks.
-
-    Raises:
-        UserError: the paper has no such method.
-    """
+    """A method's results on the 16 tasks."""
     rows = {
         row["task"]: PaperResult(float(row["success_mean"]), float(row["success_std"]))
         for row in paper_table("per_task")

@@ -25,11 +25,7 @@ def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
-    """The `run.json` beside files of records, each once; records without one are passed over.
-
-    Raises:
-        UserError: one is damaged.
-    """
+    """The `run.json` beside files of records, each once; records without one are passed over."""
     folders = dict.fromkeys(path.parent for path in records)
     return [read_run(folder) for folder in folders if (folder / RUN_FILE).is_file()]
 

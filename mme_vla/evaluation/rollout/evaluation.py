@@ -41,11 +41,7 @@ class Shard:
 
 
 def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, split: str = "test") -> list[Job]:
-    """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`).
-
-    Raises:
-        UserError: an unknown task, split or episode, or none at all.
-    """
+    """The episodes of a run, task by task, by the grammar of all commands (`mme_vla.envs.episodes`)."""
     return [Job(spec.task, spec.split, spec.episode) for spec in choose_specs(tasks, episodes, split)]
 
 
@@ -54,9 +50,6 @@ def choose_shard(text: str | None, environment: Mapping[str, str] | None = None)
 
     Args:
         text: wins over the environment. environment: by default the process's own.
-
-    Raises:
-        UserError: no two numbers, or the first not below the second.
     """
     environment = os.environ if environment is None else environment
     if text is None:
@@ -224,11 +217,7 @@ def _end_of(place: str | None) -> str | None:
 
 
 def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
-    """Refuse a predictor that says what this policy was not trained to read.
-
-    Raises:
-        UserError: the policy reads no subgoal, or another kind.
-    """
+    """Refuse a predictor that says what this policy was not trained to read."""
     if subgoals is None:
         return
     if not policy.require_processor().reads_subgoal:

@@ -131,11 +131,7 @@ class Rollout:
         self._render_plan = RenderPlan(self.policy, self.subgoals, self.settings)
 
     def run(self, jobs: Sequence[Job] | Waiting) -> None:
-        """Run these episodes.
-
-        Raises:
-            UserError: the environments cannot be built, or a policy and its subgoals do not go together.
-        """
+        """Run these episodes."""
         begun = time.perf_counter()
         self._waiting = jobs if isinstance(jobs, Waiting) else Waiting(jobs)
         for worker in range(self.envs.workers):

@@ -69,11 +69,7 @@ class RolloutSettings:
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Read the keys of a configuration that are settings; others are ignored.
-
-        Raises:
-            UserError: a value that cannot be.
-        """
+        """Read the keys of a configuration that are settings; others are ignored."""
         return read_section(cls, config, others=True)
 
     def worker_count(self, episodes: int) -> int:

@@ -87,11 +87,7 @@ class SubgoalScore:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Read what `to_dict` wrote.
-
-        Raises:
-            UserError: it is not a score.
-        """
+        """Read what `to_dict` wrote."""
         try:
             return cls(**{**values, "problems": Counter(values["problems"])})
         except (TypeError, KeyError) as error:
@@ -99,11 +95,7 @@ class SubgoalScore:
 
 
 def score_of(record: EpisodeRecord) -> SubgoalScore | None:
-    """What a record says of its subgoals; None for an episode without a predictor.
-
-    Raises:
-        UserError: the score is damaged.
-    """
+    """What a record says of its subgoals; None for an episode without a predictor."""
     values = record.extra.get(EXTRA)
     return None if values is None else SubgoalScore.from_dict(values)
 

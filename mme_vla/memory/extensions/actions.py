@@ -145,9 +145,6 @@ class ActionMemory(RecurrentMemory):
         Args:
             budget: memory tokens. hidden: width of the LSTM; None is a quarter of `d_vision`, at least 64.
             layers: of the LSTM. max_steps, max_video, stride: which frames it reads.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         if budget < 1 or layers < 1:
             raise UserError(f"memory.budget={budget}, memory.layers={layers}: both must be at least 1.")

@@ -17,11 +17,7 @@ MLP = 4
 
 
 def heads_of(hidden: int, heads: int | None) -> int:
-    """So many heads; None is one for each 64 of `hidden`, at least 2.
-
-    Raises:
-        UserError: they do not divide `hidden`.
-    """
+    """So many heads; None is one for each 64 of `hidden`, at least 2."""
     heads = heads or max(2, hidden // 64)
     if heads < 1 or hidden % heads:
         raise UserError(f"memory.heads={heads} does not divide memory.hidden={hidden}.")

@@ -53,9 +53,6 @@ class Banked(FrameMemory):
             stride, moments, video: which frames are moments (`recurrent_frames`), the current one among them.
             hidden: width of the bank; by default a quarter of `d_vision`, at least 64.
             length, retrieval_layers, time_code, fusion, consolidation: as for `MemoryBank`.
-
-        Raises:
-            UserError: sizes that do not fit together, or an unknown choice.
         """
         super().__init__()
         for key, value in {"grid": grid, "stride": stride, "video": video}.items():
@@ -165,9 +162,6 @@ class Retrieval(nn.Module):
             retrieval_layers: blocks the current tokens read the entries through.
             time_code: whether keys carry their moment's time.
             fusion: how current and retrieved tokens become one: `gate` (learned, each number its own) or `add` (mean).
-
-        Raises:
-            UserError: an unknown choice, or a size that is not positive.
         """
         super().__init__()
         if retrieval_layers < 1:
@@ -238,9 +232,6 @@ class MemoryBank(Retrieval):
             consolidation: what becomes of a moment too many: `tome` makes the two most alike neighbours one, `fifo`
                 drops the oldest.
             store_fused: store the fused tokens instead of the current ones.
-
-        Raises:
-            UserError: an unknown choice, or a size that is not positive.
         """
         if length < 1:
             raise UserError(f"bank.length={length} must be at least 1.")

@@ -57,9 +57,6 @@ class Gist(FrameMemory):
             stride: frames between two that are read, counted back from the current one; the first is always read.
             layers, hidden, heads: of the gists' encoder; its width is by default a quarter of `d_vision`, at least 64.
             encoder: `position_dim` and `position_hidden` of both `FeatureEncoder`s.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         super().__init__()
         sizes = {"anchors": anchors, "recent": recent, "gists": gists, "stride": stride, "layers": layers}

@@ -61,9 +61,6 @@ class LearnedTopK(Memory):
             layers, registers, hidden, heads: of the network that scores; its width is by default a quarter of
                 `d_vision`, at least 64.
             encoder: `position_dim` and `position_hidden` of both `FeatureEncoder`s.
-
-        Raises:
-            UserError: sizes that do not fit together, or nothing to choose from.
         """
         super().__init__()
         if not 2 <= budget <= pool * grid**2:

@@ -55,9 +55,6 @@ class Moment(FrameMemory):
             stride: frames between two that are read (`recurrent_frames`; up to 5/8 of them from the video).
             layers, hidden, heads: of the causal encoder; its width is by default a quarter of `d_vision`, at least 64.
             encoder: `position_dim` and `position_hidden` of the `FeatureEncoder`.
-
-        Raises:
-            UserError: sizes that do not fit together.
         """
         super().__init__()
         for key, value in {"moments": moments, "stride": stride, "layers": layers}.items():

@@ -46,9 +46,6 @@ class Retrieval(PerceptualMemory):
             every: frames 0 and k·every − 1 are stored, compared and remembered; 1: all. The newest of them asks.
             cut: a new chunk begins where two neighbouring stored frames have a cosine below it. −1 never cuts.
             longest: most stored frames of a chunk.
-
-        Raises:
-            UserError: the budget is not a whole number of frames, or a number that is out of its range.
         """
         if budget % grid**2 or budget < grid**2:
             raise UserError(

@@ -56,9 +56,6 @@ class SpaceTime(Memory):
             views: give the tower past pictures. states: hand over past states as tokens.
             state_dim: numbers a state is padded to before its layer.
             budget: most memory tokens there is room for; None for as many as there are frames, which it takes at least.
-
-        Raises:
-            UserError: numbers that are not positive, or neither views nor states.
         """
         super().__init__()
         for name, value in {"frames": frames, "stride": stride, "every": every, "state_dim": state_dim}.items():

@@ -39,11 +39,7 @@ class DiffusionSizes:
 
     @classmethod
     def from_dict(cls, section: Mapping[str, Any]) -> Self:
-        """Read the section `backbone` of a configuration.
-
-        Raises:
-            UserError: another network's section, an unknown or missing key, or a size that cannot be.
-        """
+        """Read the section `backbone` of a configuration."""
         values = dict(section)
         if (name := values.pop("name", None)) != NAME:
             raise UserError(

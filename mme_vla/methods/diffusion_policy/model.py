@@ -25,11 +25,7 @@ Schedule = Any
 
 
 def require_diffusers() -> None:
-    """Make sure that the package is there, before anything is built.
-
-    Raises:
-        UserError: it is not.
-    """
+    """Make sure that the package is there, before anything is built."""
     try:
         import diffusers  # noqa: F401
     except ImportError:
@@ -78,9 +74,6 @@ def sample(
     Args:
         predict: (noisy chunks [b, h, a], steps [b]) → their noise. start: [b, h, a].
         fresh: [b, steps − 1, h, a], what is added after each step but the last. steps: fewer than the schedule's.
-
-    Raises:
-        UserError: more steps than the schedule has.
     """
     total = int(schedule.config.num_train_timesteps)
     if steps is not None and not 1 <= steps <= total:
@@ -101,9 +94,6 @@ def build_image_encoder() -> nn.Sequential:
     """ResNet-18 without pooling and classifier, fresh, a group norm of 16 channels a group for each batch norm.
 
     Pictures [n, 3, H, W] → [n, 512, ⌈H/32⌉, ⌈W/32⌉].
-
-    Raises:
-        UserError: torchvision is not installed.
     """
     try:
         from torchvision.models import resnet18

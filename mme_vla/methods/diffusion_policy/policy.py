@@ -85,11 +85,7 @@ class DiffusionPolicy(Policy):
     def from_config(
         cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `memory`, `integration`, `policy`.
-
-        Raises:
-            UserError: an unknown name or option, sizes that do not fit together, or a package that is missing.
-        """
+        """Build from plain sections `backbone`, `embodiment`, `memory`, `integration`, `policy`."""
         model.require_diffusers()
         sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
         integration = _pooled(config.get("integration"), sizes)
@@ -310,11 +306,7 @@ class DiffusionPolicy(Policy):
 
 
 def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledIntegration | None:
-    """The integration of a configuration, which must hand memory over as one vector.
-
-    Raises:
-        UserError: it is of another kind.
-    """
+    """The integration of a configuration, which must hand memory over as one vector."""
     if not section:
         return None
     kind = INTEGRATIONS[section.get("name", "")]

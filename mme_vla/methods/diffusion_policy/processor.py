@@ -142,9 +142,6 @@ class DiffusionProcessor(PolicyProcessor):
             text: `clip`, `hashed`, or the folder of a CLIP. text_dim: width of its vectors.
             window: frames of an observation. frames: `consecutive`, or `asked`: those at which the policy was asked.
             memory_size: side of the pictures that a memory's vision tower reads.
-
-        Raises:
-            UserError: an unknown choice of frames, or a size or window that is not positive.
         """
         if frames not in FRAMES:
             raise UserError(f"processor.frames={brief(frames)}. {did_you_mean(str(frames), FRAMES)}")
@@ -162,11 +159,7 @@ class DiffusionProcessor(PolicyProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes.
-
-        Raises:
-            UserError: an unknown key of the section `processor`.
-        """
+        """Build the processor of a composed configuration, at its backbone's sizes."""
         from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 
         sizes, settings = DiffusionSizes.from_dict(sections["backbone"]), dict(sections["processor"])
@@ -189,11 +182,7 @@ class DiffusionProcessor(PolicyProcessor):
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Pictures of all cameras [v, 3, H, W] uint8, or [n, v, 3, H, W]; with black bars where the shape is another.
-
-        Raises:
-            UserError: a camera too many or too few, or pictures of another form.
-        """
+        """Pictures of all cameras [v, 3, H, W] uint8, or [n, v, 3, H, W]; with black bars where the shape is another."""
         names = self.embodiment.camera_names
         if len(views) != len(names):
             raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
@@ -275,8 +264,5 @@ class DiffusionProcessor(PolicyProcessor):
         Args:
             folder: of a checkpoint, which may be a stranger's.
             tokenizer: the folder of a CLIP, in place of what `processor.json` names.
-
-        Raises:
-            UserError: `folder` holds no processor, a damaged one, or one that names a text tower elsewhere.
         """
         return load_with_goal_encoder(cls, "diffusion_policy", Path(folder), tokenizer, trusted=(CLIP_NAME, HASHED))

@@ -40,11 +40,7 @@ def unwrapped(name: str) -> str:
 
 
 def unwrap_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Tensors by their names without wrapping.
-
-    Raises:
-        UserError: two of them become one.
-    """
+    """Tensors by their names without wrapping."""
     renamed: dict[str, Tensor] = {}
     for name, tensor in tensors.items():
         if unwrapped(name) in renamed:
@@ -54,11 +50,7 @@ def unwrap_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor
 
 
 def diffusion_adapter(policy: Policy) -> Adapter:
-    """The authors' names of this policy's tensors; a memory and its tower have none.
-
-    Raises:
-        UserError: it is another kind of policy.
-    """
+    """The authors' names of this policy's tensors; a memory and its tower have none."""
     if not isinstance(policy, DiffusionPolicy):
         raise UserError(
             f"This format holds Diffusion Policy; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
@@ -74,11 +66,7 @@ def diffusion_adapter(policy: Policy) -> Adapter:
 
 
 def read_diffusion_stats(folder: Path) -> NormStats | None:
-    """The statistics of `stats.json`, where there is one: the authors write `action` where others write `actions`.
-
-    Raises:
-        UserError: the file is damaged.
-    """
+    """The statistics of `stats.json`, where there is one: the authors write `action` where others write `actions`."""
     if not (folder / STATS).is_file():
         return None
     data = read_json(inside(folder, STATS, "statistics"), "normalisation statistics", limit=2**24)
@@ -92,11 +80,7 @@ def read_diffusion_stats(folder: Path) -> NormStats | None:
 
 
 def write_diffusion_policy(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """`model.pth` and `stats.json` as the authors' training writes them.
-
-    Raises:
-        UserError: another kind of policy, or one with a memory, for which the format has no names.
-    """
+    """`model.pth` and `stats.json` as the authors' training writes them."""
     released = diffusion_adapter(policy).export(policy.state_dict())
     model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in released.items()}
     torch.save({"model": model, "global_step": 0, "ckpt_manager": {}}, folder / WEIGHTS)

@@ -100,12 +100,7 @@ class MemoryVlaPolicy(Policy):
     def from_config(
         cls, config: Mapping[str, Any], processor: PolicyProcessor | None = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `memory`, `policy`.
-
-        Raises:
-            UserError: an unknown option, sizes that do not fit together, an integration, or a memory that gives past
-                views.
-        """
+        """Build from plain sections `backbone`, `embodiment`, `memory`, `policy`."""
         section = {key: value for key, value in config["backbone"].items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, section, "backbone")
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)

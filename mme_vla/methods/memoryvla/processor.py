@@ -65,11 +65,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings.
-
-        Raises:
-            UserError: also where that is not a positive whole number.
-        """
+        """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
         size = config.get("group_size", cls.group_size)
         if isinstance(size, bool) or not isinstance(size, int) or size < 1:
             raise UserError(f"processor.group_size must be a positive whole number, not {brief(size)}.")

@@ -93,11 +93,7 @@ def read_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
 
 
 def memoryvla_adapter(policy: Policy) -> Adapter:
-    """The authors' names of this policy's tensors; what they start from lacks banks and head.
-
-    Raises:
-        UserError: it is another kind of policy.
-    """
+    """The authors' names of this policy's tensors; what they start from lacks banks and head."""
     if not isinstance(policy, MemoryVlaPolicy):
         raise UserError(
             f"This format holds MemoryVLA; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
@@ -108,11 +104,7 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
 
 
 def write_memoryvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """`model.pt` as the authors' training writes it; their statistics are of other actions, and none are written.
-
-    Raises:
-        UserError: another kind of policy.
-    """
+    """`model.pt` as the authors' training writes it; their statistics are of other actions, and none are written."""
     model: dict[str, dict[str, Tensor]] = {}
     for name, tensor in memoryvla_adapter(policy).export(policy.state_dict()).items():
         part, _, suffix = name.partition(".")

@@ -229,11 +229,7 @@ class OpenVlaProcessor(Processor):
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """As `Processor.from_config`, with `jpeg` beside the other settings.
-
-        Raises:
-            UserError: also where the network's actions are wider than the robot's.
-        """
+        """As `Processor.from_config`, with `jpeg` beside the other settings."""
         jpeg = config.get("jpeg", False)
         if not isinstance(jpeg, bool):
             raise UserError(f"processor.jpeg must be true or false, not {brief(jpeg)}.")

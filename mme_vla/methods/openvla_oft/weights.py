@@ -76,11 +76,7 @@ def named_base(folder: Path) -> str:
 
 
 def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
-    """The base's tensors (behind `vla/`) with a run's adapters folded in: W + (alpha / rank)·B·A.
-
-    Raises:
-        UserError: the adapters are damaged, of another base, or of a kind that is more than that sum.
-    """
+    """The base's tensors (behind `vla/`) with a run's adapters folded in: W + (alpha / rank)·B·A."""
     settings, file = _settings(folder), folder / FOLDER / FILE
     rank, alpha = settings.get("r"), settings.get("lora_alpha")
     if not isinstance(rank, int) or not isinstance(alpha, int | float) or rank < 1:
@@ -130,9 +126,6 @@ def openvla_adapter(policy: Policy) -> Adapter:
     """OpenVLA's names of this policy's tensors; a memory has none, and OpenVLA itself no head and no state token.
 
     Of MemoryVLA the VLM alone has names: banks and head are new where it starts from OpenVLA.
-
-    Raises:
-        UserError: it is another kind of policy.
     """
     if not isinstance(policy, OpenVlaPolicy | MemoryVlaPolicy):
         raise UserError(
@@ -147,12 +140,7 @@ def openvla_adapter(policy: Policy) -> Adapter:
 
 
 def with_heads(tensors: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
-    """The model's tensors, and those of the newest head and state token beside it, each behind its module's name.
-
-    Raises:
-        UserError: a file beside it is damaged, or holds a module that these policies do not have: a vision backbone
-            with FiLM, the projector of a diffusion head.
-    """
+    """The model's tensors, and those of the newest head and state token beside it, each behind its module's name."""
     known = tuple(f"{module.rstrip('/')}--" for module in (HEAD, STATE))
     unknown = sorted(file.name for file in folder.glob("*?--*_checkpoint.pt") if not file.name.startswith(known))
     if unknown:
@@ -177,11 +165,7 @@ def _step(file: Path) -> tuple[int, str]:
 
 
 def read_dataset_statistics(folder: Path) -> NormStats | None:
-    """The statistics of `dataset_statistics.json`, where it is of one dataset that has states.
-
-    Raises:
-        UserError: the file is damaged.
-    """
+    """The statistics of `dataset_statistics.json`, where it is of one dataset that has states."""
     if not (folder / STATISTICS).is_file():
         return None
     data = read_json(inside(folder, STATISTICS, "statistics"), "normalisation statistics", limit=2**24)
@@ -198,11 +182,7 @@ def _known(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_openvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """A merged run as OpenVLA-OFT's evaluation reads it: one safetensors file, head, state token, statistics.
-
-    Raises:
-        UserError: another kind of policy, or one with a memory or adapters, for which the format has no names.
-    """
+    """A merged run as OpenVLA-OFT's evaluation reads it: one safetensors file, head, state token, statistics."""
     from safetensors.torch import save_file
 
     released = openvla_adapter(policy).export(policy.state_dict())

@@ -79,11 +79,7 @@ class SAM2ActSizes:
 
     @classmethod
     def from_dict(cls, section: Mapping[str, Any]) -> Self:
-        """Read the section `backbone` of a configuration, but for its `name`.
-
-        Raises:
-            UserError: an unknown key, or a value of another kind.
-        """
+        """Read the section `backbone` of a configuration, but for its `name`."""
         return read_section(cls, {key: value for key, value in section.items() if key != "name"}, "backbone")
 
     def __post_init__(self) -> None:

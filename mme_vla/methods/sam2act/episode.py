@@ -111,9 +111,6 @@ class KeyframeEpisode(Episode):
             frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and `<name>_camera_extrinsic`
                 [t, 3, 4], from the world to the camera.
             rendered: the same frames for every camera; depth and poses are given for these alone.
-
-        Raises:
-            UserError: also where depth or poses are missing or of another form.
         """
         self._check_readings(frames)
         if rendered is not None and any(
@@ -135,11 +132,7 @@ class KeyframeEpisode(Episode):
             self._now = (processor.shots(frames, len(places) - 1), float(fingers[-1])) if current_rendered else None
 
     def scene_inputs(self) -> SceneInputs:
-        """What the network is shown now.
-
-        Raises:
-            UserError: no execution frame was seen yet, or the current one was not drawn.
-        """
+        """What the network is shown now."""
         if self._now is None:
             raise UserError("The episode has seen no execution frame yet: call observe() with the current one first.")
         shots, finger = self._now

@@ -38,22 +38,14 @@ STAGES = {
 
 
 def check_stage(stage: str) -> str:
-    """Return the stage's name.
-
-    Raises:
-        UserError: there is no such stage.
-    """
+    """Return the stage's name."""
     if stage not in STAGES:
         raise UserError(f"Unknown training stage {brief(stage)} of SAM2Act+. {did_you_mean(str(stage), STAGES)}")
     return stage
 
 
 def select_trained(network: nn.Module, stage: str) -> list[nn.Parameter]:
-    """Freeze what a stage does not train, and return what it does.
-
-    Raises:
-        UserError: there is no such stage.
-    """
+    """Freeze what a stage does not train, and return what it does."""
     check_stage(stage)
     trained = []
     for name, parameter in network.named_parameters():
@@ -101,9 +93,6 @@ class SAM2ActPolicy(Policy):
             stage: which of the authors' two stages trains: `first` or `memory`.
             compute_dtype: as for `MMEPolicy`; the authors train in float16. history_dtype: of no use here.
             augment: shift and turn clouds while training.
-
-        Raises:
-            UserError: there is no such stage or dtype.
         """
         super().__init__()
         self.backbone, self.processor = backbone, processor
@@ -120,11 +109,7 @@ class SAM2ActPolicy(Policy):
     def from_config(
         cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `policy`.
-
-        Raises:
-            UserError: an unknown name or option, a robot of another action space, or a package that is missing.
-        """
+        """Build from plain sections `backbone`, `embodiment`, `policy`."""
         sizes, robot = SAM2ActSizes.from_dict(config["backbone"]), embodiment_of(config)
         if robot.action.width != WIDTH or robot.action.frames is not None or robot.action.horizon != 1:
             raise UserError(

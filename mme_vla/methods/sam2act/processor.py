@@ -237,9 +237,6 @@ class SAM2ActProcessor(PolicyProcessor):
             trained_waypoints, waypoints: keyframes that the clock counts to, in training and when acting.
             video_frames: frames of the conditioning video that are looked at, evenly spread.
             field_of_view: of all cameras, in degrees; the benchmark's have 90.
-
-        Raises:
-            UserError: a size that is not positive, bounds without room, or cameras without depth.
         """
         sizes = {"language": language, "words": words, "side": side, "trained_waypoints": trained_waypoints,
                  "waypoints": waypoints, "video_frames": video_frames}  # fmt: skip
@@ -269,11 +266,7 @@ class SAM2ActProcessor(PolicyProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes.
-
-        Raises:
-            UserError: an unknown key of the section `processor`.
-        """
+        """Build the processor of a composed configuration, at its backbone's sizes."""
         backbone, settings = sections["backbone"], dict(sections["processor"])
         settings.pop("name", None)
         sizes = {"language": backbone["language"], "words": backbone["words"]}
@@ -407,9 +400,6 @@ class SAM2ActProcessor(PolicyProcessor):
         Args:
             folder: of a checkpoint, which may be a stranger's.
             tokenizer: the folder of a CLIP, in place of what `processor.json` names.
-
-        Raises:
-            UserError: `folder` holds no processor, a damaged one, or one that names a text tower elsewhere.
         """
         return load_with_goal_encoder(cls, NAME, Path(folder), tokenizer, trusted=(HASHED,))
 

@@ -25,11 +25,7 @@ def is_sam2act(names: Iterable[str]) -> bool:
 
 
 def unwrap_sam2act_names(tensors: Mapping[str, Tensor], source: str) -> dict[str, Tensor]:
-    """Tensors by their names without wrapping, each copy of SAM2's compared with the original.
-
-    Raises:
-        UserError: a copy is another tensor: the three are one module in the released code.
-    """
+    """Tensors by their names without wrapping, each copy of SAM2's compared with the original."""
     renamed = {name.removeprefix(_WRAPPED): tensor for name, tensor in tensors.items()}
     for copy, original in names.released_copies(renamed).items():
         if copy in renamed and not torch.equal(renamed[copy], renamed[original]):
@@ -38,11 +34,7 @@ def unwrap_sam2act_names(tensors: Mapping[str, Tensor], source: str) -> dict[str
 
 
 def sam2act_adapter(policy: Policy) -> Adapter:
-    """The authors' names of this policy's tensors.
-
-    Raises:
-        UserError: it is another kind of policy.
-    """
+    """The authors' names of this policy's tensors."""
     if not isinstance(policy, SAM2ActPolicy):
         raise UserError(
             f"This format holds SAM2Act+; {policy.config.get('name', 'this')} is a {type(policy).__name__}. "
@@ -61,11 +53,7 @@ def sam2act_adapter(policy: Policy) -> Adapter:
 
 
 def write_sam2act(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
-    """`model_plus_last.pth` as the authors' training writes it, but for the optimizer's state.
-
-    Raises:
-        UserError: another kind of policy.
-    """
+    """`model_plus_last.pth` as the authors' training writes it, but for the optimizer's state."""
     released = sam2act_adapter(policy).export(policy.state_dict())
     model = {name: cast(tensor.detach(), dtype).cpu() for name, tensor in released.items()}
     torch.save({"epoch": 0, "model_state": model, "optimizer_state": {}, "lr_sched_state": {}}, folder / WEIGHTS)

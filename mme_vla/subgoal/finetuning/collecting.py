@@ -67,9 +67,6 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
 
     Args:
         tasks: JSON file {"<episode index>": "<Task>"} for a LeRobot dataset that does not tell its tasks.
-
-    Raises:
-        UserError: there is nothing of the kind, or a dataset whose tasks are unknown.
     """
     root = SAMPLE if str(entry) == "sample" else Path(entry)
     if (root / "meta" / "info.json").is_file():
@@ -82,11 +79,7 @@ def open_input(entry: str | Path, tasks: Path | None = None) -> list[Demonstrati
 def build(
     episodes: Sequence[Demonstration], output: Path, sets: Sequence[str], options: RowOptions | None = None
 ) -> dict[str, int]:
-    """Build these sets; return the number of rows of each.
-
-    Raises:
-        UserError: no episode, an unknown set, two episodes of one name, or `output` holds something else.
-    """
+    """Build these sets; return the number of rows of each."""
     options = options or RowOptions()
     if not episodes or not sets:
         raise UserError("There is nothing to build: name at least one episode and one of the sets.")

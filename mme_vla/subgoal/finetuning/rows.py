@@ -76,9 +76,6 @@ def episode_rows(name: str, labels: Labels, options: RowOptions) -> EpisodeRows:
 
     Args:
         name: a key of `SETS`.
-
-    Raises:
-        UserError: another name.
     """
     if name not in SETS:
         raise UserError(f"sets: {name!r}. {did_you_mean(str(name), SETS)}")
@@ -148,11 +145,7 @@ _TIME = 12  # tokens of a video frame's time stamp, at most
 
 
 def read_rows(file: str | Path) -> list[Row]:
-    """Read a JSON-lines file.
-
-    Raises:
-        UserError: it does not exist, is damaged, or holds no row.
-    """
+    """Read a JSON-lines file."""
     path = Path(file)
     if not path.is_file():
         raise UserError(f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")

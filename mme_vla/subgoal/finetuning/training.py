@@ -75,11 +75,7 @@ ZERO2 = {
 
 
 def accumulation(batch: int, per_device: int, processes: int) -> int:
-    """Batches added up before a step, so that all processes together see `batch` rows.
-
-    Raises:
-        UserError: the numbers do not divide.
-    """
+    """Batches added up before a step, so that all processes together see `batch` rows."""
     together = per_device * processes
     if batch % together:
         raise UserError(
@@ -90,11 +86,7 @@ def accumulation(batch: int, per_device: int, processes: int) -> int:
 
 
 def find_checkpoint(output: Path, resume: str | None) -> str | None:
-    """Where to go on from: a checkpoint's path, or None to start.
-
-    Raises:
-        UserError: `output` holds a run that is not to be resumed, or there is no such checkpoint.
-    """
+    """Where to go on from: a checkpoint's path, or None to start."""
     checkpoints = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
     if resume is None:
         if checkpoints or (output / ADAPTER).exists():

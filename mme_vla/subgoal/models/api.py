@@ -284,9 +284,6 @@ def make_api(speaks: str, settings: Mapping[str, Any], where: str, usage: Usage,
 
     Args:
         speaks: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
-
-    Raises:
-        UserError: an unknown way, key or value; no key, or a package that is not installed.
     """
     if speaks not in CONNECTIONS:
         raise UserError(f"{where}.api={speaks!r}. {did_you_mean(str(speaks), CONNECTIONS)}")

@@ -101,9 +101,6 @@ class Connection:
     Args:
         settings: of its own kind.
         client: what the questions go to; None makes one.
-
-    Raises:
-        UserError: there is no key, or the client's package is not installed.
     """
 
     settings_type: ClassVar[type[Settings]] = Settings

@@ -84,9 +84,6 @@ class VLM:
             adapter: folder or repository of a LoRA adapter (PEFT); ms-swift's checkpoints are such.
             device: `auto` (a GPU where there is one), `cpu`, `cuda`, `cuda:1`, …
             dtype: of the weights, one of `DTYPES`.
-
-        Raises:
-            UserError: the extra `vlm` is not installed, nothing loadable is there, or an option cannot work.
         """
         _check_batch(batch_size)
         place = find_device(device)  # before the minutes that loading may take
@@ -147,11 +144,7 @@ class VLM:
 
 
 def load_model(name: str, dtype: str = "bfloat16") -> tuple[Any, Any]:
-    """A model and its processor, on the CPU.
-
-    Raises:
-        UserError: the extra `vlm` is not installed, or there is no such model or dtype.
-    """
+    """A model and its processor, on the CPU."""
     if dtype not in DTYPES:
         raise UserError(f"dtype={dtype!r} of a Qwen3-VL. {did_you_mean(str(dtype), DTYPES)}")
     try:
