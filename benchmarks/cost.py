@@ -28,7 +28,7 @@ OF_BUDGETS = ("framesamp_modul", "tokendrop_expert")
 
 
 def full_batch(policy: MMEPolicy, batch: int, prompt: int) -> Batch:
-    """Noise pictures, a prompt of `prompt` tokens without padding, and a memory that is full."""
+    """Noise images, a prompt of `prompt` tokens without padding, and a memory that is full."""
     made = random_batch(policy, batch, valid=policy.memory.capacity if policy.memory else 0)
     made.prompt = torch.full((batch, prompt), 5)
     made.prompt_mask = torch.ones(batch, prompt, dtype=torch.bool)

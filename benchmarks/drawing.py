@@ -1,4 +1,4 @@
-"""What pictures on demand save: evaluation episodes and demonstrations, drawn where looked at, against drawn whole.
+"""What images on demand save: evaluation episodes and demonstrations, drawn where looked at, against drawn whole.
 
     python benchmarks/drawing.py [MODEL ...] [--task VideoUnmask] [--steps 128] [--no-record] [--no-episodes]
 
@@ -112,7 +112,7 @@ def episode(policy: MMEPolicy, name: str, job: Job, steps: int, draw: str) -> Me
 
 def episodes(models: list[str], task: str, steps: int) -> None:
     """Print a row for every model."""
-    columns = ("model", "pictures (front + wrist): all", "needed", "environment, CPU: all", "needed", "gain",
+    columns = ("model", "images (front + wrist): all", "needed", "environment, CPU: all", "needed", "gain",
                "with the policy, CPU: all", "needed", "gain", "wall, gain")  # fmt: skip
     print("| " + " | ".join(columns) + " |\n|---|" + "---:|" * (len(columns) - 1), flush=True)
     job = Job(task, "test", 0)

@@ -51,14 +51,14 @@ class Parts:
     """Times the parts of an environment's step: what the simulator does, and what is left to us."""
 
     def __init__(self, env: Any) -> None:
-        self.seconds = {"physics": 0.0, "rendering": 0.0, "copies of pictures": 0.0}
+        self.seconds = {"physics": 0.0, "rendering": 0.0, "copies of images": 0.0}
         scene = env.task.scene
         scene.step = self._timed("physics", scene.step)
         scene.update_render = self._timed("rendering", scene.update_render)
         for sensor in scene.sensors.values():
             sensor.capture = self._timed("rendering", sensor.capture)
             # What was drawn is waited for where it is read, so that most of the drawing's time is spent here.
-            sensor.get_obs = self._timed("copies of pictures", sensor.get_obs)
+            sensor.get_obs = self._timed("copies of images", sensor.get_obs)
 
     def _timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def timed(*args: Any, **kwargs: Any) -> Any:

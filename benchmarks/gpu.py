@@ -77,7 +77,7 @@ def chunks(model: str, setup: Setup) -> dict[str, Any]:
 
 
 def attention_rows(setup: Setup, lengths: Sequence[int] = (512, 512, 64, 20), width: int = 256) -> dict[str, Any]:
-    """Attention alone, with memory, pictures, prompt and actions so long: each backend's time and error."""
+    """Attention alone, with memory, images, prompt and actions so long: each backend's time and error."""
     spans = [Span(name, length) for name, length in zip(MEMORY_VISIBILITY, lengths, strict=True)]
     rows: dict[str, Any] = {}
     for backend in ("sdpa", "flex", "varlen"):

@@ -1,4 +1,4 @@
-"""The row of `gpu.py` about LeRobot's PI05 as shipped: the same pictures, prompt and chunk, its own code."""
+"""The row of `gpu.py` about LeRobot's PI05 as shipped: the same images, prompt and chunk, its own code."""
 
 import statistics
 from typing import Any

@@ -3,7 +3,7 @@
     python benchmarks/kill.py [train cache convert record evaluate] [--every 1] [--only rename …] [--minutes 60]
 
 What comes out must equal an undisturbed run's result bit by bit, but for times. `kill_tracer.py` says what is seen of a
-process; `kill_commands.py` what is run: small models, made-up demonstrations, a scripted environment, the made-up
+process; `kill_commands.py` what is run: small models, synthetic demonstrations, a scripted environment, the synthetic
 simulator of one process. Nothing leaves the machine.
 """
 
@@ -171,7 +171,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=(), help="kinds of operation, such as rename (default: all)")
     parser.add_argument("--thin", action="store_true", help="three of the successive writes to one file, not all")
     parser.add_argument("--minutes", type=float, default=60, help="stop killing after so long (default: 60)")
-    parser.add_argument("--skip", type=int, default=0, help="go on after so many kills of an earlier attack")
+    parser.add_argument("--skip", type=int, default=0, help="continue after so many kills of an earlier attack")
     parser.add_argument("--json", type=Path, help="write the outcomes here")
     args = parser.parse_args()
     if unknown := set(args.commands) - set(COMMANDS):

@@ -105,7 +105,7 @@ def _evaluate(inputs: Path, folder: Path) -> None:
 
 
 class _Recorder:
-    """Stands in for the simulator: the steps of a demonstration, made up."""
+    """Stands in for the simulator: the steps of a demonstration, synthetic."""
 
     def __init__(self, task: Any, on_step: Callable[[Any], None], render_request: Any) -> None:
         self._seed, self._on_step = task.seed, on_step

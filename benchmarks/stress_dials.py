@@ -1,6 +1,6 @@
 """How far each dial of `split=stress` goes: who knows everything, does it still solve the test scenes?
 
-`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (goes on where it was stopped)
+`python benchmarks/stress_dials.py --output benchmarks/stress_dials.csv` (continues where it was stopped)
 
 Two know everything. The demonstrator moves the arm as it records. The oracle planner is `mme_vla.play`'s: it acts from
 outside, as a policy in an evaluation does, by choices and pixels, and has so many control steps after the video.
@@ -36,7 +36,7 @@ type Ended = tuple[str, int, int]
 
 
 def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
-    """A demonstration without pictures."""
+    """A demonstration without images."""
     spec = metadata.episode(task, "test", episode)
     env = make_task(task, render=False, seed=spec.seed, difficulty=spec.difficulty, stress={dial: value})
     try:
@@ -47,7 +47,7 @@ def demonstrator(dial: str, task: str, value: int, episode: int) -> Ended:
 
 
 def oracle(dial: str, task: str, value: int, episode: int) -> Ended:
-    """The oracle planner's choices in the environment that policies meet, without pictures."""
+    """The oracle planner's choices in the environment that policies meet, without images."""
     spec = metadata.episode(task, f"stress:{dial}={value}", episode)
     which = EpisodeId(*astuple(spec))
     session = make_session(which, "mme_vla", MAX_STEPS, MAX_CHOICES, images=False)

@@ -5,9 +5,9 @@
 Plays the execution of demonstrations of the embedded sample through the real predictors, 16 steps at a time, with
 stand-ins for the models: they give the recorded subgoals (and MemER's keyframes) as answers, and count. Qwen3-VL-4B's
 FLOPs are those of PyTorch's `FlopCounterMode` over the real code on the meta device: vision tower, one pass over the
-question with keys and values kept, one pass for each token of the answer. Tokens of pictures are exact; words are
+question with keys and values kept, one pass for each token of the answer. Tokens of images are exact; words are
 counted with a small tokenizer of RoboMME's language, where Qwen's own would take about as many. Gemini's FLOPs are not
-known; its tokens of pictures are what its documentation says (258 a picture and 258 a second of video), its thoughts
+known; its tokens of images are what its documentation says (258 an image and 258 a second of video), its thoughts
 are left out, and its price is that of configs/subgoal/gemini.yaml.
 """
 
@@ -29,7 +29,7 @@ from mme_vla.subgoal.text import mark_points, memer_reply, write_boxes
 
 TERA = 1e12
 RUN = 16  # actions executed of a chunk
-IMAGE_TOKENS, SECOND = 258, 258  # Gemini's tokens of a picture, and of a second of video
+IMAGE_TOKENS, SECOND = 258, 258  # Gemini's tokens of an image, and of a second of video
 QWEN3_VL_4B = {
     "text_config": {
         "vocab_size": 151936, "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36,
@@ -58,7 +58,7 @@ def qwen() -> Any:
 
 @cache
 def vision_flops(patches: int, n_images: int) -> int:
-    """The vision tower and its mergers on pictures of this many patches each, attention within each."""
+    """The vision tower and its mergers on images of this many patches each, attention within each."""
     tower = qwen().model.visual
     total = patches * n_images
     pixels = torch.empty(total, 3 * 2 * 16 * 16, device="meta")

@@ -14,9 +14,9 @@ frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. 
 every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
 takes in, and what all slots have in common is learned late.
 
-The memories beyond the paper can be named too (`retrieval_modul`); what they change stands in `OF_KIND`. In the video
+The memories beyond the paper can be named too (`retrieval_modul`); what they change is in `OF_KIND`. In the video
 the arm leans aside, for each colour its own way: that is all that the memory `actions` is told, and `spacetime` beside
-its pictures.
+its images.
 """
 
 import argparse

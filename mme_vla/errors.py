@@ -30,7 +30,7 @@ def missing_extra(what: str, extra: str) -> UserError:
 
 
 def brief(value: object, most: int = 80, quote: bool = True) -> str:
-    """A value as it stands in a message: its repr, cut in the middle where it is longer than `most` characters.
+    """A value as it is in a message: its repr, cut in the middle where it is longer than `most` characters.
 
     >>> brief("x" * 1000, 9)
     "'xxx…xxx'"

@@ -3,7 +3,8 @@ r"""Write `tests/data/compatibility`: files of every published format, and what 
     python scripts/make_compatibility_files.py tests/data/compatibility
 
 Run it at the version whose files later versions have to read, from the root of a clone with the extras `dev`, `sim`,
-`vlm`, `baselines` and `orbax`, on a CPU. `tests/end_to_end/test_compatibility.py` opens the files and compares what it gets with
+`vlm`, `baselines` and `orbax`, on a CPU. `tests/end_to_end/test_compatibility.py` opens the files and compares what it
+gets with
 `expected.json`. Floating-point figures agree to 1e-5 between CPUs, not bitwise. Never regenerate the folder to make
 that test pass: a failure means that files of users can no longer be read.
 
@@ -292,7 +293,7 @@ def evaluate(folder: Path) -> None:
 
 
 def evaluate_scripted(folder: Path, output: Path) -> Any:
-    """Run, or go on with, four episodes in the tests' own environment, which needs no simulator."""
+    """Run, or continue with, four episodes in the tests' own environment, which needs no simulator."""
     from rollout_scripted_env import make_far_env
 
     return mme_vla.evaluate(
@@ -310,7 +311,7 @@ def result_rows(folder: Path, episodes: int, scratch: Path) -> list[dict[str, st
 
 
 def probe(folder: Path, output: Path, *more: str) -> str:
-    """Probe a checkpoint on the dataset, or go on with it; the table that is printed."""
+    """Probe a checkpoint on the dataset, or continue with it; the table that is printed."""
     return command(
         "probe", f"checkpoint={folder / 'training' / 'framesamp'}", f"recordings={folder / 'dataset'}", "draws=2",
         "moments=2", "flow_steps=2", "recorded=1", "with=[shuffle,drop:1]", "scan=true", "device=cpu",

@@ -20,7 +20,7 @@ Z = 0.07
 
 
 class Tip:
-    """Stands in for the tool centre point; an evaluation stands for a step."""
+    """Stands in for the tool centre point; an evaluation means a step."""
 
     def __init__(self, env: Task, monkeypatch: pytest.MonkeyPatch) -> None:
         self._env, self._place = env, [0.4, 0.4, Z]

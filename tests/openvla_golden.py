@@ -124,6 +124,6 @@ def batch(tensors: dict[str, Tensor], about: dict[str, Any]) -> Batch:
 
 
 def fused(backbone: OpenVlaBackbone, tensors: dict[str, Tensor]) -> Tensor:
-    """Fused tokens [b, v, n, d] of the golden six-channel pictures."""
+    """Fused tokens [b, v, n, d] of the golden six-channel images."""
     pixels = tensors["in/pixel_values"].unflatten(1, (-1, 6))
     return backbone.vlm.vision(pixels.flatten(0, 1)).unflatten(0, pixels.shape[:2])

@@ -1,4 +1,4 @@
-"""Recorded episodes made up on the spot, and policies that are known to read one slot, or none."""
+"""Recorded episodes synthetic on the spot, and policies that are known to read one slot, or none."""
 
 from typing import Any
 
@@ -88,7 +88,7 @@ def reader(slot: int | None, budget: int = 5) -> ReadsOneSlot:
 
 
 def probed(policy: Any, words: list[Any], folder: Any, count: int = 1, **settings: Any) -> list[Line]:
-    """A probe of the first made-up episodes, each of which may take from the others."""
+    """A probe of the first synthetic episodes, each of which may take from the others."""
     recordings = made_up(robot=policy.embodiment)
     arms: list[Arm] = read_arms(words) if words else []
     chosen = OfflineSettings(**{"draws": 3, "moments": 2, "flow_steps": 2, **settings})

@@ -18,7 +18,7 @@ class ScriptedEnv:
     It ends by success once the joints have travelled far enough, so the outcome depends on all actions.
 
     Attributes:
-        actions: all it was given. frames: all front pictures it showed.
+        actions: all it was given. frames: all front images it showed.
     """
 
     def __init__(self, task: str, episode: int, max_steps: int, travel: float, step_s: float, dies: str) -> None:

@@ -18,7 +18,7 @@ GOAL = "pick up the cube"
 
 
 def serving_policy(name: str = "tokendrop_expert", **overrides: Any) -> MMEPolicy:
-    """Eight by eight patches a picture: most of a request's time would be the tower's."""
+    """Eight by eight patches an image: most of a request's time would be the tower's."""
     return small_policy(name, backbone={"vision": {**SMALL_VISION, "patch_size": 8}}, **overrides)
 
 
@@ -77,7 +77,7 @@ class Served:
 
     @contextmanager
     def reading(self) -> Iterator["Reading"]:
-        """Within the block the first video, once it is read, goes on being read: one of any length."""
+        """Within the block the first video, once it is read, continues being read: one of any length."""
         state, engine = Reading(), self.server.engine
         begin = engine.run
 

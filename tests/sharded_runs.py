@@ -74,7 +74,7 @@ def validation_losses(job: Trainer) -> dict[str, float]:
 
 
 def train(folder: Path) -> dict[str, Any]:
-    """Train sharded to step 4, with a checkpoint at 2 and 4 that is written while it goes on."""
+    """Train sharded to step 4, with a checkpoint at 2 and 4 that is written while it continues."""
     job = trainer(folder / "run", 4, **SHARDED)
     assert finish_run(job) and is_sharded(job.policy)
     held = sum(p.to_local().numel() for p in trainable(job.policy).values())
@@ -157,7 +157,7 @@ def policies(folder: Path) -> dict[str, Any]:
 
 
 def go_on(folder: Path) -> dict[str, Any]:
-    """One process goes on, from the parts of two."""
+    """One process continues, from the parts of two."""
     parts = len(shard_files(resolve_checkpoint(folder / "run")))
     return {"parts": parts, "finished": finish_run(trainer(folder / "run", 6, resumed=True))}
 

@@ -116,7 +116,7 @@ ALIKE = {
     "base": "the contract of a room",
     "settings": "what a command may be told",
     "progress": "the bar a person sees",
-    "pictures": "pictures on their way to the network: how they are made ready, which are asked for",
+    "pictures": "images on their way to the network: how they are made ready, which are asked for",
     "episodes": "the episodes there are: of the benchmark, of a dataset",
     "sizes": "what a network is built to",
     "backbone": "the network of its folder",

@@ -29,7 +29,7 @@ H5 = "record_dataset_PickXtimes.h5"
 
 
 def write_recording(folder: Path) -> None:
-    """A file in the layout of RoboMME's recorder, with compressed pictures as there."""
+    """A file in the layout of RoboMME's recorder, with compressed images as there."""
     rng = np.random.default_rng(0)
     with h5py.File(folder / H5, "w") as file:
         for number, length in enumerate(LENGTHS):
@@ -84,7 +84,7 @@ def write_summed_dataset(folder: Path) -> None:
 
 
 def read_dataset(folder: Path) -> object:
-    """Every column and picture, and the checksums as `inspect` compares them."""
+    """Every column and image, and the checksums as `inspect` compares them."""
     source = EpisodeSource(folder / "dataset", name="fuzzed")
     source.verify()
     read: list[object] = [source.fps, source.lengths, source.exec_starts, source.subgoal_names]

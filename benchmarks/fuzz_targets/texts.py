@@ -42,7 +42,7 @@ def read_logs(folder: Path) -> object:
 
 
 def _is_shorter(valid: Any, result: Any) -> bool:
-    """A log cut after a whole line is that of a run that was stopped there: it goes on with the missing episodes."""
+    """A log cut after a whole line is that of a run that was stopped there: it continues with the missing episodes."""
     return result[0] == valid[0] and result[1] == valid[1][: len(result[1])]
 
 
@@ -81,7 +81,7 @@ def write_replies(folder: Path) -> None:
 
 
 def read_replies(folder: Path) -> object:
-    """What the predictors and players understand of it; they count what they cannot, and go on."""
+    """What the predictors and players understand of it; they count what they cannot, and continue."""
     replies = {name: read_text(folder / name, "an answer") for name in ANSWERS}
     try:
         return (
@@ -99,7 +99,7 @@ class _Words:
 
 
 def write_rows(folder: Path) -> None:
-    """Two rows, one with a picture and a point, one with a video."""
+    """Two rows, one with an image and a point, one with a video."""
     images = np.random.default_rng(0).integers(0, 255, (12, 32, 32, 3), np.uint8)
     (folder / "a.png").write_bytes(png_bytes(images[0]))
     (folder / "a.mp4").write_bytes(video_bytes(images))
@@ -121,7 +121,7 @@ def _messages(user: str, reply: str) -> list[dict[str, str]]:
 
 
 def read_rows(folder: Path) -> object:
-    """Every question with its pictures."""
+    """Every question with its images."""
     dataset = RowDataset(folder / "simple.jsonl", _Words())
     read: list[object] = [len(dataset), dataset.left_out]
     for i in range(len(dataset)):

@@ -1,4 +1,4 @@
-"""`Backbone`: what a policy asks of a network that turns pictures, words and memory into actions."""
+"""`Backbone`: what a policy asks of a network that turns images, words and memory into actions."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -73,7 +73,7 @@ class Backbone(nn.Module):
         grid: side of a view's token grid.
         horizon, action_dim: of the chunk [h, a] it answers with.
         sample_steps: of an iterative head, unless told otherwise.
-        image_size: side of the square pictures it reads.
+        image_size: side of the square images it reads.
         vocab_size: words it knows; None where it does not say.
         agrees: whether its samples can agree with actions that are already promised (`Batch.overlap`).
         compiles_sampling: whether `sample` runs without waiting for the GPU, so that `compile_sampling` is for it.
@@ -122,11 +122,11 @@ class Backbone(nn.Module):
     """The vision tower: its weights decide what a cache of its tokens holds."""
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Pictures [n, 3, s, s] in [−1, 1] → the tower's tokens [n, grid², d_vision]."""
+        """Images [n, 3, s, s] in [−1, 1] → the tower's tokens [n, grid², d_vision]."""
         raise NotImplementedError
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, grid², d_vision] as memories store them."""
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, grid², d_vision] as memories store them."""
         raise NotImplementedError
 
     def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
@@ -168,7 +168,7 @@ class Backbone(nn.Module):
     def shard_groups(self) -> Sequence[ShardGroup]:
         """What processes that share the weights gather together: by default the tower, and layer by layer the rest.
 
-        All that stands in no group is gathered for a whole pass, in float32.
+        All that is in no group is gathered for a whole pass, in float32.
         """
         tower = set(self.vision.modules())
         layers = [ShardGroup(layer) for layer in stacked_layers(self) if layer not in tower]

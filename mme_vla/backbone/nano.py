@@ -1,4 +1,4 @@
-"""nano: a backbone of under five million parameters. Action tokens read pictures, words and memory; nothing else moves.
+"""nano: a backbone of under five million parameters. Action tokens read images, words and memory; nothing else moves.
 
 The prefix is not processed in layers: each layer of the action column attends to the context as it is. That makes a
 training step on stored tokens cheap enough for a laptop, and leaves memory as many doors as it needs.
@@ -30,7 +30,7 @@ from mme_vla.types import Batch
 
 @dataclass(frozen=True)
 class TowerConfig:
-    """The convolutional vision tower: channels of its stages over 32×32, 16×16 and 8×8 places of a 128-pixel picture.
+    """The convolutional vision tower: channels of its stages over 32×32, 16×16 and 8×8 places of a 128-pixel image.
 
     `blocks_…` are residual blocks. `pretrained` takes the weights that ship with the library.
     """
@@ -217,7 +217,7 @@ class NanoBackbone(Backbone):
             module.compile(**options)
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, 64, d]; no graph is kept while the tower is frozen."""
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, 64, d]; no graph is kept while the tower is frozen."""
         frozen = not any(p.requires_grad for p in self.vision.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
             tokens: Tensor = self.vision(images)
@@ -332,7 +332,7 @@ class NanoBackbone(Backbone):
         return output
 
     def parts(self) -> Mapping[str, str]:
-        """Tower; words and pictures; columns that an integration asked for; all else acts."""
+        """Tower; words and images; columns that an integration asked for; all else acts."""
         return self.PARTS
 
 

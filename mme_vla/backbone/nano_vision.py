@@ -11,7 +11,7 @@ from mme_vla.errors import UserError
 
 WEIGHTS = "assets/nano_vision.safetensors"
 STRIDES = (4, 2, 2)
-"""Of the three stages: a 128-pixel picture becomes 32×32, 16×16 and 8×8 places."""
+"""Of the three stages: a 128-pixel image becomes 32×32, 16×16 and 8×8 places."""
 
 
 class Residual(nn.Module):
@@ -31,9 +31,9 @@ CLASSES = (
     "nothing", "robot", "red cube", "green cube", "blue cube", "other cube", "container", "button", "target", "disc",
     "box", "obstacle", "peg",
 )  # fmt: skip
-"""What a place of a picture may show; a class's number is its place in here."""
+"""What a place of an image may show; a class's number is its place in here."""
 FINE, COARSE = 8, 4
-"""A token stands for 8×8 places that show a class each, and for 4×4 places that have a colour each."""
+"""A token means 8×8 places that show a class each, and for 4×4 places that have a colour each."""
 LOUDNESS = (1.0, 32.0, 320.0, 320.0, 0.1)
 """Factors of presence, share, column, row and colours, which bring them to one size."""
 
@@ -41,14 +41,14 @@ LOUDNESS = (1.0, 32.0, 320.0, 320.0, 0.1)
 WORDS = 2048
 """Entries of the shipped tokenizer."""
 FAINT = 0.02
-"""Tokens full of a class that the picture must show at least for shares to add up to about one."""
+"""Tokens full of a class that the image must show at least for shares to add up to about one."""
 
 
 class ConvTower(nn.Module):
-    """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d] that say what is where.
+    """Images [n, 3, s, s] in [−1, 1] → tokens [n, (s/16)², d] that say what is where.
 
-    A token holds, for each class but the first, its presence; its share of all that the picture shows of the class, as
-    it is and times the column and the row in the picture, each in [−1, 1]; and the colours of its 4×4 places. So a sum
+    A token holds, for each class but the first, its presence; its share of all that the image shows of the class, as
+    it is and times the column and the row in the image, each in [−1, 1]; and the colours of its 4×4 places. So a sum
     of tokens, and pooled ones, say where the things of a class are: their middle.
 
     Args:

@@ -98,7 +98,7 @@ class VisionTower(nn.Module):
         return super().train(False)
 
     def forward(self, images: Tensor, frame_mask: Tensor | None = None, every: int = 0) -> Tensor:
-        """Tokens of pictures [n, 3, s, s]; or of clips [n, t, 3, s, s], of the last of whose frames they are.
+        """Tokens of images [n, 3, s, s]; or of clips [n, t, 3, s, s], of the last of whose frames they are.
 
         Args:
             frame_mask: [n, t] bool, False on frames of clips that are not there. every: see `PastViews`.

@@ -138,7 +138,7 @@ def _log_curves(log: "RerunLog", source: "EpisodeSource", curves: "RecurrenceCur
 
 
 def selection(args: argparse.Namespace) -> None:
-    """Write what a memory remembers along an episode as an mp4, and its last picture as PNG."""
+    """Write what a memory remembers along an episode as an mp4, and its last image as PNG."""
     from mme_vla.cli.inspect import build_memory
     from mme_vla.config.composition import compose
     from mme_vla.data.episodes import EpisodeSource
@@ -157,7 +157,7 @@ def selection(args: argparse.Namespace) -> None:
     path = args.output or Path("outputs/analyse") / f"{source.name}_episode{args.episode}_{args.memory}.mp4"
     write_video(of_one_size(sheets), path, fps=args.fps)
     sheets[-1].save(path.with_suffix(".png"))
-    print(f"wrote {path} ({len(sheets)} pictures) and {path.with_suffix('.png')}")
+    print(f"wrote {path} ({len(sheets)} images) and {path.with_suffix('.png')}")
 
 
 def cost(args: argparse.Namespace) -> None:
@@ -281,13 +281,13 @@ def _parser() -> argparse.ArgumentParser:
         made.add_argument("--stride", type=int, default=16, help="steps between two chunks (default: %(default)s)")
         made.add_argument("--most", type=int, help="chunks of an episode at most (default: all)")
         made.add_argument("--device", default="cpu")
-    made = command(selection, "mp4, with a PNG of its last picture beside it")
+    made = command(selection, "mp4, with a PNG of its last image beside it")
     made.add_argument("--memory", default="tokendrop", help="a memory of configs/memory (default: %(default)s)")
     made.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="its options, as memory.budget=256")
     made.add_argument("--dataset", default="sample")
     made.add_argument("--episode", type=int, default=0)
-    made.add_argument("--every", type=int, default=8, help="steps between two pictures (default: %(default)s)")
-    made.add_argument("--fps", type=int, default=4, help="pictures a second (default: %(default)s)")
+    made.add_argument("--every", type=int, default=8, help="steps between two images (default: %(default)s)")
+    made.add_argument("--fps", type=int, default=4, help="images a second (default: %(default)s)")
     made = command(cost, "CSV")
     made.add_argument("--models", nargs="+", metavar="NAME", help="default: all")
     made.add_argument("--budgets", nargs="*", type=int, help=f"memory budgets; none named: {BUDGETS}")

@@ -48,7 +48,7 @@ def main(cfg: DictConfig) -> None:
             continue
         rank, world = process_rank()
         if rank == 0:
-            source.verify()  # its pictures are all about to be read, and for the last time
+            source.verify()  # its images are all about to be read, and for the last time
         # Beside the folder, and one for each share: processes that take other shares, or train, are welcome.
         with FolderLock(folder.parent, "build of this vision cache", f".{folder.name}.{rank}of{world}.lock"):
             if cfg.rebuild:

@@ -74,7 +74,7 @@ def main(cfg: DictConfig) -> None:
         composition_digest(policy.config),
     )  # fmt: skip
     if not settings.render:
-        logger.warning("render=false: the policy sees black pictures; only the time of the simulation means anything")
+        logger.warning("render=false: the policy sees black images; only the time of the simulation means anything")
     output = default_output(facts) if cfg.output is None else Path(str(cfg.output)).expanduser()
     count = f"{len(jobs)} episode{'s'[len(jobs) == 1 :]}"
     logger.info("%s into %s%s", count, output, f", shared as {shard.index}/{shard.count}" if shard.count > 1 else "")

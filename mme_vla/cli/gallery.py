@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
     from mme_vla.envs.task import Task
 
-COLUMNS = 4  # pictures a row
+COLUMNS = 4  # images a row
 EVERY = 8
-"""Steps between two pictures that are taken; which of them are shown is decided at the end."""
+"""Steps between two images that are taken; which of them are shown is decided at the end."""
 
 
 @dataclass(frozen=True)
@@ -72,11 +72,11 @@ def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
 
 
 def page(entries: Sequence[tuple[str, str, str]]) -> str:
-    """The page's Markdown; each entry is a task, its goal and the name of its picture."""
+    """The page's Markdown; each entry is a task, its goal and the name of its image."""
     lines = [
         "# The sixteen tasks",
         "",
-        "One demonstrated episode each, front camera; pictures with a red border belong to the conditioning video.",
+        "One demonstrated episode each, front camera; images with a red border belong to the conditioning video.",
         "Drawn by `mme-vla gallery`.",
         "",
     ]

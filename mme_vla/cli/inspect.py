@@ -41,7 +41,7 @@ def main(cfg: DictConfig) -> None:
     if cfg.memory is None:
         return None
     image = draw_memory(source, episode, step, build_memory(cfg), cfg.memory.name, Path(cfg.output), console)
-    console.print(f"picture: {image}", highlight=False, soft_wrap=True)
+    console.print(f"image: {image}", highlight=False, soft_wrap=True)
     return None
 
 
@@ -108,7 +108,7 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     _show(table, console)
     subgoals = printable(", ".join(source.subgoal_names)) or "none"
     console.print(
-        f"{frames - video} execution steps to train on · {source.fps:g} frames per second · pictures as "
+        f"{frames - video} execution steps to train on · {source.fps:g} frames per second · images as "
         f"{'video' if source.video_cameras else 'images'} · subgoals: {subgoals}",
         highlight=False,
     )
@@ -120,7 +120,7 @@ def show_dataset(source: "EpisodeSource", console: "Console", most: int = 40) ->
     elif source.root == SAMPLE:
         checksums = "none, this dataset ships with the library"
     else:
-        checksums = "none, so damage to pictures or numbers cannot be noticed"
+        checksums = "none, so damage to images or numbers cannot be noticed"
     console.print(f"checksums: {checksums}", highlight=False)
 
 

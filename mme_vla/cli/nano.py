@@ -64,7 +64,7 @@ def command(cfg: DictConfig) -> None:
 
 
 def run(config: Mapping[str, Any], extra_dirs: Sequence[Path] = ()) -> Path:
-    """All stages of a run; the path of its page; of a folder, where other commands are to go on there.
+    """All stages of a run; the path of its page; of a folder, where other commands are to continue there.
 
     Args:
         config: as configs/nano.yaml. extra_dirs: trees of the user's own models, as `--config-dir` adds them.

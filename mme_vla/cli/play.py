@@ -69,7 +69,7 @@ def _on_the_page(run: PlayRun, participant: str, host: str, port: int) -> None:
 
     serve(Desk(run, participant), host, port)
     played = len(run.episodes) - len(run.todo)
-    log.info("ended · %d of %d episodes played; the same command goes on with the others", played, len(run.episodes))
+    log.info("ended · %d of %d episodes played; the same command continues with the others", played, len(run.episodes))
 
 
 def _by_itself(run: PlayRun, player: Any) -> None:

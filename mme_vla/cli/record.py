@@ -35,7 +35,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
     Where which frames are drawn depends on the demonstration, it is made twice: once without a look, which says what
-    these frames are, and again with pictures of them.
+    these frames are, and again with images of them.
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
@@ -89,7 +89,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
 
 
 def _unseen(task: str, scene: dict[str, Any]) -> "Recording":
-    """The same demonstration without pictures, its steps in memory."""
+    """The same demonstration without images, its steps in memory."""
     from mme_vla.envs.recording.recorder import Recorder
 
     env = make_task(task, render=False, **scene)

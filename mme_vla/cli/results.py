@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> None:
     from rich.console import Console
 
     if args.demo == bool(args.runs):
-        raise UserError("Name files or folders of episode records, or --demo for made-up ones (not both).")
+        raise UserError("Name files or folders of episode records, or --demo for synthetic ones (not both).")
     records = demo_records(DEMO) if args.demo else read_folders(find_records(args.runs))
     protocol = Protocol(
         tuple(args.tasks or tasks_of(records)), args.episodes or _episodes(records, args.split), args.errors,
@@ -186,5 +186,5 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--confidence", type=float, default=0.95, help="level of intervals and tests")
     parser.add_argument("--samples", type=int, default=10_000, help="of the bootstrap")
     parser.add_argument("--seed", type=int, default=0, help="of the bootstrap")
-    parser.add_argument("--demo", action="store_true", help="made-up records with the paper's success rates")
+    parser.add_argument("--demo", action="store_true", help="synthetic records with the paper's success rates")
     return parser

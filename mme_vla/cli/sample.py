@@ -10,7 +10,7 @@ from mme_vla.data.sample import make_sample
 def main() -> None:
     """Run `mme-vla sample`."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("full", type=Path, help="folder with the VideoUnmask file that has a picture for every step")
+    parser.add_argument("full", type=Path, help="folder with the VideoUnmask file that has an image for every step")
     parser.add_argument("thinned", type=Path, help="folder with the thinned files")
     parser.add_argument("--output", type=Path, default=SAMPLE, help="new dataset folder (default: inside the package)")
     arguments = parser.parse_args()

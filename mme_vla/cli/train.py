@@ -27,7 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 @cli("train")
 def main(cfg: DictConfig) -> None:
-    """Train from the beginning, or go on with a run that was interrupted."""
+    """Train from the beginning, or continue with a run that was interrupted."""
     from hydra.core.hydra_config import HydraConfig
 
     begun, named = time.perf_counter(), True
@@ -121,7 +121,7 @@ def _train(
         if holds:
             load_policy(run.checkpoint, policy)
             cast_frozen(policy, config["finetune"].get("frozen_dtype"))
-        line.say(f"going on from {run.checkpoint}")
+        line.say(f"continuing from {run.checkpoint}")
     recipe = {key: value for key, value in config["train"].items() if not isinstance(value, dict)}
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
     if holds:

@@ -233,7 +233,7 @@ class _Printable(logging.Formatter):
 
 
 def _choices(override: Override) -> list[str]:
-    """The overrides that a sweep stands for; the override itself when it is none."""
+    """The overrides that a sweep means; the override itself when it is none."""
     if not override.is_sweep_override():
         return [str(override.input_line)]
     if not override.is_discrete_sweep() or override.value_type == ValueType.GLOB_CHOICE_SWEEP:

@@ -53,7 +53,7 @@ def print_user_errors() -> Iterator[None]:
         except KeyboardInterrupt as stop:
             number = signal.SIGTERM if isinstance(stop, Terminated) else signal.SIGINT
             name = "SIGTERM" if number == signal.SIGTERM else "Ctrl-C"
-            _say(f"Stopped by {name}. What was finished is kept: the same command goes on from there.", "Stopped")
+            _say(f"Stopped by {name}. What was finished is kept: the same command continues from there.", "Stopped")
             raise SystemExit(128 + number) from None
         except Exception as error:
             sentence = disk_trouble(error)

@@ -179,7 +179,7 @@ def _included(file: Path, trees: Sequence[Path]) -> list[Path]:
 
 
 def _group_pages(groups: dict[str, str], requested: set[str], trees: Sequence[Path]) -> list[str]:
-    """Each group with its choices; of those that were asked for (a model stands for its parts) the keys too."""
+    """Each group with its choices; of those that were asked for (a model means its parts) the keys too."""
     if not groups:
         return []
     rows = [

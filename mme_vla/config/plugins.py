@@ -1,6 +1,6 @@
 """Modules of the user's own, whose decorators register memories, tasks, players: imported when the user says so.
 
-What a configuration or command line of the user's names is imported at once. What a checkpoint names is a stranger's
+What a configuration or command line of the user's names is imported at once. What a checkpoint names is an untrusted
 word: it is imported only where the user says `trust_plugins=True` (`--trust-plugins`), or has imported it already.
 """
 

@@ -1,4 +1,4 @@
-"""A section of a configuration as the dataclass it stands for: every key and every kind of value is checked here, once.
+"""A section of a configuration as the dataclass it means: every key and every kind of value is checked here, once.
 
 What a value means (a bound, a choice) is checked by the dataclass itself, in `__post_init__`.
 """

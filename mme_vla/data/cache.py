@@ -2,7 +2,7 @@
 
 `mme-vla cache model=… data=…` builds it; under `torchrun` every process takes its share of the
 episodes. One folder holds the tokens of one dataset under one encoder and one way of pooling; what it was made of
-stands in its `fingerprint.json`, and a folder whose fingerprint is not the expected one is refused, never read and
+is in its `fingerprint.json`, and a folder whose fingerprint is not the expected one is refused, never read and
 never replaced unless asked to.
 """
 

@@ -96,7 +96,7 @@ def build_cache(
     total, left = int(source.lengths[list(mine)].sum()), int(source.lengths[missing].sum())
     with (
         progress(f"vision cache {source.name}", total, total - left, "frames") as advance,
-        # Pictures are decoded in a thread while the ones before them are encoded.
+        # Images are decoded in a thread while the ones before them are encoded.
         closing(ahead(_of_all(source, missing, memory, batch_size), CHUNKS_AHEAD)) as chunks,
     ):
         for episode, of_episode in groupby(chunks, lambda chunk: chunk[0]):
@@ -136,7 +136,7 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Chunk:
-    """A stretch of an episode: how many frames it spans, the pictures to encode, and the scores that came up."""
+    """A stretch of an episode: how many frames it spans, the images to encode, and the scores that came up."""
 
     length: int
     stored_images: np.ndarray
@@ -257,8 +257,8 @@ def ensure_cache(
     coded = source.lossy.get(source.robot.memory_camera)
     if coded is not None and memory.make_scorer() is not None:
         log.warning(
-            "%s: its films are coded as %s, and this memory scores patches by how little they change: what compression "
-            "moves passes for motion. Convert the recordings with lossless films, or choose another memory.",
+            "%s: its videos are coded as %s, and this memory scores patches by how little they change: what "
+            "compression moves passes for motion. Convert the recordings with lossless videos, or choose another memory.",
             source.name, coded,
         )  # fmt: skip
     expected = fingerprint(source, memory.storage, encoder, dtype)

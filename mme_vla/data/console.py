@@ -21,7 +21,7 @@ def quiet_libraries() -> Iterator[None]:
     level, begin = root.level, tqdm.tqdm.__init__
     root.setLevel(max(level, logging.WARNING))
     tqdm.tqdm.__init__ = partialmethod(begin, disable=None)
-    # x264 sums up every film that it closes. LeRobot asks for warnings only, but not until then.
+    # x264 sums up every video that it closes. LeRobot asks for warnings only, but not until then.
     av.logging.set_libav_level(av.logging.ERROR)
     try:
         with SuppressProgressBars():

@@ -91,9 +91,9 @@ _PARTS, _MERGED, _KEYFRAMES = "episodes", "merged", "keyframes.npz"
 
 @dataclass(frozen=True)
 class ConvertOptions:
-    """How pictures are stored.
+    """How images are stored.
 
-    images: `video`, or `png` for lossless pictures inside the tables (about ten times larger).
+    images: `video`, or `png` for lossless images inside the tables (about ten times larger).
     names: of the columns: `robomme`, as in the released datasets, or `lerobot`, as LeRobot's own policies ask for
         (`columns.NAMES`). Readers here take either.
     fps: frames per second; 20 is the simulator's control rate.
@@ -105,7 +105,7 @@ class ConvertOptions:
         them where all episodes have them.
     keyframes: keep the keyframes' depth and camera poses beside the tables too (`mme_vla.data.keyframes`).
     partly: say in two more columns which frames were drawn; `convert` does where an episode was recorded at a choice of
-        frames. The pictures of the others repeat an earlier one, and readers refuse them.
+        frames. The images of the others repeat an earlier one, and readers refuse them.
     """
 
     images: str = "video"
@@ -355,7 +355,7 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
 
 
 def count_frames(path: Path) -> int:
-    """Number of pictures in a video file, counted without decoding."""
+    """Number of images in a video file, counted without decoding."""
     import av
 
     container = av.open(str(path))

@@ -46,7 +46,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
 
     Items are dictionaries of tensors for the processor's `collate`, with the step's goal, subgoals and place beside
     them. They depend on (seed, epoch, index) alone, whatever worker makes them. Memory use does not grow with the data:
-    tables and token caches are memory-mapped, and an item decodes only the pictures of its window, most often the
+    tables and token caches are memory-mapped, and an item decodes only the images of its window, most often the
     current ones.
     """
 

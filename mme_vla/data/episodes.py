@@ -64,7 +64,7 @@ class EpisodeSource:
                 do not mark their conditioning video.
             name: short name, which the validation split and the cache folder use; by default the folder's.
             max_open_videos: most video files kept open.
-            robot: says which columns hold its pictures, states and actions.
+            robot: says which columns hold its images, states and actions.
         """
         self.root = resolve_root(root)
         self.name = name or ("sample" if self.root == SAMPLE else self.root.resolve().name)
@@ -86,7 +86,7 @@ class EpisodeSource:
         videos = {name: column for name, column in self.columns.items() if features[column]["dtype"] == "video"}
         self.video_cameras = tuple(videos)
         self.lossy = {name: coding for name, c in videos.items() if (coding := lossy_coding(features[c]))}
-        """Of cameras whose films lost something when they were made: how they were coded."""
+        """Of cameras whose videos lost something when they were made: how they were coded."""
         self.subgoal_names = tuple(column for column in SUBGOALS if column in columns)
         self._check_tables()
         episodes = read_episode_table(self.root, tuple(dict.fromkeys(videos.values())))
@@ -157,7 +157,7 @@ class EpisodeSource:
         return len(sums.table)
 
     def _check_tables(self) -> None:
-        """The same for what every opening reads anyway; tables that hold pictures are left to `verify`."""
+        """The same for what every opening reads anyway; tables that hold images are left to `verify`."""
         sums = Sums(self.root, remedy=REMEDY.removesuffix("."))
         for name in sums.table:
             if name.startswith("meta/") or (name.startswith("data/") and len(self.video_cameras) == len(self.columns)):
@@ -207,7 +207,7 @@ class EpisodeSource:
     def rendered(self, episode: int, camera: str | None = None) -> np.ndarray:
         """Which frames of an episode show what was seen, bool [t]; by default of the camera that feeds memory.
 
-        All, unless the dataset was recorded at a choice of frames; the pictures of others are placeholders.
+        All, unless the dataset was recorded at a choice of frames; the images of others are placeholders.
         """
         camera = self.robot.memory_camera if camera is None else camera
         start, length = int(self._starts[episode]), int(self.lengths[episode])
@@ -271,7 +271,7 @@ class EpisodeSource:
         return {name: str(_flat(row[name])[0].as_py()).lower() for name in self.subgoal_names}
 
     def frames(self, episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        """Decode pictures [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory."""
+        """Decode images [n, H, W, 3] uint8 of a camera at these frames; by default of the one that feeds memory."""
         indices = np.asarray(indices, np.int64)
         length = int(self.lengths[episode])
         if not len(indices) or indices.min() < 0 or indices.max() >= length:
@@ -357,7 +357,7 @@ class EpisodeSource:
 
 
 class _VideoFiles:
-    """Which file, and from which second on, holds an episode's pictures of one view."""
+    """Which file, and from which second on, holds an episode's images of one view."""
 
     def __init__(self, root: Path, template: object, view: str, episodes: dict[str, Any]) -> None:
         self._root, self._template, self._view = root, template, view

@@ -106,7 +106,7 @@ class RawFrame:
     action: [8] as stored, seven absolute joint targets and the gripper command (−1 close, 1 open).
     is_demo: the step belongs to the conditioning video.
     subgoals: the four texts of `SUBGOALS`, lower-case; after completion the last ones stay, as released.
-    drawn: the cameras that were drawn at this step; of the others `front` and `wrist` repeat an earlier picture (the
+    drawn: the cameras that were drawn at this step; of the others `front` and `wrist` repeat an earlier image (the
         first one, before there is any).
     """
 
@@ -133,7 +133,7 @@ class RawEpisode(StoredValues):
             )
         self.length = len(steps)
         with decoding(f"{ref.file} {ref.group}", "an episode", REMEDY):
-            # A recording at a chosen list of frames has pictures at these alone.
+            # A recording at a chosen list of frames has images at these alone.
             image_keys = () if FRAMES in group else _IMAGE_KEYS.values()
             needed = ("setup/task_goal", *(f"timestep_0/{x}" for x in (*image_keys, *_REQUIRED)))
             missing = [name for name in needed if name not in group]
@@ -204,7 +204,7 @@ class RawEpisode(StoredValues):
         }
 
     def subgoals(self) -> Iterator[dict[str, str]]:
-        """The four texts of every step, as in `RawFrame`, without reading pictures."""
+        """The four texts of every step, as in `RawFrame`, without reading images."""
         subgoals: dict[str, str] = {}
         for k in range(self.length):
             if not subgoals or not self._flag(k, "info/is_completed"):
@@ -289,13 +289,13 @@ class RawEpisode(StoredValues):
         return bool(self._numbers(step, "action/joint_action", 8)[7] > 0)
 
     def front(self, step: int) -> np.ndarray:
-        """The front picture of one step, [H, W, 3] uint8."""
+        """The front image of one step, [H, W, 3] uint8."""
         return self._image(step, "front")
 
     def __iter__(self) -> Iterator[RawFrame]:
         for camera, rendered in self.rendered.items():
             if not rendered.any():
-                raise UserError(f"{self.ref.file} {self.ref.group} has no picture of the camera {camera!r}. {REMEDY}")
+                raise UserError(f"{self.ref.file} {self.ref.group} has no image of the camera {camera!r}. {REMEDY}")
         latest = {camera: self._image(int(rendered.argmax()), camera) for camera, rendered in self.rendered.items()}
         for k, subgoals in enumerate(self.subgoals()):
             fingers = self._numbers(k, "obs/gripper_state", 1)

@@ -28,7 +28,7 @@ FOLDER = "keyframes"
 ENTRY_EVERY = 10
 """A chain of keyframes begins at every so manieth frame, as released."""
 SIDE = 128
-"""Pixels that pictures are kept at, as released."""
+"""Pixels that images are kept at, as released."""
 _ARRAYS = ("frames", "colours", "depth", "intrinsic", "extrinsic", "open", "decisions", "targets", "length")
 
 
@@ -142,7 +142,7 @@ class EpisodeKeyframes:
         """Kept frames [n] as an environment delivers them to a robot that reads depth; see `KeyframeEpisode.observe`.
 
         Returns:
-            Of every camera pictures [n, s, s, 3] uint8, depths [n, s, s, 1] float32 in millimetres, poses [n, 3, 4].
+            Of every camera images [n, s, s, 3] uint8, depths [n, s, s, 1] float32 in millimetres, poses [n, 3, 4].
         """
         arrays = self._read("frames", "colours", "depth", "extrinsic")
         at = np.searchsorted(arrays["frames"], frames)
@@ -203,7 +203,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
         seed: int = 42,
         sampled: bool = True,
     ) -> None:
-        """Find the chains; pictures are not read yet.
+        """Find the chains; images are not read yet.
 
         Args:
             length: k; keyframes of a sample.

@@ -36,7 +36,7 @@ class Columns:
     """Where things are: a column for every camera, and those whose numbers, joined, are the state and the action.
 
     pose: the same of the tool's pose, where actions are differences to it.
-    tables: the columns that are read from the tables; pictures are among them only where they are stored there.
+    tables: the columns that are read from the tables; images are among them only where they are stored there.
     """
 
     cameras: Mapping[str, str]
@@ -72,7 +72,7 @@ def find_columns(root: Path, features: Mapping[str, Mapping[str, Any]], robot: E
     for name, column in cameras.items():
         if features[column]["dtype"] not in ("image", "video"):
             raise UserError(
-                f"{root}: {column} holds {brief(features[column]['dtype'])}, no pictures: it cannot be the camera "
+                f"{root}: {column} holds {brief(features[column]['dtype'])}, no images: it cannot be the camera "
                 f"{name!r} of the robot {robot.name!r} (embodiment.cameras.{name}.key)."
             )
     state = tuple(columns[key] for key in robot.state.key or ("state",))
@@ -176,7 +176,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def lossy_coding(feature: dict[str, Any]) -> str | None:
-    """How a film was coded if something was lost by it, such as `av1 at crf 30`; None where not, or where nothing says.
+    """How a video was coded if something was lost by it, such as `av1 at crf 30`; None where not, or where nothing says.
 
     LeRobot writes what is known under `info`; its default before it wrote the quality was AV1 at crf 30.
     """

@@ -1,4 +1,4 @@
-"""A memory as a picture: a timeline of how much is remembered of each frame, and the frames themselves."""
+"""A memory as an image: a timeline of how much is remembered of each frame, and the frames themselves."""
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -20,7 +20,7 @@ def memory_sheet(
         grid: side of a frame's patch grid. exec_start: first execution frame. title: one line above.
 
     Returns:
-        A picture: remembered patches in colour, the rest of their frames dimmed, the current frame last.
+        An image: remembered patches in colour, the rest of their frames dimmed, the current frame last.
     """
     counts = np.bincount(selected[:, 0], minlength=len(frames))
     remembered = np.flatnonzero(counts)

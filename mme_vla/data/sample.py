@@ -2,7 +2,7 @@
 
 `mme-vla sample FULL_FOLDER THINNED_FOLDER`
 
-Four real demonstrations, one of them with a picture for every step, as a LeRobot v3.0 dataset of under 6 MB. It exists
+Four real demonstrations, one of them with an image for every step, as a LeRobot v3.0 dataset of under 6 MB. It exists
 so that the first command of the README needs nothing else; nobody has to run this again.
 """
 
@@ -14,7 +14,7 @@ from mme_vla.data.hdf5_episode import EpisodeRef
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.errors import UserError
 
-# (folder, task, episode): `full` holds one episode with a picture a step, `thinned` the others.
+# (folder, task, episode): `full` holds one episode with an image a step, `thinned` the others.
 EPISODES = (
     ("full", "VideoUnmask", 6),
     ("thinned", "PatternLock", 8),
@@ -31,16 +31,16 @@ README = """# The embedded sample
 Four RoboMME demonstrations (LeRobot v3.0, 916 frames at the simulator's 20 Hz, videos), written by the official
 recorder with a software rasteriser and converted by `mme-vla sample`.
 
-| episode | task | difficulty | seed | frames | of them video | front picture | wrist picture |
+| episode | task | difficulty | seed | frames | of them video | front image | wrist image |
 | --- | --- | --- | --- | --- | --- | --- | --- |
 | 0 | VideoUnmask 6 | medium | 6600 | 173 | 66 | every step | every 6th step |
 | 1 | PatternLock 8 | easy | 15800 | 148 | 74 | every 4th step | every 4th step |
 | 2 | PickXtimes 8 | easy | 1800 | 332 | 0 | every 30th step | every 30th step |
 | 3 | VideoUnmask 4 | easy | 6400 | 263 | 66 | every 8th step | every 8th step |
 
-**Stale pictures.** To keep the sample small, pictures are stored only at every n-th step (n in the table), at sub-task
+**Stale images.** To keep the sample small, images are stored only at every n-th step (n in the table), at sub-task
 boundaries, at the first and last frame, and where the conditioning video ends. Every other step repeats the last stored
-picture, which is up to n - 1 steps old. States, actions, subgoals and flags are those of every step. So only episode 0
+image, which is up to n - 1 steps old. States, actions, subgoals and flags are those of every step. So only episode 0
 shows motion as it was; use it where motion matters. Results on this sample say nothing about the benchmark.
 
 `configs/data/sample.yaml` holds out episode 3 for validation: another scene of the task of episode 0.

@@ -93,7 +93,7 @@ def open_sources(
 ) -> list[EpisodeSource]:
     """Open the datasets of `data.sources`: folders, `sample`, or mappings with root, name and exec_starts.
 
-    `robot` says which columns hold its pictures, states and actions.
+    `robot` says which columns hold its images, states and actions.
     """
     listed = [entries] if isinstance(entries, (str, Mapping)) else list(entries or [])
     if not listed:

@@ -1,8 +1,8 @@
-"""Pictures out of video files, by time stamp, with PyAV.
+"""Images out of video files, by time stamp, with PyAV.
 
 PyAV brings its own FFmpeg, so the same decoder runs on every machine; torchcodec needs FFmpeg's libraries from the
 system and is not used. Files stay open between calls, as many as the process may hold: samples are drawn from all
-episodes at random, and opening a file takes longer than decoding a picture.
+episodes at random, and opening a file takes longer than decoding an image.
 """
 
 import os
@@ -16,11 +16,11 @@ import numpy as np
 from mme_vla.errors import UserError
 from mme_vla.utils import decoding, files_to_hold
 
-_SEEK_BEYOND = 64  # pictures: a target further ahead than this is sought, a nearer one is decoded up to
+_SEEK_BEYOND = 64  # images: a target further ahead than this is sought, a nearer one is decoded up to
 
 
 class VideoReader:
-    """Decodes single pictures from a bounded number of open files. Safe across `fork`: a child opens its own."""
+    """Decodes single images from a bounded number of open files. Safe across `fork`: a child opens its own."""
 
     def __init__(self, max_open: int = 512) -> None:
         """Open nothing yet.
@@ -34,7 +34,7 @@ class VideoReader:
         self._may_hold: int | None = None
 
     def read(self, path: Path, timestamps: Sequence[float] | np.ndarray, fps: float) -> np.ndarray:
-        """Return the pictures nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for."""
+        """Return the images nearest to `timestamps` (seconds), [n, H, W, 3] uint8, in the order asked for."""
         order = np.argsort(np.asarray(timestamps), kind="stable")
         targets = np.asarray(timestamps, np.float64)[order]
         images: list[np.ndarray] = []
@@ -45,14 +45,14 @@ class VideoReader:
                 for image in self._decode(self._container(path), targets, fps):
                     images.append(image)
                 if len({image.shape for image in images}) > 1:
-                    raise ValueError("its pictures are not of one size")
+                    raise ValueError("its images are not of one size")
         except UserError:
             self._drop(path)
             raise
         if len(images) < len(targets):
             self._drop(path)
             raise UserError(
-                f"{path} holds no picture at {targets[len(images)]:.3f} s ({fps:g} frames per second): the video is "
+                f"{path} holds no image at {targets[len(images)]:.3f} s ({fps:g} frames per second): the video is "
                 "shorter than the table beside it, or damaged. Copy or convert the dataset again."
             )
         out = np.empty((len(targets), *images[0].shape), np.uint8)
@@ -67,7 +67,7 @@ class VideoReader:
         time, image = -np.inf, None
         for target in targets:
             if target > time + near or target < time - tolerance or image is None:
-                # One tick early, so that rounding never lands behind the picture's own key frame.
+                # One tick early, so that rounding never lands behind the image's own key frame.
                 container.seek(max(round(target / stream.time_base) - 1, 0), stream=stream)
                 frames = container.decode(stream)
                 time, image = -np.inf, None

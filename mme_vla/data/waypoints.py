@@ -39,7 +39,7 @@ class Motions:
 def find_motions(rows: np.ndarray, first: int) -> Motions:
     """Take apart a column that holds, for every frame, the target of the motion under way.
 
-    A motion begins where its target first stands in the column: that frame was seen when it had already begun, so it
+    A motion begins where its target first is in the column: that frame was seen when it had already begun, so it
     was decided one frame before. The first one was decided at the first execution frame.
 
     Args:

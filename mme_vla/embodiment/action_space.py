@@ -67,7 +67,7 @@ def words(value: Any, where: str, width: int, default: Sequence[str]) -> tuple[s
 Place = tuple[float, float]
 MOST_WORDS = 400  # characters of an option
 MIDDLE: Place = (0.5, 0.5)
-"""The point of a choice that needs none, as shares of the picture's height and width."""
+"""The point of a choice that needs none, as shares of the image's height and width."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class ActionSpace:
     frames: camera frames an action takes; None where an action is one planned motion of any length.
     choice: numbers of which one is 1 and the others 0, the letters a, b, … of the options that an episode offers; what
         is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1], never by statistics.
-    point: the two numbers that say where in the memory camera's picture: y and x as shares of its height and width.
+    point: the two numbers that say where in the memory camera's image: y and x as shares of its height and width.
     of_pose: numbers that are differences to the tool's pose at their own step, i. e. to the pose's number at the same
         place, angles (from the fourth on) by the shorter way: recorded, predicted and sent as such. Who executes an
         action adds the pose of that moment (`beside_pose`). Past a recording's end they are 0.
@@ -282,7 +282,7 @@ class ActionSpace:
             actions: [..., w] absolute. options: what the episode offers.
 
         Returns:
-            [..., w], the point within the picture; `actions` themselves where nothing is chosen.
+            [..., w], the point within the image; `actions` themselves where nothing is chosen.
         """
         if not self.choice:
             return actions

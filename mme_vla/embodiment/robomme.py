@@ -16,7 +16,7 @@ POSE = ("x", "y", "z", "roll", "pitch", "yaw")
 CAMERAS = ("front", "wrist")
 """What the benchmark's environments show."""
 SIDE = 256
-"""Of the benchmark's pictures, in pixels; points of subgoals and choices are pixels of its front picture."""
+"""Of the benchmark's images, in pixels; points of subgoals and choices are pixels of its front image."""
 LETTERS = "abcdefgh"
 """Of the options that a task can offer."""
 
@@ -62,7 +62,7 @@ def benchmark_action(
         pose: of the tool now [6], for actions that are differences to it.
 
     Returns:
-        The numbers; or `{"choice": "A", "point": [y, x]}`, in pixels of the front picture.
+        The numbers; or `{"choice": "A", "point": [y, x]}`, in pixels of the front image.
     """
     if space.of_pose and pose is not None:
         action = space.beside_pose(action, pose)
@@ -73,10 +73,10 @@ def benchmark_action(
 
 
 def choice_row(letter: str, point: Sequence[float]) -> np.ndarray:
-    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of the picture.
+    """A choice as numbers [10] float32: eight letters of which one is 1, then y and x as shares of the image.
 
     Args:
-        letter: `a` to `h`. point: y and x in pixels of the front picture; empty for a choice that needs none.
+        letter: `a` to `h`. point: y and x in pixels of the front image; empty for a choice that needs none.
     """
     row = np.zeros(len(LETTERS) + 2, np.float32)
     row[LETTERS.index(letter)] = 1

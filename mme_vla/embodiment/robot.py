@@ -32,7 +32,7 @@ class Camera:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """What is delivered beside the pictures: depth [H, W, 1] int16 in millimetres, and the camera's pose [3, 4].
+        """What is delivered beside the images: depth [H, W, 1] int16 in millimetres, and the camera's pose [3, 4].
 
         The pose is from the world to the camera, in OpenCV's axes.
         """
@@ -70,12 +70,12 @@ class Embodiment:
 
     @property
     def readings(self) -> tuple[str, ...]:
-        """What all cameras deliver beside their pictures, by the benchmark's names."""
+        """What all cameras deliver beside their images, by the benchmark's names."""
         return tuple(name for camera in self.cameras for name in camera.readings)
 
     @property
     def augmentations(self) -> tuple[str, ...]:
-        """What is done to each camera's pictures in training."""
+        """What is done to each camera's images in training."""
         return tuple(camera.augment for camera in self.cameras)
 
     @classmethod

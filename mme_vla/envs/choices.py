@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Choice:
-    """One option: its letter (lower case), its text, and the motion it stands for."""
+    """One option: its letter (lower case), its text, and the motion it means."""
 
     label: str
     action: str

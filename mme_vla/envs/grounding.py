@@ -1,4 +1,4 @@
-"""Where objects are in the front picture, and the sub-task texts that say so."""
+"""Where objects are in the front image, and the sub-task texts that say so."""
 
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
@@ -16,7 +16,7 @@ PLACE = "<>"
 
 
 def project(point: np.ndarray) -> np.ndarray:
-    """Pixel [y, x] (float64) of a point [3] of the world in the front picture."""
+    """Pixel [y, x] (float64) of a point [3] of the world in the front image."""
     extrinsic = front_extrinsic().astype(np.float64)
     x, y, depth = INTRINSIC.astype(np.float64) @ (extrinsic @ np.append(np.asarray(point, np.float64), 1.0))
     return np.array([y, x]) / depth
@@ -75,7 +75,7 @@ class Grounding:
 
         Args:
             subtask: whose text is shown now.
-            segmentation: reads the object ids of the present picture; called only when needed. None: no pictures.
+            segmentation: reads the object ids of the present image; called only when needed. None: no images.
         """
         if subtask is not self._subtask:
             self._subtask, self._text = subtask, None

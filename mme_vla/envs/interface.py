@@ -83,7 +83,7 @@ class RoboMMEEnv(gymnasium.Env):
 
     Attributes:
         on_frame: called with every frame that is returned, for recording.
-        drawing: which frames have pictures, from the next call on; None for all. The others' are None in the lists.
+        drawing: which frames have images, from the next call on; None for all. The others' are None in the lists.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -191,17 +191,17 @@ class RoboMMEEnv(gymnasium.Env):
     def restore_state(self, state: EpisodeState) -> tuple[Any, dict[str, Any]]:
         """Go on from a saved state of the same episode, whichever environment it is of; as if nothing had been between.
 
-        The episode is played again, without pictures but of the present frame and where a text needs a pixel. Nothing
+        The episode is played again, without images but of the present frame and where a text needs a pixel. Nothing
         of it reaches `on_frame`.
 
         Returns:
-            Observation lists and info, as the last `reset` or `step` before `save_state` returned them, pictures of the
+            Observation lists and info, as the last `reset` or `step` before `save_state` returned them, images of the
             newest frame alone.
         """
         return play_again(self, state)
 
     def render(self) -> np.ndarray | None:
-        """The newest front picture [256, 256, 3]; None if it was not drawn, or before the first reset."""
+        """The newest front image [256, 256, 3]; None if it was not drawn, or before the first reset."""
         self._open_task()
         return None if self._run is None else self._run.newest.get("front_rgb")
 
@@ -274,7 +274,7 @@ class RoboMMEEnv(gymnasium.Env):
         self._evaluate()
         try:
             subtask.run(self._require_run().control.demonstrator)
-        except PlanningError as error:  # the benchmark goes on with the rest of the video
+        except PlanningError as error:  # the benchmark continues with the rest of the video
             log.info("conditioning video: %r was not carried out: %s", subtask.text, error)
         self._evaluate()
 

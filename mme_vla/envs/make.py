@@ -110,7 +110,7 @@ def check_names(task: str, env: str, action_space: str, difficulty: str | None, 
 
 
 def require_simulator() -> None:
-    """Refuse to go on without the simulator's packages."""
+    """Refuse to continue without the simulator's packages."""
     if find_spec("mani_skill") is None:
         raise missing_extra("The simulator", "sim")
 

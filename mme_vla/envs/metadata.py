@@ -106,10 +106,10 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
 FURTHER, FURTHER_EPISODES = "further", 100
-"""Episodes that go on where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
+"""Episodes that continue where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
 _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
-"""Episodes a task has in each of these; `further_hard` are the hard ones as the same rule goes on, and so forth."""
+"""Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
 _COUNTS = {**SPLITS, MORE: 900, **FURTHER_SPLITS}
 FOLDER_VARIABLE = "MME_VLA_ROBOMME_METADATA"
 _TEST_SEED = (500_000, 10_000)

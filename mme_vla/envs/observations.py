@@ -1,4 +1,4 @@
-"""What a policy sees of a task: robot state and camera pictures of one frame, and only what was asked for.
+"""What a policy sees of a task: robot state and camera images of one frame, and only what was asked for.
 
 A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
 """
@@ -60,7 +60,7 @@ class Include:
 
 
 class AngleTrack:
-    """Roll, pitch and yaw that go on where the previous frame's left off instead of jumping by a full turn.
+    """Roll, pitch and yaw that continue where the previous frame's left off instead of jumping by a full turn.
 
     Extrinsic x-y-z angles; the quaternion's sign follows the previous frame's, and each angle's change is folded into
     [-π, π) and added, so that values may leave ±π.
@@ -94,7 +94,7 @@ class Observer:
     Args:
         task: the simulated task.
         include: what the frames hold beyond the standard keys.
-        render: take pictures; without it frames hold the robot's state only.
+        render: take images; without it frames hold the robot's state only.
     """
 
     def __init__(self, task: "Task", include: Include, render: bool) -> None:
@@ -119,7 +119,7 @@ class Observer:
         """The present moment; `info` is what the task has just evaluated.
 
         Args:
-            cameras: those that take a picture; the others' are None.
+            cameras: those that take an image; the others' are None.
         """
         self._taken = set()
         qpos = self.task.qpos
@@ -146,7 +146,7 @@ class Observer:
         return frame
 
     def segmentation(self) -> np.ndarray:
-        """Object ids [256, 256] of the present front picture, which is taken if the frame has none."""
+        """Object ids [256, 256] of the present front image, which is taken if the frame has none."""
         if "front" not in self._taken:
             self._render_cameras(["front"])
         return self._read(SENSORS["front"], segmentation=True)["segmentation"][..., 0]

@@ -56,7 +56,7 @@ class OfficialEnv:
         return observation, reward, terminated, truncated, _flat(info)
 
     def render(self) -> np.ndarray | None:
-        """The newest front picture [256, 256, 3], or None before the first reset."""
+        """The newest front image [256, 256, 3], or None before the first reset."""
         self._open()
         return self._newest
 

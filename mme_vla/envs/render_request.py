@@ -1,4 +1,4 @@
-"""Which pictures are taken: a control step costs milliseconds, a picture of it some fifty."""
+"""Which images are taken: a control step costs milliseconds, an image of it some fifty."""
 
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field

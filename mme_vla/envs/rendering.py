@@ -1,9 +1,9 @@
 """The renderer, kept for the life of the process.
 
 ManiSkill makes a render system for each scene. All of them share SAPIEN's engine, in which shaders and pipelines are
-compiled when the first picture is taken, half a second where software renders; it goes with the last render system
+compiled when the first image is taken, half a second where software renders; it goes with the last render system
 that holds it. An episode that closes its scene before the next one opens so pays for it again. One more render system,
-never released, keeps it; scenes stay separate, and pictures the same.
+never released, keeps it; scenes stay separate, and images the same.
 
 It also keeps one Vulkan device from being opened per environment, of which NVIDIA's driver bears some thirty only.
 """
@@ -89,7 +89,7 @@ def without_table(source: str) -> str:
 def lean_shaders() -> "ShaderConfig | None":
     """Shaders for cameras in scenes without an environment map; None where the installed ones are not as expected.
 
-    Sets the formats of pictures, which ManiSkill sets by the pack's name, so ask right before the cameras are made.
+    Sets the formats of images, which ManiSkill sets by the pack's name, so ask right before the cameras are made.
     """
     from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
 
@@ -192,7 +192,7 @@ def keep_renderer(device: "sapien.Device") -> None:
 
 
 def renderer_works() -> bool:
-    """Whether each renderer that is kept still takes pictures; true where none is kept.
+    """Whether each renderer that is kept still takes images; true where none is kept.
 
     A lost device or memory that ran out leaves a renderer behind that fails from then on, whatever is asked of it: only
     another process helps.

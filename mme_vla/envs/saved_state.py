@@ -1,9 +1,9 @@
 """`EpisodeState`: where a running episode stands, kept as what led there.
 
 A simulator's positions and velocities are not all of its state: contacts, the solver's last solution and the script's
-own memory belong to it, and a state without them goes on otherwise. But the same scene and actions always give the
+own memory belong to it, and a state without them continues otherwise. But the same scene and actions always give the
 same episode, to the last bit on CPUs of one maker. So a state is its scene and its actions; restoring it plays them
-again without pictures, at some two milliseconds a control step.
+again without images, at some two milliseconds a control step.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ class EpisodeState:
     actions: tuple[Any, ...]
 
     def check(self, other: "EpisodeState") -> None:
-        """Make sure that an environment whose own state is `other` can go on from here."""
+        """Make sure that an environment whose own state is `other` can continue from here."""
         places = [field.name for field in fields(self) if field.name not in ("options", "actions")]
         differ = [name for name in places if getattr(self, name) != getattr(other, name)]
         if differ:

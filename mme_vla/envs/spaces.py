@@ -121,7 +121,7 @@ class Waypoint(ActionSpace):
 
 
 class MultiChoice(ActionSpace):
-    """One of the task's options by its letter, with a pixel [y, x] of the front picture where it needs an object."""
+    """One of the task's options by its letter, with a pixel [y, x] of the front image where it needs an object."""
 
     name = "multi_choice"
 

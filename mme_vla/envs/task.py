@@ -29,8 +29,8 @@ class Task(Stage):
         recovery: `z` or `xy` draws the pick that a recovery demonstration fails once, and how.
         stress: how far dials are turned (`variants.DIALS`); at 0 the scene is the benchmark's.
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
-        second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
-        robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's own words for `recovery`.
+        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
+        does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's own words for `recovery`.
 
     Raises:
         UserError: an unknown difficulty or recovery mode, a negative seed, or a dial that the task does not have.

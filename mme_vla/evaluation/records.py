@@ -42,7 +42,7 @@ class EpisodeKey(NamedTuple):
 class Seconds:
     """Where an episode's wall time went.
 
-    sim: building and stepping the environment, without its pictures. render: those (0 where they cannot be told apart).
+    sim: building and stepping the environment, without its images. render: those (0 where they cannot be told apart).
     policy: the episode's share of the policy's batches. total: from its beginning to its end, waiting included.
     """
 

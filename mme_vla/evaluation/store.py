@@ -38,7 +38,7 @@ from mme_vla.utils import (
 RUN_FILE = "run.json"
 INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base_url", "timeout", "retries", "backoff",
                "requests_per_minute", "input_price", "output_price")  # fmt: skip
-"""Options of a model that predicts or plays which do not decide what it says, and may differ when a run goes on."""
+"""Options of a model that predicts or plays which do not decide what it says, and may differ when a run continues."""
 
 
 def fingerprint(settings: Mapping[str, Any]) -> str:
@@ -47,7 +47,7 @@ def fingerprint(settings: Mapping[str, Any]) -> str:
 
 
 def claim_run(folder: Path, settings: Mapping[str, Any], notes: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Begin a run in `folder`, or go on with the one that is there.
+    """Begin a run in `folder`, or continue with the one that is there.
 
     Args:
         settings: plain values that decide the outcomes: checkpoint, seeds, split, step limit, action space, …
@@ -88,7 +88,7 @@ def read_run(folder: Path) -> dict[str, Any]:
             "it are of this run."
         )
     if content["fingerprint"] != fingerprint(content["settings"]):
-        raise UserError(f"{path} was changed by hand: its settings do not have its fingerprint.")
+        raise UserError(f"{path} was changed manually: its settings do not have its fingerprint.")
     return verified(content, str(path))
 
 
@@ -309,7 +309,7 @@ class Claims:
 
     @contextmanager
     def _locked(self) -> Iterator[int]:
-        """Hold the file, and know all that stands in it."""
+        """Hold the file, and know all that is in it."""
         file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -345,7 +345,7 @@ class Claims:
 
 
 def _is_locked(path: Path) -> bool:
-    """Whether a process writes to a records file. Where the disk knows no locks, whoever began is taken to go on."""
+    """Whether a process writes to a records file. Where the disk knows no locks, whoever began is taken to continue."""
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Memory as film: one vector, joined to the condition that scales and shifts every block of a denoising network."""
+"""Memory as video: one vector, joined to the condition that scales and shifts every block of a denoising network."""
 
 from typing import Any
 

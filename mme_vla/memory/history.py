@@ -190,7 +190,7 @@ class OnlineHistory(History):
         """Of the next `count` frames, which (offsets from 0) have to be encoded before `append`.
 
         Args:
-            rendered: offsets of those that have a picture; by default all.
+            rendered: offsets of those that have an image; by default all.
         """
         stored = self.spec.stored_frames(self._length + count)
         stored = stored[stored >= self._length] - self._length
@@ -206,8 +206,8 @@ class OnlineHistory(History):
         """Add frames in order.
 
         Args:
-            frames: pictures [n, H, W, 3] uint8. tokens: of the wanted ones, [wanted, patches, d_vision].
-            rendered: offsets [n] of the pictures among the frames, of which there are `count`; by default they are all.
+            frames: images [n, H, W, 3] uint8. tokens: of the wanted ones, [wanted, patches, d_vision].
+            rendered: offsets [n] of the images among the frames, of which there are `count`; by default they are all.
         """
         count = len(frames) if count is None else count
         offsets, numbers = self.to_encode(count, rendered), np.arange(count) if rendered is None else rendered
@@ -238,13 +238,13 @@ class OnlineHistory(History):
         rendered: np.ndarray | None = None,
         count: int | None = None,
     ) -> None:
-        """Add frames in order, through `encode`: pictures [n, H, W, 3] → tokens [n, patches, d_vision]."""
+        """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches, d_vision]."""
         offsets = self.to_encode(len(frames) if count is None else count, rendered)
         places = offsets if rendered is None else np.searchsorted(rendered, offsets)
         self.append(frames, encode(frames[places]), rendered, count)
 
     def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
-        """Show the scorer the next frames that have a picture; `numbers` says which they are."""
+        """Show the scorer the next frames that have an image; `numbers` says which they are."""
         if self._scorer is None:
             return
         numbered = zip((numbers + self._length).tolist(), frames, strict=True)
@@ -292,9 +292,9 @@ class PromptConditionedHistory(History):
 
 
 class LazyHistory(OnlineHistory):
-    """Frames wait as pictures in the CPU's memory; their tokens stay on the device that encoded them.
+    """Frames wait as images in the CPU's memory; their tokens stay on the device that encoded them.
 
-    A recurrent memory reads one frame in sixteen: the vision tower then runs sixteen times less. A picture of 256×256
+    A recurrent memory reads one frame in sixteen: the vision tower then runs sixteen times less. An image of 256×256
     takes 192 KiB, less than its 8×8 tokens at full width would on the GPU.
 
     Args:

@@ -16,7 +16,7 @@ from mme_vla.speed.recompute import Recompute, checkpoint_options
 
 @dataclass(frozen=True)
 class Standard:
-    """Mean and standard deviation of each colour, for pictures in [0, 1]."""
+    """Mean and standard deviation of each colour, for images in [0, 1]."""
 
     mean: Sequence[float]
     std: Sequence[float]
@@ -34,7 +34,7 @@ HALF = Standard((0.5, 0.5, 0.5), (0.5, 0.5, 0.5))
 
 
 class FusedVision(nn.Module):
-    """Two towers on the same picture; a token is [DINOv2 | SigLIP] of one patch, row-major.
+    """Two towers on the same image; a token is [DINOv2 | SigLIP] of one patch, row-major.
 
     Each gives what stands after its block before the last, without a norm: the last block, the final norm and SigLIP's
     pooling head are part of the published weights, and no action reads them.
@@ -49,7 +49,7 @@ class FusedVision(nn.Module):
         self.dino_standard = dino_standard
 
     def standardised(self, images: Tensor) -> Tensor:
-        """Pictures [..., 3, s, s] in [−1, 1] → six channels [..., 6, s, s]: DINOv2's, then SigLIP's."""
+        """Images [..., 3, s, s] in [−1, 1] → six channels [..., 6, s, s]: DINOv2's, then SigLIP's."""
         pixels = (images + 1) / 2
         return torch.cat([self.dino_standard.apply(pixels), HALF.apply(pixels)], dim=-3)
 
@@ -98,7 +98,7 @@ class Projector(nn.Module):
 
 
 class Prismatic(nn.Module):
-    """Pictures become tokens of a Llama, which reads them among words.
+    """Images become tokens of a Llama, which reads them among words.
 
     It holds all that the published weights hold; the language head and the ends of the towers are read by no action.
     """
@@ -114,7 +114,7 @@ class Prismatic(nn.Module):
         self.language.model.rotary_emb = Angles(llama.width // llama.num_heads)
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Pictures [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision]; no graph where nothing learns."""
+        """Images [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision]; no graph where nothing learns."""
         frozen = not any(p.requires_grad for p in self.vision.parameters())
         with torch.set_grad_enabled(torch.is_grad_enabled() and not frozen):
             return self.vision(self.vision.standardised(images))

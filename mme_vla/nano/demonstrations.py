@@ -72,11 +72,11 @@ CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode of a task, with pictures of some frames.
+    """One episode of a task, with images of some frames.
 
     length: frames. exec_start: the first execution frame. states: [length, 8] float32. motions: its decisions.
     subgoals: `simple` and `grounded` → what the simulator says at each decision, as it says it at test
-    time. pictures: camera → frame → [256, 256, 3] uint8.
+    time. images: camera → frame → [256, 256, 3] uint8.
     """
 
     task: str
@@ -103,7 +103,7 @@ class Demonstration:
 
     @classmethod
     def load(cls, path: Path, images: bool = True) -> "Demonstration":
-        """Read what `save` wrote, or what of it is no picture."""
+        """Read what `save` wrote, or what of it is no image."""
         with np.load(path) as file:
             loaded_images = {
                 camera: dict(zip(file[f"{camera}_frames"].tolist(), file[f"{camera}_pictures"], strict=True))
@@ -299,7 +299,7 @@ def _subgoal_texts(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
 
 
 def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:
-    """The current picture of each of these cameras."""
+    """The current image of each of these cameras."""
     if not cameras:
         return []
     env.scene.update_render(update_sensors=True, update_human_render_cameras=False)

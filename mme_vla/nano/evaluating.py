@@ -112,10 +112,10 @@ def run_episodes(
 
 
 def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord]) -> list[Path]:
-    """Films of the first success and the first failure of these records, run once more with every frame drawn.
+    """Videos of the first success and the first failure of these records, run once more with every frame drawn.
 
     Args:
-        folder: of the films; what it has is not drawn again.
+        folder: of the videos; what it has is not drawn again.
     """
     for won in (True, False):
         record = next((record for record in records if record.success is won), None)

@@ -60,7 +60,7 @@ def build(config: Mapping[str, Any]) -> MMEPolicy:
     """A policy with fresh weights but for its tower, which does not learn."""
     policy = mme_of(build_from_config(OmegaConf.create(dict(config))), "nanoMME")
     if policy.augment:
-        raise UserError("policy.augment=true changes pictures, and nano policies learn from tokens: set it to false.")
+        raise UserError("policy.augment=true changes images, and nano policies learn from tokens: set it to false.")
     apply_finetuning(policy, freeze_vision=True)
     return policy
 
@@ -72,7 +72,7 @@ def train(
     files: Sequence[Path],
     learning: Mapping[str, Any],
 ) -> Path:
-    """Train a policy in `folder`, or go on with it; the last checkpoint.
+    """Train a policy in `folder`, or continue with it; the last checkpoint.
 
     Args:
         config: as `compose_policy` gives it. settings, learning: the sections `train` and `learning`.

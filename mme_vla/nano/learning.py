@@ -66,7 +66,7 @@ class Decisions(Dataset[int]):
     """The decisions of demonstrations as a policy learns them, all in memory: an item is a row, see `collate`.
 
     batch: every decision, or every so many where the robot executes more motions of a chunk than one; the tokens of
-        the current pictures (`Batch.view_tokens`) stand in place of the pictures.
+        the current images (`Batch.view_tokens`) stand in place of the images.
     far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
         an item `often` times.
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
@@ -88,7 +88,7 @@ class Decisions(Dataset[int]):
         noise: float = 0.0,
         blur: float = 0.0,
     ) -> "Decisions":
-        """Make all tokens, of one demonstration after the other: their pictures together are gigabytes.
+        """Make all tokens, of one demonstration after the other: their images together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
@@ -158,7 +158,7 @@ class Decisions(Dataset[int]):
 
     @cached_property
     def _token_std(self) -> dict[str, Tensor]:
-        """The standard deviation of each number of a token, of the present pictures and of those remembered."""
+        """The standard deviation of each number of a token, of the present images and of those remembered."""
         features = {"views": self.batch.view_tokens, "past": None}
         if self.batch.history is not None:
             features["past"] = self.batch.history.features[self.batch.history.mask]

@@ -57,7 +57,7 @@ def write_page(
         "",
         f"![Loss on held-out demonstrations]({CURVES})",
         "",
-        *[f"- film: [{video.stem}](<{video.relative_to(folder)}>)" for video in videos],
+        *[f"- video: [{video.stem}](<{video.relative_to(folder)}>)" for video in videos],
         "",
     ]
     with write_atomically(folder / PAGE) as draft:

@@ -1,7 +1,7 @@
 """Pretraining of the nano backbone's vision tower: which object is where, and what colour things have.
 
 The tower says, for each of the 8×8 places under a token, which class of objects is seen there (the labels of
-`scenes.py`), and gives back a coarse picture.
+`scenes.py`), and gives back a coarse image.
 """
 
 import logging
@@ -26,14 +26,14 @@ from mme_vla.processing.tokenizer import SAMPLE, Tokenizer
 from mme_vla.utils import write_atomically
 
 logger = logging.getLogger(__name__)
-SHIFT = 8  # pixels that a picture is moved by at most
+SHIFT = 8  # pixels that an image is moved by at most
 NAMED = {"red": "red cube", "green": "green cube", "blue": "blue cube"}
 """Words of goals, and the class of objects that each names."""
 
 
 @dataclass(frozen=True)
 class PretrainSettings:
-    """steps: updates. batch_size: pictures each. lr: peak learning rate, on a cosine to zero after a short warm-up.
+    """steps: updates. batch_size: images each. lr: peak learning rate, on a cosine to zero after a short warm-up.
 
     held_out: share of the scenes that only measure. save_every: updates between two drafts. seed: of everything random.
     """
@@ -47,7 +47,7 @@ class PretrainSettings:
 
 
 def as_images(tower: ConvTower, images: Tensor, grid: int) -> tuple[Tensor, Tensor]:
-    """What a tower says of pictures [n, 3, s, s]: class scores [n, classes, 64, 64] and colours [n, 3, 32, 32]."""
+    """What a tower says of images [n, 3, s, s]: class scores [n, classes, 64, 64] and colours [n, 3, 32, 32]."""
     scores, colours = tower.answers(images)
     return _joined(scores, grid, FINE), _joined(colours.unflatten(-1, (3, -1)), grid, COARSE)
 
@@ -80,7 +80,7 @@ def class_words() -> Tensor:
 
 
 def load_scenes(files: Sequence[Path]) -> tuple[Tensor, Tensor]:
-    """Pictures [n, 3, s, s] uint8 and labels [n, 64, 64] uint8 of recorded scenes."""
+    """Images [n, 3, s, s] uint8 and labels [n, 64, 64] uint8 of recorded scenes."""
     if not files:
         raise UserError("There is no recorded scene to learn from.")
     images, labels = [], []
@@ -114,7 +114,7 @@ def tower_loss(tower: ConvTower, grid: int, images: Tensor, labels: Tensor, weig
 
 
 def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, settings: PretrainSettings) -> Path:
-    """Train a tower on recorded scenes; a run that was interrupted goes on. The path of its weights.
+    """Train a tower on recorded scenes; a run that was interrupted continues. The path of its weights.
 
     Args:
         tower: with fresh weights. grid: side of its token grid. files: scenes. folder: of the run.

@@ -1,6 +1,6 @@
-"""Pictures of the sixteen tasks with what is where in them: what the small vision tower learns to see from.
+"""Images of the sixteen tasks with what is where in them: what the small vision tower learns to see from.
 
-Nothing is simulated: a scene is built once, and for each picture its objects, the arm and the gripper are put somewhere
+Nothing is simulated: a scene is built once, and for each image its objects, the arm and the gripper are put somewhere
 else. Segmentation says which object every pixel shows, so labels cost nothing.
 """
 
@@ -22,20 +22,20 @@ _BY_NAME = {
     "board": "box", "box": "box", "obstacle": "obstacle", "peg": "peg",
 }  # fmt: skip
 LABEL_SIDE = 64
-"""Labels have a number for each of 64×64 places of a picture."""
+"""Labels have a number for each of 64×64 places of an image."""
 _CUBES = ("red cube", "green cube", "blue cube")
 _CLEAR_COLOUR = 60  # of 255: how far a cube's strongest channel stands out where it has one
 
 
 def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Pictures of one scene, differently arranged each time.
+    """Images of one scene, differently arranged each time.
 
     Args:
-        count: arrangements; each gives a picture of the front camera and one of the wrist's.
-        size: side of the pictures.
+        count: arrangements; each gives an image of the front camera and one of the wrist's.
+        size: side of the images.
 
     Returns:
-        pictures [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.
+        images [2·count, size, size, 3] uint8, and labels [2·count, 64, 64] uint8: places in `CLASSES`.
     """
     from mme_vla.envs.robot.kinematics import Arm
 
@@ -119,7 +119,7 @@ def _home_qpos(env: "Task") -> np.ndarray:
 
 
 def _take(env: "Task") -> list[tuple[np.ndarray, np.ndarray]]:
-    """Picture [H, W, 3] and segmentation [H, W] of both cameras."""
+    """Image [H, W, 3] and segmentation [H, W] of both cameras."""
     env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
     taken = []
     for camera in ("base_camera", "hand_camera"):

@@ -50,7 +50,7 @@ class Reveal:
 class Decision:
     """One choice and what came of it.
 
-    choice: letter. action: its text. point: pixel [y, x] of the front picture, None where it needs none.
+    choice: letter. action: its text. point: pixel [y, x] of the front image, None where it needs none.
     frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
     seconds: from the moment the frames were there to the choice. note: whatever the player adds.
     """
@@ -70,7 +70,7 @@ class ChoiceSession:
     Args:
         env: with `reset` and `step` of `mme_vla.envs` (or the official package's), in that action space.
         episode: which one it is.
-        pictures: whether the player looks at them; without, the environment need not render, and frames are black.
+        images: whether the player looks at them; without, the environment need not render, and frames are black.
         max_choices: choices after which the episode counts as timed out; a choice may move nothing at all, so the
             environment's own limit on steps might never be reached.
         clock: seconds that only grow.
@@ -115,7 +115,7 @@ class ChoiceSession:
         self._simulated += self._clock() - started
         frames = self._frames(observation)
         if not frames:
-            raise UserError("The environment shows no pictures: make it with render=True.")
+            raise UserError("The environment shows no images: make it with render=True.")
         if "available_multi_choices" not in info:
             raise UserError('The environment offers no options: make it with action_space="multi_choice".')
         title = "Conditioning video" if len(frames) > 1 else "The scene"
@@ -192,9 +192,9 @@ class ChoiceSession:
 
     @property
     def frame(self) -> np.ndarray:
-        """The present front picture [256, 256, 3]: points are pixels of it."""
+        """The present front image [256, 256, 3]: points are pixels of it."""
         if not self.reveals:
-            raise UserError("There is no picture before start().")
+            raise UserError("There is no image before start().")
         return next(reveal.frames[-1] for reveal in reversed(self.reveals) if len(reveal.frames))
 
     @property
@@ -242,7 +242,7 @@ class ChoiceSession:
 
 
 def checked_point(point: Any, option: Option) -> tuple[float, float]:
-    """A pixel (row, column) of the front picture."""
+    """A pixel (row, column) of the front image."""
     what = f"Option {option.label!r} ({option.action})"
     if point is None or (isinstance(point, Sequence) and not len(point)):
         raise UserError(f"{what} needs a point: the pixel [row, column] of the object meant.")
@@ -255,6 +255,6 @@ def checked_point(point: Any, option: Option) -> tuple[float, float]:
     y, x = (float(value) for value in values)
     if not (0 <= y < SIDE and 0 <= x < SIDE):
         raise UserError(
-            f"The point ({y:g}, {x:g}) lies outside of the picture: rows and columns go from 0 to {SIDE - 1}."
+            f"The point ({y:g}, {x:g}) lies outside of the image: rows and columns go from 0 to {SIDE - 1}."
         )
     return y, x

@@ -13,7 +13,7 @@ from mme_vla.registry import PLAYERS
 
 
 class NoChoiceError(Exception):
-    """A player does not go on. outcome: what the episode counts as; the message says why."""
+    """A player does not continue. outcome: what the episode counts as; the message says why."""
 
     def __init__(self, outcome: str, reason: str) -> None:
         super().__init__(reason)
@@ -25,7 +25,7 @@ class Player:
 
     Attributes:
         model: what its records are filed under.
-        looks: whether it needs pictures; for one that does not, nothing is rendered, which is much faster.
+        looks: whether it needs images; for one that does not, nothing is rendered, which is much faster.
     """
 
     model = "player"
@@ -38,7 +38,7 @@ class Player:
         """The next action {"choice", "point"} and a note to keep with it.
 
         Raises:
-            NoChoiceError: the player does not go on.
+            NoChoiceError: the player does not continue.
         """
         raise NotImplementedError
 

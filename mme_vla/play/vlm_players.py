@@ -24,11 +24,11 @@ from mme_vla.utils import parse_json
 _OBJECT = re.compile(r"\{[^{}]*\}")
 
 SYSTEM = """You decide what a robot arm does next. A task is described in words; it cannot be solved from the present \
-picture alone, but from what the clips have shown so far. All pictures come from one fixed camera in front of the robot.
+image alone, but from what the clips have shown so far. All images come from one fixed camera in front of the robot.
 
 Each time you get the frames since your last decision and choose exactly one option. A planner then carries it out \
 without fault, so only your choice counts. Options marked [point] need the place of the object you mean in the present \
-picture: the candidate nearest to it is taken.
+image: the candidate nearest to it is taken.
 
 A point is [row, column], both from 0 (top, left) to 1000 (bottom, right).
 End your answer with one JSON object and nothing after it: {"choice": "<letter>", "point": [row, column]}. \
@@ -48,7 +48,7 @@ def choice_text(decision: Decision) -> str:
 
 
 def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[str, bool]], complaint: str = "") -> str:
-    """One question that tells the whole episode, `<video>` and `<image>` where pictures go.
+    """One question that tells the whole episode, `<video>` and `<image>` where images go.
 
     Args:
         goal: the task in words.
@@ -57,7 +57,7 @@ def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[st
     """
     lines = [f"The task: {goal}"]
     lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
-    lines += [f"The present picture: {IMAGE}", "Options:", option_list(options)]
+    lines += [f"The present image: {IMAGE}", "Options:", option_list(options)]
     if complaint:
         lines.append(complaint)
     lines.append("What next?")
@@ -67,7 +67,7 @@ def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[st
 def opening(goal: str, options: Sequence[Option], video: bool) -> str:
     """The first question of a conversation."""
     introduction = (
-        "The video comes before you act; the picture is the present one." if video else "This is the present picture."
+        "The video comes before you act; the image is the present one." if video else "This is the present image."
     )
     return f"The task: {goal}\n{introduction}\nOptions:\n{option_list(options)}\nWhat next?"
 
@@ -75,9 +75,7 @@ def opening(goal: str, options: Sequence[Option], video: bool) -> str:
 def following(decision: Decision, options: Sequence[Option], changed: bool) -> str:
     """A later question of a conversation."""
     description = (
-        "the video shows it, the picture is the present one"
-        if changed
-        else "nothing moved; this is the present picture"
+        "the video shows it, the image is the present one" if changed else "nothing moved; this is the present image"
     )
     return f"You chose {choice_text(decision)}; {description}.\nOptions:\n{option_list(options)}\nWhat next?"
 
@@ -193,7 +191,7 @@ class ModelPlayer(Player):
 
 @PLAYERS.register("qwenvl")
 class QwenPlayer(ModelPlayer):
-    """Reads the whole episode anew at each decision: a clip for each motion, and the present picture.
+    """Reads the whole episode anew at each decision: a clip for each motion, and the present image.
 
     Args:
         model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
@@ -298,7 +296,7 @@ class GeminiPlayer(ModelPlayer):
 
 @PLAYERS.register("openai")
 class OpenAIPlayer(GeminiPlayer):
-    """The same conversation with any endpoint that speaks OpenAI's chat completions; videos are shown as pictures.
+    """The same conversation with any endpoint that speaks OpenAI's chat completions; videos are shown as images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
     settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.

@@ -28,7 +28,7 @@ HEADERS = (
 
 
 def require_page() -> None:
-    """Refuse to go on without the packages the page needs."""
+    """Refuse to continue without the packages the page needs."""
     if find_spec("starlette") is None or find_spec("uvicorn") is None:
         raise missing_extra("The page", "play")
 

@@ -70,7 +70,7 @@ class Policy(Saved):
         return {}
 
     def image_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """The random numbers that change the pictures of `count` training samples, if any; beside `loss_draws`'s."""
+        """The random numbers that change the images of `count` training samples, if any; beside `loss_draws`'s."""
         return {}
 
     def forward(self, batch: Any, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:

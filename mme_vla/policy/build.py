@@ -56,7 +56,7 @@ def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) ->
     if memory.past_view_spec is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
-            f"and the tower of the backbone {config['backbone']['name']!r} sees one picture at a time. Take another "
+            f"and the tower of the backbone {config['backbone']['name']!r} sees one image at a time. Take another "
             "memory, a backbone that hosts `past` (pi05), or past states alone (memory.views=false)."
         )
 

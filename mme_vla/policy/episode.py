@@ -81,7 +81,7 @@ class Episode:
         self._policy = policy
         self._generator = torch.Generator().manual_seed(seed)
         self._recent: list[tuple[Tensor | None, Tensor]] = []  # None: that frame was not drawn
-        """Pictures and states of the frames that the policy sees at once, the current one last."""
+        """Images and states of the frames that the policy sees at once, the current one last."""
         self._video_over = False
         self.goal = checked_text(goal, "the goal")
         self.subgoal: str | None = None
@@ -179,7 +179,7 @@ class Episode:
 
         Raises:
             UserError: a wrong dtype or shape, a video frame after execution has begun, a memory that needs states, or
-                one that looks back at pictures of every camera.
+                one that looks back at images of every camera.
         """
         self._check_apart()
         camera = self._robot.memory_camera
@@ -201,7 +201,7 @@ class Episode:
             state: [s].
 
         Raises:
-            UserError: pictures or a state of another form, or a memory that looks back at pictures of every camera.
+            UserError: images or a state of another form, or a memory that looks back at images of every camera.
         """
         self._check_apart()
         state = finite_array(state, "the state")
@@ -209,7 +209,7 @@ class Episode:
         if state.shape != (width,):
             raise UserError(f"look() needs a state of {width} finite numbers, got shape {state.shape}.")
         if lacking := [name for name in names if name not in views]:
-            raise UserError(f"look() needs a picture of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
+            raise UserError(f"look() needs an image of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
         images = processor.images([views[name] for name in names])
@@ -218,7 +218,7 @@ class Episode:
     def _check_apart(self) -> None:
         if self._past is not None:
             raise UserError(
-                "This policy's vision tower looks back at past pictures of every camera: give whole observations "
+                "This policy's vision tower looks back at past images of every camera: give whole observations "
                 "(`Episode.observe`), not past frames of one camera and the current view apart."
             )
 
@@ -264,7 +264,7 @@ class Episode:
         if states is None:
             raise UserError(
                 "This policy's memory reads the robot's own states and actions: give past frames with their states "
-                "(`Episode.observe`), not as pictures alone."
+                "(`Episode.observe`), not as images alone."
             )
         actions, known = np.zeros((len(demo), self._robot.action.width), np.float32), np.zeros(len(demo), bool)
         if self._robot.action.frames is not None:
@@ -308,7 +308,7 @@ class Episode:
     def window(self) -> tuple[Tensor, Tensor]:
         """Views [t, v, 3, s, s] uint8 and states [t, s] of the frames that the policy sees at once, the current last.
 
-        Where fewer frames of the execution have been seen, the oldest stands for those before it.
+        Where fewer frames of the execution have been seen, the oldest means those before it.
 
         Raises:
             UserError: no frame was seen yet, or one of these was not drawn.
@@ -405,7 +405,7 @@ class Episode:
 
     def _require_rendered(self, images: Tensor | None) -> Tensor:
         if images is None:
-            raise UserError("The current frame was not drawn: observe() a picture of every camera before act().")
+            raise UserError("The current frame was not drawn: observe() an image of every camera before act().")
         return images
 
     def _see(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:

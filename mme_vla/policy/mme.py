@@ -132,7 +132,7 @@ class MMEPolicy(Policy):
         return self.backbone.loss_draws(count, generator)
 
     def image_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """While training with augmentation `changes` [n, …]: what happens to a sample's pictures."""
+        """While training with augmentation `changes` [n, …]: what happens to a sample's images."""
         return {"changes": self._draw_changes(count, generator)} if self.training and self.augment else {}
 
     def forward(
@@ -206,7 +206,7 @@ class MMEPolicy(Policy):
         return self.memory.condition_on_prompt(batch.history, mark)
 
     def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
-        """The random numbers that change the pictures of `count` training samples, [count, …] on the CPU."""
+        """The random numbers that change the images of `count` training samples, [count, …] on the CPU."""
         from mme_vla.processing.augment import augmentation_draws
 
         return augmentation_draws(count, generator)

@@ -107,7 +107,7 @@ _PLACE = re.compile(rf"({_REPOSITORY.pattern})((?:/[\w-][\w. -]*)*)")
 def local_folder(source: str | Path, revision: str | None = None, token: str | None = None) -> Path:
     """Return `source` if it exists on disk, else the downloaded snapshot of the hub repository of that name.
 
-    A folder of a training run stands for its newest checkpoint, and `latest` for the newest run beside it.
+    A folder of a training run means its newest checkpoint, and `latest` for the newest run beside it.
 
     Args:
         source: a path, or `owner/name` of a hub repository, or `owner/name/folder` of one in it: no other is fetched.

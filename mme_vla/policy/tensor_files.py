@@ -166,7 +166,7 @@ def assign_tensors(
 def take_memory(module: nn.Module) -> None:
     """Move those of a module's tensors that lie in a memory-mapped file into memory that torch allots.
 
-    Files place tensors at any multiple of a few bytes, and matrix products round differently from there: what goes on
+    Files place tensors at any multiple of a few bytes, and matrix products round differently from there: what continues
     from a file would differ in the last bits from what never stopped.
     """
     for tensor in (*module.parameters(), *module.buffers()):

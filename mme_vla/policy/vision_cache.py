@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mme_vla.policy.episode import Episode
 
 Pooled = Callable[[Tensor, int, str], Tensor]
-"""Pictures as the tower takes them, the side of the grid and the pooling → tokens [n, grid², d_vision]."""
+"""Images as the tower takes them, the side of the grid and the pooling → tokens [n, grid², d_vision]."""
 
 
 class VisionEncoder(Protocol):
@@ -61,7 +61,7 @@ def tower_fingerprint(tower: nn.Module, dtype: torch.dtype, *beside: str) -> str
 
     Args:
         tower: whose weights count. dtype: that it runs in.
-        beside: what else its pictures go through; nothing where it says nothing.
+        beside: what else its images go through; nothing where it says nothing.
     """
     digest = hashlib.sha256(str(dtype).encode())
     for name, tensor in sorted(tower.state_dict().items()):

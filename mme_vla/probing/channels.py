@@ -86,11 +86,11 @@ Place = tuple[History, int]
 class OnlyFrames(History):
     """A history in which some stored frames follow one another as if there had been no others.
 
-    What the memory then chooses is a choice among these; `frames` says which frame each of its numbers stands for.
+    What the memory then chooses is a choice among these; `frames` says which frame each of its numbers means.
     """
 
     def __init__(self, full: History, frames: np.ndarray) -> None:
-        """Take the stored frames `frames` [m], ascending, at least one; the last stands for the current one."""
+        """Take the stored frames `frames` [m], ascending, at least one; the last means the current one."""
         every = full.spec.keep_every
         self._length = len(frames) if every == 1 else max((len(frames) - 1) * every, 1)
         self._kept = full.spec.stored_frames(self._length)
@@ -176,7 +176,7 @@ class Channel:
         raise NotImplementedError
 
     def commit(self, episode: Episode, remembering: Any) -> None:
-        """Let the real episode go on from a chunk that was chosen so."""
+        """Let the real episode continue from a chunk that was chosen so."""
 
 
 class SelectionChannel(Channel):

@@ -51,7 +51,7 @@ class Recording:
         return self.source.subgoals(self.episode, step).get(column)
 
     def frame(self, number: int) -> np.ndarray:
-        """A picture [H, W, 3] uint8 of the camera that feeds memory."""
+        """An image [H, W, 3] uint8 of the camera that feeds memory."""
         return self.source.frames(self.episode, [number])[0]
 
     def boundaries(self) -> list[int]:
@@ -73,7 +73,7 @@ class Recording:
     def views(
         self, start: int, stop: int, required: np.ndarray | None
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray] | None]:
-        """Pictures of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
+        """Images of frames start … stop − 1 and where they stand, as `Episode.observe` takes them.
 
         Args:
             required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A

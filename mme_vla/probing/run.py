@@ -1,4 +1,4 @@
-"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it goes on where it was."""
+"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it continues where it was."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext

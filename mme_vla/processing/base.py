@@ -1,4 +1,4 @@
-"""What every processor is asked: pictures, words, states and actions in the network's form, batches, and back."""
+"""What every processor is asked: images, words, states and actions in the network's form, batches, and back."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -30,7 +30,7 @@ DEFAULT = "pi05"
 class Sample:
     """One training step as it is recorded, with the frames before it that the processor asked for.
 
-    views: camera → pictures [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
+    views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
     goal: the task in words; subgoal: its current part, where the policy reads one.
     past_actions: [n, w] the robot's own actions right before the chunk. actions: [h, w] the chunk, absolute.
     """
@@ -91,7 +91,7 @@ class PolicyProcessor:
 
     @property
     def cameras(self) -> Sequence[str]:
-        """The cameras whose pictures an item is made of, in the embodiment's order."""
+        """The cameras whose images an item is made of, in the embodiment's order."""
         return self.embodiment.camera_names
 
     @property
@@ -129,14 +129,14 @@ class PolicyProcessor:
         if self._stats is None:
             raise UserError(
                 "States and actions need normalisation statistics, and this processor has none. Training computes them "
-                "from its data; otherwise set processor.stats to a norm_stats.json (one stands in every checkpoint)."
+                "from its data; otherwise set processor.stats to a norm_stats.json (one is in every checkpoint)."
             )
         return self._stats
 
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Pictures of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the network takes them.
+        """Images of all cameras in the embodiment's order, [H, W, 3] or [n, H, W, 3] each, as the network takes them.
 
         Returns:
             uint8 [v, 3, s, s'], or [n, v, 3, s, s'].
@@ -164,7 +164,7 @@ class PolicyProcessor:
 
     @property
     def memory_image_format(self) -> str:
-        """What a setting lets memory pictures go through besides, which a cache of their tokens depends on."""
+        """What a setting lets memory images go through besides, which a cache of their tokens depends on."""
         return ""
 
     @property
@@ -187,7 +187,7 @@ class PolicyProcessor:
 
         Args:
             states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False
-                where none of the robot's own did; what stands in `actions` there does not matter.
+                where none of the robot's own did; what is in `actions` there does not matter.
 
         Returns:
             [state | action relative to it | known], normalised; actions are 0 where they are not known.
@@ -237,7 +237,7 @@ class PolicyProcessor:
         """Read what `save` wrote; nothing outside of the folder is read on its word.
 
         Args:
-            folder: of a checkpoint, which may be a stranger's.
+            folder: of a checkpoint, which may be an untrusted.
             tokenizer: in place of the one that `processor.json` names.
         """
         raise NotImplementedError

@@ -68,31 +68,31 @@ def resize_with_pad(images: Tensor, size: tuple[int, int] | int) -> Tensor:
 
 def to_unit_range(images: Tensor) -> Tensor:
     """Map uint8 0…255 to float32 -1…1."""
-    # In place: the pictures of an episode are large, and each step would take as much memory again.
+    # In place: the images of an episode are large, and each step would take as much memory again.
     return images.to(torch.float32, copy=True).div_(255).mul_(2).sub_(1)
 
 
 def as_uint8_frames(image: np.ndarray | Tensor) -> np.ndarray:
-    """Bring one picture, or a stack of them, into the form the resize expects: uint8, channels last.
+    """Bring one image, or a stack of them, into the form the resize expects: uint8, channels last.
 
     Accepts uint8, or float in [0, 1] (mapped by truncating 255·x, as released), with the channels last or first.
     """
     array = image.detach().cpu().numpy() if isinstance(image, Tensor) else np.asarray(image)
     if array.ndim not in (3, 4):
-        raise UserError(f"Expected a picture [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}.")
+        raise UserError(f"Expected an image [H, W, 3] or a stack [n, H, W, 3], got shape {list(array.shape)}.")
     if array.shape[-1] != 3 and array.shape[-3] == 3:
         array = np.moveaxis(array, -3, -1)
     if array.shape[-1] != 3:
-        raise UserError(f"Expected RGB pictures (three channels first or last), got shape {list(array.shape)}.")
+        raise UserError(f"Expected RGB images (three channels first or last), got shape {list(array.shape)}.")
     if np.issubdtype(array.dtype, np.floating):
         if array.size and not (array.min() >= 0 and array.max() <= 1):
             raise UserError(
-                f"Float pictures must lie in [0, 1], got values from {array.min():g} to {array.max():g}; "
-                "give uint8 pictures or divide by 255."
+                f"Float images must lie in [0, 1], got values from {array.min():g} to {array.max():g}; "
+                "give uint8 images or divide by 255."
             )
         return (255 * array).astype(np.uint8)
     if array.dtype != np.uint8:
-        raise UserError(f"Expected pictures as uint8, or as float in [0, 1]; got {array.dtype}.")
+        raise UserError(f"Expected images as uint8, or as float in [0, 1]; got {array.dtype}.")
     return array
 
 
@@ -101,18 +101,18 @@ def _pair(size: tuple[int, int] | int) -> tuple[int, int]:
 
 
 def _fit(source_h: int, source_w: int, height: int, width: int) -> tuple[int, int, int, int]:
-    """Say how large the picture becomes inside (height, width) and where it sits: (h, w, top, left)."""
+    """Say how large the image becomes inside (height, width) and where it sits: (h, w, top, left)."""
     ratio = max(source_w / width, source_h / height)
     inner_h, inner_w = int(source_h / ratio), int(source_w / ratio)
     return inner_h, inner_w, (height - inner_h) // 2, (width - inner_w) // 2
 
 
 Prepare = Callable[[Sequence[np.ndarray]], Tensor]
-"""Pictures [n, H, W, 3] uint8 of every camera in the embodiment's order → [n, v, 3, s, s] uint8."""
+"""Images [n, H, W, 3] uint8 of every camera in the embodiment's order → [n, v, 3, s, s] uint8."""
 
 
 class PastImages:
-    """Holds an episode's pictures as they came, as far back as is looked; they are prepared when they are asked for.
+    """Holds an episode's images as they came, as far back as is looked; they are prepared when they are asked for.
 
     Which of them are looked at is known only when the policy acts, and preparing one costs more than keeping it.
     """
@@ -142,7 +142,7 @@ class PastImages:
         if lacking:
             raise UserError(
                 f"This policy looks back at the frames {lacking[:5]}, which were not drawn of every camera: what "
-                "`frames_read` names has to be observed with all pictures."
+                "`frames_read` names has to be observed with all images."
             )
         stored = [self._frames[frame] for frame in frames.tolist()]
         return [np.stack(of_camera) for of_camera in zip(*stored, strict=True)]
@@ -151,14 +151,14 @@ class PastImages:
 def past_views(
     spec: PastViewSpec, step: int, read: Callable[[np.ndarray], Sequence[np.ndarray]], prepare: Prepare
 ) -> PastViews:
-    """Past views of a step, unbatched; where there is no such frame yet, black pictures that nobody sees.
+    """Past views of a step, unbatched; where there is no such frame yet, black images that nobody sees.
 
     Args:
-        read: frames [n], ascending, at least one → pictures [n, H, W, 3] of every camera.
+        read: frames [n], ascending, at least one → images [n, H, W, 3] of every camera.
     """
     requested = spec.at(step)
     there = requested >= 0
-    # The current frame goes along where there is no other: it says how large pictures are.
+    # The current frame goes along where there is no other: it says how large images are.
     frames = requested[there] if there.any() else np.array([step])
     prepared = prepare(read(frames))
     images = prepared.new_zeros(len(requested), *prepared.shape[1:])

@@ -100,10 +100,10 @@ LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would
 
 @PROCESSORS.register("pi05")
 class Processor(PolicyProcessor):
-    """Turns raw pictures, words, states and actions into what the network reads, and its answer back into actions.
+    """Turns raw images, words, states and actions into what the network reads, and its answer back into actions.
 
     Args:
-        image_size: s; side of the square pictures the vision tower takes, in pixels.
+        image_size: s; side of the square images the vision tower takes, in pixels.
         tokenizer: turns prompts into ids.
         prompt: name of the prompt format (`PROMPTS`).
         prompt_length: longest prompt in tokens, without the options of a robot that chooses.
@@ -190,7 +190,7 @@ class Processor(PolicyProcessor):
         return self.tokenizer.fingerprint
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Resize the current pictures of all cameras with Pillow, as released.
+        """Resize the current images of all cameras with Pillow, as released.
 
         Args:
             views: one entry a camera in the order of the embodiment's: [H, W, 3], or [n, H, W, 3] for n observations;
@@ -204,7 +204,7 @@ class Processor(PolicyProcessor):
             raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
         resized = [resize_with_pad_uint8(as_uint8_frames(view), self.image_size) for view in views]
         if len({view.shape for view in resized}) > 1:
-            raise UserError(f"All views need as many pictures, got shapes {[list(view.shape) for view in resized]}.")
+            raise UserError(f"All views need as many images, got shapes {[list(view.shape) for view in resized]}.")
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(np.stack(resized, axis=-4), -1, -3)))
 
     def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
@@ -279,7 +279,7 @@ class Processor(PolicyProcessor):
         return self.embodiment.action.to_absolute(relative, state.to(relative))
 
     def item(self, sample: Sample) -> dict[str, Any]:
-        """Pictures [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
+        """Images [v, 3, s, s], prompt ids and mask [l], raw state [s] and normalised actions [h, action_dim]."""
         state = sample.states[-1]
         prompt, prompt_mask = self.prompt(
             sample.goal, subgoal=sample.subgoal, state=state, past_actions=sample.past_actions
@@ -335,7 +335,7 @@ class Processor(PolicyProcessor):
         """Read what `save` wrote. Nothing outside of the folder is read for it, and of the hub only π0.5's tokenizer.
 
         Args:
-            folder: of a checkpoint, which may be a stranger's.
+            folder: of a checkpoint, which may be an untrusted.
             tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes it.
         """
         config = saved_settings(Path(folder), tokenizer)

@@ -1,4 +1,4 @@
-"""What the policy is told in words. A format is one class here; everything else refers to it by name."""
+"""What the policy is reported. A format is one class here; everything else refers to it by name."""
 
 import re
 import warnings

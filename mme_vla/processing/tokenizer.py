@@ -65,7 +65,7 @@ class Tokenizer:
         return self._processor.encode(text, add_bos=bos)
 
     def piece(self, text: str) -> int:
-        """The id of one piece, as the model spells it (`▁` stands for a space)."""
+        """The id of one piece, as the model spells it (`▁` means a space)."""
         index = self._processor.piece_to_id(text)
         if index == self._processor.unk_id():
             raise UserError(f"Tokenizer {self.spec!r} has no piece {text!r}, which this policy's prompts need.")
@@ -101,5 +101,5 @@ def _download(spec: str) -> Path:
         raise UserError(
             f"The hub did not give the tokenizer {spec!r} ({type(error).__name__}: {str(error).splitlines()[0]}). "
             "Check the name, the network and `hf auth login` (PaliGemma's files ask you to accept a licence), "
-            "or download the file by hand and give its path."
+            "or download the file manually and give its path."
         ) from None

@@ -30,7 +30,7 @@ logger = logging.getLogger("mme_vla.serving")
 class ServedConnection:
     """Speaks first (`metadata`, packed), then answers one request after the other.
 
-    Reading goes on while the policy computes, so that pings are answered and a client that goes is noticed.
+    Reading continues while the policy computes, so that pings are answered and a client that goes is noticed.
     """
 
     def __init__(self, socket: WebSocket, engine: Engine, settings: ServeSettings, metadata: bytes) -> None:

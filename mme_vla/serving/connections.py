@@ -62,9 +62,9 @@ class Connection:
 class Connections:
     """All open connections of a server.
 
-    Connections of strangers never take a place from those who have shown the key: they have `STRANGERS` places of their
-    own, and the longest silent one goes first. Among the guests, the longest silent connection that waits for no answer
-    makes room for a new one; one that holds no episode goes before one that does.
+    Connections of untrusted sources never take a place from those who have shown the key: they have `STRANGERS` places
+    of their own, and the longest silent one goes first. Among the guests, the longest silent connection that waits for
+    no answer makes room for a new one; one that holds no episode goes before one that does.
     """
 
     def __init__(self, limits: Limits, stats: ServerStats) -> None:
@@ -243,7 +243,7 @@ class WebSocketProtocol(WebSocketsSansIOProtocol):
             return
         if within and not self.read_paused:
             connection.wait(limits.receive_s)
-        else:  # an answer to a ping is no sign that the episode goes on
+        else:  # an answer to a ping is no sign that the episode continues
             connection.until = connection.silent_since + limits.idle_s
 
     def handle_text(self, event: Any) -> None:

@@ -37,7 +37,7 @@ SPACES = ("joint_angle", "ee_pose")
 
 @dataclass
 class Running:
-    """One session's episode, and the observations since its last chunk: pictures by camera, and states."""
+    """One session's episode, and the observations since its last chunk: images by camera, and states."""
 
     episode: Episode
     images: list[dict[str, np.ndarray]] = field(default_factory=list)
@@ -108,7 +108,7 @@ class MMEVLAModelServer(PredictModelServer):
         return {"action": RAW}
 
     def get_observation_spec(self) -> dict[str, DimSpec]:
-        """The pictures, the state and the words that are read."""
+        """The images, the state and the words that are read."""
         images = {VIEWS[name]: IMAGE_RGB for name in self.policy.embodiment.camera_names}
         words = {"language": LANGUAGE} | ({} if self.subgoal is None else {"subgoal": LANGUAGE})
         return {**images, "state": RAW, **words}

@@ -22,7 +22,7 @@ DEEPEST = 32_767  # millimetres: the benchmark's depth is int16
 def read_beside(
     robot: Embodiment, images: Mapping[str, np.ndarray], message: Mapping[str, Any], key: str
 ) -> dict[str, np.ndarray]:
-    """Depth and poses of every camera that has them, one for each of its pictures.
+    """Depth and poses of every camera that has them, one for each of its images.
 
     Args:
         images: [t, H, W, 3] by camera. message: lists (or arrays) of t readings. key: how it spells their names.
@@ -46,7 +46,7 @@ def read_beside(
 def _reading_rows(key: str, message: Mapping[str, Any], count: int, shape: tuple[int, ...]) -> np.ndarray:
     if key not in message:
         expected = "one pose [3, 4] from the world to the camera" if shape == POSE else "depth in millimetres"
-        raise UserError(f"The request lacks {key}: this policy reads {expected} beside every picture of the camera.")
+        raise UserError(f"The request lacks {key}: this policy reads {expected} beside every image of the camera.")
     value = message[key]
     rows = list(value) if isinstance(value, list) or (isinstance(value, np.ndarray) and value.ndim) else None
     if rows is None or len(rows) != count:
@@ -74,7 +74,7 @@ SUBGOALS = ("simple_subgoal", "grounded_subgoal")
 OPTIONS = "available_multi_choices"  # beside an observation, for policies that choose; the benchmark's name
 IMAGE_KEYS = {"front": "observation/image", "wrist": "observation/wrist_image"}  # openpi's names of RoboMME's cameras
 MOST_GOAL = 4000  # characters
-SIDES = (8, 4096)  # pixels of a picture's side
+SIDES = (8, 4096)  # pixels of an image's side
 KNOWN = ("reset", "add_buffer", "observation/image", "front_rgb_list")
 
 
@@ -87,7 +87,7 @@ class Reset:
 class AddBuffer:
     """Frames to remember, the current one included; nothing is chosen yet.
 
-    frames: t pictures [H, W, 3] uint8 of the camera that feeds memory.
+    frames: t images [H, W, 3] uint8 of the camera that feeds memory.
     exec_start: index of the episode's first execution frame; 0 where it is not said.
     states: what the robot felt at these frames, [t, s]; only a memory of its own motion needs them.
     """
@@ -106,8 +106,8 @@ class Infer:
     first: whether the message begins an episode; None where the schema does not say.
     options: what can be chosen, for a policy that chooses; none where they stay as they were.
     states: what the robot felt at `frames`, [t, s].
-    seen: for a robot that reads more than pictures, everything its cameras delivered at the frames of this message, in
-        the form of `Episode.observe`: pictures by camera, depth and poses; `states` goes with it.
+    seen: for a robot that reads more than images, everything its cameras delivered at the frames of this message, in
+        the form of `Episode.observe`: images by camera, depth and poses; `states` goes with it.
     """
 
     images: Mapping[str, np.ndarray]
@@ -289,27 +289,27 @@ def _frames(key: str, frames: Any, most: int) -> list[np.ndarray]:
     if isinstance(frames, np.ndarray):
         frames = list(frames) if frames.ndim == 4 else None
     if not isinstance(frames, list):
-        raise UserError(f"{key} must be a list of uint8 pictures [height, width, 3].")
+        raise UserError(f"{key} must be a list of uint8 images [height, width, 3].")
     if not 1 <= len(frames) <= most:
         raise UserError(f"{key} holds {len(frames)} frames; this server takes 1 … {most} (limits.frames).")
     for frame in frames:
         _image(key, frame)
     shapes = {frame.shape for frame in frames}
     if len(shapes) > 1:
-        raise UserError(f"All pictures of {key} need one size, got {sorted(shapes)[:3]}.")
+        raise UserError(f"All images of {key} need one size, got {sorted(shapes)[:3]}.")
     return frames
 
 
 def _image(key: str, image: Any) -> np.ndarray:
     if not isinstance(image, np.ndarray):
-        raise UserError(f"{key} must be a uint8 picture [height, width, 3], got {type(image).__name__}.")
+        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {type(image).__name__}.")
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[-1] != 3:
         got = f"{image.dtype} {list(image.shape)}"
-        raise UserError(f"{key} must be a uint8 picture [height, width, 3], got {got}.")
+        raise UserError(f"{key} must be a uint8 image [height, width, 3], got {got}.")
     if not all(SIDES[0] <= side <= SIDES[1] for side in image.shape[:2]):
-        raise UserError(f"{key}: a picture's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(image.shape[:2])}.")
+        raise UserError(f"{key}: an image's sides are {SIDES[0]} … {SIDES[1]} pixels, got {list(image.shape[:2])}.")
     if max(image.shape[:2]) > 8 * min(image.shape[:2]):
-        raise UserError(f"{key}: a picture of {list(image.shape[:2])} is too narrow to be scaled into a square.")
+        raise UserError(f"{key}: an image of {list(image.shape[:2])} is too narrow to be scaled into a square.")
     return image
 
 

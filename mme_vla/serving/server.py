@@ -31,7 +31,7 @@ def warm_up(policy: Policy, settings: ServeSettings) -> None:
 
 
 def _nothing(robot: Embodiment, count: int) -> dict[str, np.ndarray]:
-    """Black pictures of every camera, and a wall at no distance where it reads depth."""
+    """Black images of every camera, and a wall at no distance where it reads depth."""
     frames: dict[str, np.ndarray] = {}
     for camera in robot.cameras:
         frames[camera.name] = np.zeros((count, SIDE, SIDE, 3), np.uint8)

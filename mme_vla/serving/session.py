@@ -20,7 +20,7 @@ SMALL = 2**16  # bytes decoded on the event loop; larger messages are decoded in
 
 
 class NoEpisodeError(UserError):
-    """A request goes on with an episode that is not here."""
+    """A request continues with an episode that is not here."""
 
 
 async def read_request(engine: Engine, settings: ServeSettings, data: bytes | bytearray) -> Request:
@@ -134,7 +134,7 @@ class Session:
             episode.remember(taken, demo, states=proprio)
 
     def _watch(self, frames: Mapping[str, np.ndarray], states: np.ndarray) -> Iterator[None]:
-        """Take frames with what all cameras delivered, for a policy that reads more than pictures."""
+        """Take frames with what all cameras delivered, for a policy that reads more than images."""
         episode, piece = self.episode, self._piece
         for start in range(0, len(states), piece):
             if start:
@@ -205,7 +205,7 @@ class HttpSessions:
         """Answer a request of a session, after those of the same session that came before.
 
         Raises:
-            NoEpisodeError: the request goes on with an episode that is not here.
+            NoEpisodeError: the request continues with an episode that is not here.
             BusyError: a new session, and no place for it.
             UserError: the request does not fit the episode, which ends with it, as it does with any other error.
         """

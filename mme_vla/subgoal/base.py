@@ -25,7 +25,7 @@ _CONFIG_TYPES = (str, int, float, bool, list, dict, type(None))  # the values of
 class Subgoal:
     """A subgoal for the policy, and how it came about.
 
-    text: in words, points as `<row, column>` in pixels of the front picture; None while there has been none (the
+    text: in words, points as `<row, column>` in pixels of the front image; None while there has been none (the
         policy's prompt is then the plain one).
     points: those points in order, (row, column).
     queried: whether a model was asked for this one; False for one that is kept.
@@ -67,8 +67,8 @@ class SubgoalEpisode:
 
     goal: the task in words, lower-case as in training. task: its name, empty if unknown.
     video: [t, H, W, 3] uint8, the conditioning video without the current frame; empty without one.
-    frame: the current front picture [H, W, 3] uint8. step: actions executed so far.
-    info: what the environment reports beside the picture. subgoal: the last prediction.
+    frame: the current front image [H, W, 3] uint8. step: actions executed so far.
+    info: what the environment reports beside the image. subgoal: the last prediction.
     asked_step: the step of the last question; None while there was none.
     """
 
@@ -108,7 +108,7 @@ class SubgoalEpisode:
 
     @property
     def frame(self) -> np.ndarray:
-        """The current front picture."""
+        """The current front image."""
         if self._frame is None:
             raise UserError("The episode has seen no frame yet: call observe() with the current one before predict().")
         return self._frame
@@ -126,7 +126,7 @@ class SubgoalPredictor:
     """
 
     sees_video = True
-    """Whether `start_episode` has to be given the pictures of a conditioning video."""
+    """Whether `start_episode` has to be given the images of a conditioning video."""
     sees_passing = True
     """Whether frames are looked at besides those at which `predict` is called."""
 

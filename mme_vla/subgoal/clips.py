@@ -1,4 +1,4 @@
-"""Pictures and videos as models look at them: which frames of a video, out of memory or out of a file."""
+"""Images and videos as models look at them: which frames of a video, out of memory or out of a file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +12,16 @@ from mme_vla.utils.media import FPS
 
 VIDEO_FRAMES = 10  # that a model looks at, at most
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
-"""How films that models look at are compressed (`mme_vla.utils.media.Film`): finer than those for people."""
+"""How videos that models look at are compressed (`mme_vla.utils.media.Film`): finer than those for people."""
 
 _REMEDY = "Build the training data again."
 
 
 def read_image(path: Path) -> np.ndarray:
-    """Read a picture as [H, W, 3] uint8."""
+    """Read an image as [H, W, 3] uint8."""
     from PIL import Image
 
-    with decoding(require_file(path, "a picture"), "a picture", _REMEDY), Image.open(path) as image:
+    with decoding(require_file(path, "an image"), "an image", _REMEDY), Image.open(path) as image:
         return np.array(image.convert("RGB"))
 
 
@@ -44,7 +44,7 @@ class Clip:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Sample a file; frames that are not looked at are decoded but not turned into pictures."""
+        """Sample a file; frames that are not looked at are decoded but not turned into images."""
         import av
 
         with decoding(require_file(path, "a video"), "a video", _REMEDY), av.open(str(path)) as container:

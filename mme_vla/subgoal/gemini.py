@@ -99,11 +99,11 @@ _NOTES = {
     "InsertPeg": "The video shows which end of the peg is grasped and from which side it is inserted.",
     "PatternLock": (
         "Directions are those of the robot's base. The camera faces the robot: forward, away from the robot, is down "
-        "in the picture, and the robot's left is on the right-hand side of the picture."
+        "in the image, and the robot's left is on the right-hand side of the image."
     ),
     "RouteStick": (
         "Directions are those of the robot's base. The camera faces the robot, so the robot's left is on the "
-        "right-hand side of the picture, and turning is judged from above."
+        "right-hand side of the image, and turning is judged from above."
     ),
 }
 
@@ -117,7 +117,7 @@ def gemini_system(task: str, kind: str) -> str:
     example = example_of(task, kind)
     parts = [
         "You watch a robot arm at a table through a camera in front of it, and tell it what to do next. You are given "
-        "the task in words, then pictures or short videos of what happened. Break the task down into subgoals and name "
+        "the task in words, then images or short videos of what happened. Break the task down into subgoals and name "
         "the one the robot has to work on now.",
         *what_there_is(task, kind),
     ]
@@ -143,7 +143,7 @@ def what_there_is(task: str, kind: str) -> list[str]:
     ]
     if kind == "grounded" and any(AT in text for text in templates):
         parts.append(
-            "<y, x> is a point in the latest picture: y is its row and x its column, whole numbers from 0 (top, left) "
+            "<y, x> is a point in the latest image: y is its row and x its column, whole numbers from 0 (top, left) "
             "to 1000 (bottom, right). Point at the middle of the object that is meant."
         )
     if task in _NOTES:
@@ -162,18 +162,18 @@ def _subgoals(task: str, kind: str) -> list[str]:
 
 
 def first_query(goal: str, video: bool) -> str:
-    """The first question; its pictures come before it, the demonstration video first."""
+    """The first question; its images come before it, the demonstration video first."""
     context = (
-        "The video shows what happened before the robot's turn, the picture shows the scene now."
+        "The video shows what happened before the robot's turn, the image shows the scene now."
         if video
-        else "The picture shows the scene at the start."
+        else "The image shows the scene at the start."
     )
     return f"The task: {goal}\n{context} Plan the subgoals, and name the first one."
 
 
 def next_query(clip: bool) -> str:
-    """A later question; its video, or the single picture of a very short stretch, comes before it."""
-    context = "This video shows what the robot did since." if clip else "This picture shows the scene now."
+    """A later question; its video, or the single image of a very short stretch, comes before it."""
+    context = "This video shows what the robot did since." if clip else "This image shows the scene now."
     return f"{context} Describe what happened, and name the current subgoal."
 
 
@@ -193,7 +193,7 @@ CLIP = 4  # frames: fewer are not worth a video
 class GeminiEpisode(SubgoalEpisode):
     """An episode, its conversation, and the frames the model has not seen.
 
-    messages: what was asked and answered, each a role and parts; a part is a text, or a picture [H, W, 3] or video
+    messages: what was asked and answered, each a role and parts; a part is a text, or an image [H, W, 3] or video
     [t, H, W, 3], which is encoded once for all questions that show it.
     """
 
@@ -298,7 +298,7 @@ class Gemini(SubgoalPredictor):
 
 @SUBGOALS.register("openai")
 class OpenAI(Gemini):
-    """The same questions to any endpoint that speaks OpenAI's chat completions; videos are shown as pictures.
+    """The same questions to any endpoint that speaks OpenAI's chat completions; videos are shown as images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
     settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.

@@ -17,7 +17,7 @@ from mme_vla.subgoal.text import MalformedReply, memer_system, memer_user, parse
 class MemerEpisode(SubgoalEpisode):
     """An episode, its keyframes, and as many frames back as the next question may show.
 
-    keyframes: frame number (from the first execution frame) → picture.
+    keyframes: frame number (from the first execution frame) → image.
     """
 
     def __init__(self, goal: str, video: np.ndarray | None, task: str, reach: int) -> None:

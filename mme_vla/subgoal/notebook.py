@@ -50,21 +50,21 @@ def planner_system(task: str, kind: str) -> str:
 
 
 def opening_query(goal: str, video: bool) -> str:
-    """The planner's first question; its pictures come before it, the demonstration video first."""
+    """The planner's first question; its images come before it, the demonstration video first."""
     context = (
-        "The video shows what happened before the robot's turn, the picture shows the scene now. Note what has to be "
+        "The video shows what happened before the robot's turn, the image shows the scene now. Note what has to be "
         "remembered of the video."
         if video
-        else "The picture shows the scene at the start."
+        else "The image shows the scene at the start."
     )
     return f"The task: {goal}\n{context} Name the first subgoal."
 
 
 def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
     """A later question to the planner; the video of the finished subgoal, if it has frames, comes before it."""
-    context = "The picture shows the scene now."
+    context = "The image shows the scene now."
     if clip:
-        context = "The video shows how it was done, the picture the scene now."
+        context = "The video shows how it was done, the image the scene now."
     return (
         f"The task: {goal}\nYour notebook:\n{notes}\nThe subgoal {finished!r} is complete. {context} Bring the "
         "notebook up to date, and name the next subgoal."
@@ -72,11 +72,11 @@ def next_query(goal: str, finished: str, notes: str, clip: bool) -> str:
 
 
 def monitor_query(goal: str, subgoal: str, clip: bool) -> str:
-    """A question to the monitor; its pictures come before it."""
+    """A question to the monitor; its images come before it."""
     context = (
-        "The video shows what the robot did since it was given the subgoal, the picture the scene now."
+        "The video shows what the robot did since it was given the subgoal, the image the scene now."
         if clip
-        else "The picture shows the scene now."
+        else "The image shows the scene now."
     )
     return f"The task: {goal}\nThe subgoal: {subgoal}\n{context} Is the subgoal complete?"
 
@@ -241,7 +241,7 @@ class NotebookEpisode(SubgoalEpisode):
         self.since = [*self.since, *frames][-LONGEST:]
 
     def images(self) -> list[MediaPart]:
-        """The video of the current subgoal, if it is worth one, and the present picture."""
+        """The video of the current subgoal, if it is worth one, and the present image."""
         clip = [MediaPart(np.stack(self.since))] if len(self.since) >= CLIP else []
         return [*clip, MediaPart(self.frame)]
 

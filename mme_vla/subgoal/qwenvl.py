@@ -1,4 +1,4 @@
-"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current picture, the video and its own past subgoals."""
+"""`qwenvl`: a fine-tuned Qwen3-VL that reads the current image, the video and its own past subgoals."""
 
 import time
 from collections.abc import Sequence

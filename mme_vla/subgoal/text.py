@@ -1,7 +1,7 @@
 """From a language model's answer to a subgoal: points, JSON, coordinates.
 
-Models write points in thousandths of the picture's sides, `(row, column)` from 0 to 1000; the policy reads pixels of
-the 256×256 front picture, `<row, column>`. What cannot be read raises `MalformedAnswer`, which the predictors count
+Models write points in thousandths of the image's sides, `(row, column)` from 0 to 1000; the policy reads pixels of
+the 256×256 front image, `<row, column>`. What cannot be read raises `MalformedAnswer`, which the predictors count
 and survive.
 """
 
@@ -68,7 +68,7 @@ def memer_user(goal: str, keyframes: int, recent: int, video: bool) -> str:
 
     Args:
         goal: the task in words.
-        keyframes, recent: how many pictures of each kind come with it, in this order.
+        keyframes, recent: how many images of each kind come with it, in this order.
         video: whether a conditioning video comes before them.
     """
     setup = f"The task has a video input for initial setup: {VIDEO}\n" if video else ""
@@ -154,7 +154,7 @@ def parse_subgoal(reply: str, side: int = SIDE) -> Parsed:
     """Read the answer of the fine-tuned predictor: a line of text with `<|box_start|>(a,b)<|box_end|>` points.
 
     Raises:
-        MalformedAnswer: nothing in it, a damaged point, or one outside the picture.
+        MalformedAnswer: nothing in it, a damaged point, or one outside the image.
     """
     text = " ".join(reply.split())
     if not text:

@@ -63,14 +63,14 @@ def _table(blocks: list[Block]) -> dict[str, set[str]]:
 
 @torch.no_grad()
 def check_tokens(backbone: Backbone, images: torch.Tensor) -> None:
-    """Pooled tokens have the sizes that caches and memories are made for, picture by picture."""
+    """Pooled tokens have the sizes that caches and memories are made for, image by image."""
     flat = images.flatten(0, 1)
     for pooled in (backbone.grid, 1):
         tokens = backbone.pooled_tokens(flat, pooled, "mean")
         shape = (len(flat), pooled**2, backbone.vision_width)
         assert tokens.shape == shape, f"pooled_tokens at grid {pooled} must be {shape}; got {tuple(tokens.shape)}."
     error = float((backbone.pooled_tokens(flat[1:2], 1, "mean") - tokens[1:2]).abs().max())
-    assert error <= TOLERANCE, f"a picture's tokens depend on its batch (by {error:.2g})."
+    assert error <= TOLERANCE, f"an image's tokens depend on its batch (by {error:.2g})."
 
 
 @torch.no_grad()

@@ -81,7 +81,7 @@ def check_reach(
     padded = replace(memory, tokens=memory.tokens.masked_fill(~memory.mask[..., None], 1e3))
     assert (~memory.mask).any(), "the check needs padding among the memory tokens"
     error = float((_loss(policy, batch, draws, padded) - before).abs().max())
-    assert error <= TOLERANCE, f"what stands in the memory's padding changed the loss by {error:.2g}."
+    assert error <= TOLERANCE, f"what is in the memory's padding changed the loss by {error:.2g}."
 
 
 def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory: MemoryTokens, before: Tensor) -> None:

@@ -22,7 +22,7 @@ _Kind = TypeVar("_Kind", bound=History)
 def check_memory(name: str, frames: int = 48, **options: Any) -> None:
     """Run every check on the memory that is registered under `name`, and print a line for each that passed.
 
-    The episode is synthetic: `frames` pictures in which a square moves, the first 20 of them a conditioning video.
+    The episode is synthetic: `frames` images in which a square moves, the first 20 of them a conditioning video.
 
     Args:
         name: the key in `MEMORIES`. frames: length of the episode, at least 40.
@@ -79,7 +79,7 @@ class Episode:
         return history
 
     def sparse(self, rendered: np.ndarray, until: int) -> OnlineHistory:
-        """The first `until` frames, of which only some have a picture."""
+        """The first `until` frames, of which only some have an image."""
         history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
         tokens = self.tokens[history.to_encode(until, rendered)]
         history.append(self.images[rendered], tokens, rendered, until)
@@ -160,7 +160,7 @@ def check_encoding(memory: Memory, frames: int) -> None:
     hidden = replace(history, features=history.features.clone(), positions=history.positions.clone())
     hidden.features[~history.mask], hidden.positions[~history.mask] = 1e3, 77.0
     error = float((_valid(_encoded(memory, hidden)) - _valid(encoded)).abs().max())
-    assert error <= TOLERANCE, f"what stands in padding changed the memory tokens by {error:.2g}."
+    assert error <= TOLERANCE, f"what is in padding changed the memory tokens by {error:.2g}."
 
     alone = _encoded(memory, history.rows(slice(1, None)))
     error = float((_valid(alone)[0] - _valid(encoded)[1]).abs().max())

@@ -93,7 +93,7 @@ def random_history(policy: MMEPolicy, batch: int, valid: int, seed: int = 0) -> 
 
 
 def random_batch(policy: MMEPolicy, batch: int = 2, valid: int = 100, seed: int = 0) -> Batch:
-    """A batch of noise pictures, short prompts and random actions."""
+    """A batch of noise images, short prompts and random actions."""
     generator = torch.Generator().manual_seed(seed)
     size, length, views = policy.backbone.image_size, 16, len(policy.embodiment.cameras)
     prompt_mask = torch.zeros(batch, length, dtype=torch.bool)

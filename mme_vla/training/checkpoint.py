@@ -8,7 +8,7 @@
         SHA256SUMS               of each of these files (the last pass of writing reads them once more)
 
 All randomness is a function of (seed, step), so there is no generator state and no data position to keep. Nothing is
-pickled: a checkpoint from a stranger cannot run code.
+pickled: a checkpoint from an untrusted source cannot run code.
 """
 
 import importlib.metadata
@@ -102,7 +102,7 @@ def save_shards(
     keep: KeepRule,
     hurry: bool = False,
 ) -> Path:
-    """Begin to write `folder`/step_… of a sharded run; all processes call it, and go on when `writer` has its copies.
+    """Begin to write `folder`/step_… of a sharded run; all processes call it, and continue when `writer` has its copies.
 
     Args:
         hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's weights into it
@@ -135,7 +135,7 @@ def save_shards(
 
 
 def load_policy(checkpoint: Path, policy: Policy) -> None:
-    """Give a policy, on meta or not, the weights that a run goes on from; `restore` brings all else."""
+    """Give a policy, on meta or not, the weights that a run continues from; `restore` brings all else."""
     tensors = read_weights(checkpoint, policy) if shard_files(checkpoint) else load_tensors(checkpoint)
     assign_tensors(policy, tensors, str(checkpoint))
 

@@ -160,7 +160,7 @@ class Logger(Protocol):
         ...
 
     def log_image(self, step: int, name: str, path: Path) -> None:
-        """Record a picture file."""
+        """Record an image file."""
         ...
 
     def close(self) -> None:
@@ -182,7 +182,7 @@ class JsonLines:
         self._file.write(json.dumps({"step": step, **values}) + "\n")
 
     def log_image(self, step: int, name: str, path: Path) -> None:
-        """Pictures lie in the run folder already."""
+        """Images lie in the run folder already."""
 
     def close(self) -> None:
         self._file.close()
@@ -217,7 +217,7 @@ class TensorBoard:
 
 @LOGGERS.register("wandb")
 class WeightsAndBiases:
-    """A Weights & Biases run under the run folder's name; a resumed run goes on in the same one."""
+    """A Weights & Biases run under the run folder's name; a resumed run continues in the same one."""
 
     def __init__(
         self,

@@ -154,7 +154,7 @@ class Trainer:
                         self.save(done, stopping)
                 if stopping:
                     self.stopped_by = stop.signal
-                    line.say(f"Stopped at step {done} as asked; go on with resume={self.run_info.folder}")
+                    line.say(f"Stopped at step {done} as asked; continue with resume={self.run_info.folder}")
                     return False
         return True
 
@@ -165,7 +165,7 @@ class Trainer:
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
-        # Of the whole update: the pictures of a sample depend neither on the number of processes nor of pieces.
+        # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)
         draws = {**draws, **self.policy.image_draws(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}

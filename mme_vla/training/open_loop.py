@@ -1,4 +1,4 @@
-"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as a picture."""
+"""The open-loop check: predicted against recorded chunks along held-out episodes, as numbers and as an image."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -70,7 +70,7 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
     Args:
         policy: with adapters, frozen parameters, recomputation and compilation as they shall be.
         dtype: matrix products run in it (`policy.compute_dtype`). Groups are gathered in it, but for what computes in
-            float32: groups that say so, norms, and all that stands in no group.
+            float32: groups that say so, norms, and all that is in no group.
         compiled: groups are compiled whole, so nothing inside one is gathered apart: its norms are in `dtype` too.
     """
     full = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
@@ -117,7 +117,7 @@ def is_sharded(module: nn.Module) -> bool:
 def full_state(policy: Policy) -> dict[str, Tensor]:
     """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All processes call it."""
     full = cast(dict[str, Tensor], get_model_state_dict(policy, options=FULL_STATE))
-    # Trained on the CPU they may lie in what training goes on with, or in the middle of what was gathered.
+    # Trained on the CPU they may lie in what training continues with, or in the middle of what was gathered.
     return {name: tensor.clone() for name, tensor in full.items()} if policy.device.type == "cpu" else full
 
 

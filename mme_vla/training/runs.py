@@ -36,7 +36,7 @@ The name too: it follows from the sections that are compared, and runs of earlie
 
 @dataclass(frozen=True)
 class Run:
-    """Where a run writes, and the checkpoint it goes on from with the updates already done (None: from nothing)."""
+    """Where a run writes, and the checkpoint it continues from with the updates already done (None: from nothing)."""
 
     folder: Path
     checkpoint: Path | None = None
@@ -100,7 +100,7 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
         more = [f"  … and {len(pairs) - 7:,} more"] if len(pairs) > 7 else []
         lines = "\n".join([*pairs[:7], *more])
         raise UserError(
-            f"{checkpoint} was trained with other settings, so going on from it would be another run:\n{lines}\n"
+            f"{checkpoint} was trained with other settings, so continuing from it would be another run:\n{lines}\n"
             f"Repeat the settings of {checkpoint.parent.parent / CONFIG}, or start anew with init_from={checkpoint}."
         )
     steps = config["train"]["steps"]
@@ -111,8 +111,8 @@ def open_run(folder: Path, resume: str | None, config: Mapping[str, Any]) -> Run
     newer = [path.name for path in checkpoints_in(checkpoint.parent) if step_of(path) > state["step"]]
     if newer:
         raise UserError(
-            f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which going on from {checkpoint.name} "
-            "would overwrite: resume from the newest, or move those away."
+            f"{checkpoint.parent} holds newer checkpoints ({', '.join(newer)}), which continuing from "
+            f"{checkpoint.name} would overwrite: resume from the newest, or move those away."
         )
     return Run(checkpoint.parent.parent, checkpoint, state["step"])
 
@@ -121,14 +121,14 @@ def check_content(checkpoint: Path, now: Sequence[str]) -> None:
     """Make sure that a resumed run has the data it began with.
 
     Args:
-        checkpoint: it goes on from. now: `SplitData.content`.
+        checkpoint: it continues from. now: `SplitData.content`.
     """
     then = read_state(checkpoint)["config"].get("data", {}).get("content")
     if then is not None and list(then) != list(now):
         which = [i for i, (old, new) in enumerate(zip_longest(then, now)) if old != new]
         raise UserError(
             f"The data have changed since {checkpoint} was written: number {', '.join(map(str, which))} of "
-            "data.sources holds other episodes, so going on would be another run. Bring the data back, or start anew "
+            "data.sources holds other episodes, so continuing would be another run. Bring the data back, or start anew "
             f"with init_from={checkpoint}."
         )
 
@@ -210,7 +210,7 @@ def start_from(policy: Policy, source: str) -> str:
     """Copy every weight that `source` holds into a freshly built policy; only its memory's own may be new.
 
     Args:
-        source: a checkpoint of any format (`mme_vla.weights`), or one of this library's run folders, which stands for
+        source: a checkpoint of any format (`mme_vla.weights`), or one of this library's run folders, which means
             its newest checkpoint.
 
     Returns:

@@ -40,7 +40,7 @@ def shard_files(checkpoint: Path) -> list[Path]:
 
 
 class ShardWriter:
-    """Writes parts in a thread while training goes on; one checkpoint at a time. All processes call each method."""
+    """Writes parts in a thread while training continues; one checkpoint at a time. All processes call each method."""
 
     def __init__(self) -> None:
         self._group = distributed.new_group(backend="gloo")

@@ -1,4 +1,4 @@
-"""Files as they really are: damaged, shared, half written, from strangers. Nothing here knows what is in them."""
+"""Files as they really are: damaged, shared, half written, from untrusted sources. Nothing here knows what is in them."""
 
 from mme_vla.utils.checksums import (
     SUMS,

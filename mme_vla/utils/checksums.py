@@ -122,7 +122,7 @@ def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """`values` without their seal; those that were written without one, by hand or long ago, are taken as they are."""
+    """`values` without their seal; those that were written without one, manually or long ago, are taken as they are."""
     inner = {key: value for key, value in values.items() if key != SEAL}
     if SEAL in values and values[SEAL] != _sum(inner):
         raise UserError(

@@ -91,7 +91,7 @@ def require_file(path: Path, what: str = "a file") -> Path:
 
 
 def _short_path(path: Path) -> str:
-    """A path in a message; a stranger's file may have given it a name of any length."""
+    """A path in a message; an untrusted file may have given it a name of any length."""
     return brief(str(path), 300, quote=False)
 
 

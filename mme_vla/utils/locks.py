@@ -18,7 +18,7 @@ _locked: set[int] = set()  # descriptors
 
 
 def _release_all() -> None:
-    """A forked process holds nothing: it would go on holding the folder when this process is gone."""
+    """A forked process holds nothing: it would continue holding the folder when this process is gone."""
     while _locked:
         os.close(_locked.pop())
 

@@ -1,4 +1,4 @@
-"""What people look at: one writer of films, one contact sheet, one border. Pictures are [H, W, 3] uint8 throughout."""
+"""What people look at: one writer of videos, one contact sheet, one border. Images are [H, W, 3] uint8 throughout."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from PIL.Image import Image
     from PIL.ImageFont import FreeTypeFont, ImageFont
 
-FPS = 30  # of films; the simulator's steps simply play faster
-RED = (255, 0, 0)  # the border of a conditioning video's pictures
+FPS = 30  # of videos; the simulator's steps simply play faster
+RED = (255, 0, 0)  # the border of a conditioning video's images
 BORDER = 10  # pixels
-CAPTION = 24  # pixels below a film's pictures
+CAPTION = 24  # pixels below a video's images
 INK, FAINT = (40, 40, 40), (150, 150, 150)
 TILE, GAP, MARGIN, LABEL = 160, 12, 20, 20  # pixels of a contact sheet
 
 
 class VideoWriter:
-    """An H.264 mp4 that is compressed as its frames come, so that no film is held in memory.
+    """An H.264 mp4 that is compressed as its frames come, so that no video is held in memory.
 
-    A context manager: the film ends with the block.
+    A context manager: the video ends with the block.
 
     Args:
         target: a path, written in place (draw into a draft what is to appear whole), or a binary file.
@@ -59,7 +59,7 @@ class VideoWriter:
         self.frames += 1
 
     def close(self, complete: bool = True) -> None:
-        """End the film; with `whole=False` what the encoder still holds is dropped, for a file that is thrown away."""
+        """End the video; with `whole=False` what the encoder still holds is dropped, for a file that is thrown away."""
         if complete and self._stream is not None:
             self._container.mux(self._stream.encode(None))
         self._container.close()
@@ -72,7 +72,7 @@ class VideoWriter:
 
 
 def write_video(frames: Iterable[np.ndarray], path: Path, **options: Any) -> int:
-    """Write frames of one size as a film that appears only when it is whole; return their number.
+    """Write frames of one size as a video that appears only when it is whole; return their number.
 
     Args:
         options: as `Film`.
@@ -93,7 +93,7 @@ def video_bytes(frames: Iterable[np.ndarray], **options: Any) -> bytes:
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """A picture as PNG."""
+    """An image as PNG."""
     from PIL import Image
 
     buffer = BytesIO()
@@ -102,7 +102,7 @@ def png_bytes(image: np.ndarray) -> bytes:
 
 
 def bordered(image: np.ndarray, pixels: int = BORDER) -> np.ndarray:
-    """The picture in a red border: it belongs to a conditioning video."""
+    """The image in a red border: it belongs to a conditioning video."""
     framed = image.copy()
     for edge in (np.s_[:pixels], np.s_[-pixels:], np.s_[:, :pixels], np.s_[:, -pixels:]):
         framed[edge] = RED
@@ -137,7 +137,7 @@ def video_frame(views: Sequence[np.ndarray], caption: str | None = None, video: 
 
 
 def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
-    """Pictures of any sizes as frames of a film: each at the top left of a white one that holds the largest."""
+    """Images of any sizes as frames of a video: each at the top left of a white one that holds the largest."""
     from PIL import Image
 
     width, height = (-(-max(image.size[axis] for image in images) // 2) * 2 for axis in (0, 1))
@@ -149,7 +149,7 @@ def of_one_size(images: Sequence["Image"]) -> Iterator[np.ndarray]:
 
 @dataclass(frozen=True)
 class Tile:
-    """One picture of a contact sheet. outline: a colour around it; None for none."""
+    """One image of a contact sheet. outline: a colour around it; None for none."""
 
     image: np.ndarray
     label: str
@@ -162,7 +162,7 @@ def contact_sheet(
     """Tiles in rows, each above its label.
 
     Args:
-        columns: tiles a row. title: one line above them. header: a picture between title and tiles.
+        columns: tiles a row. title: one line above them. header: an image between title and tiles.
         side: pixels of a tile.
     """
     from PIL import Image, ImageDraw
@@ -191,7 +191,7 @@ def evenly_spaced(count: int, limit: int) -> list[int]:
 
 
 def thumbnail(image: np.ndarray, side: int = TILE) -> "Image":
-    """The picture as a square of `side` pixels."""
+    """The image as a square of `side` pixels."""
     from PIL import Image
 
     return Image.fromarray(image).resize((side, side), Image.Resampling.LANCZOS)
@@ -227,5 +227,5 @@ def _fill(video: VideoWriter, frames: Iterable[np.ndarray]) -> int:
     for frame in frames:
         video.add(frame)
     if not video.frames:
-        raise ValueError("A film needs at least one frame.")
+        raise ValueError("A video needs at least one frame.")
     return video.frames

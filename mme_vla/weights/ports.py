@@ -27,7 +27,7 @@ _SPELLINGS = [
     (rf"{_VLM}(vision_tower|multi_modal_projector)\.", rf"{names.ROOT}.paligemma.model.\1."),
     (rf"{_VLM}model\.vision_tower\.(?!vision_model\.)", f"{names.VISION}."),
 ]
-WINDOW_MEMORY = {"use_visual_memory": "past pictures in its vision tower", "use_proprioceptive_memory": "past states"}
+WINDOW_MEMORY = {"use_visual_memory": "past images in its vision tower", "use_proprioceptive_memory": "past states"}
 """LeRobot's short-window memory of π0.5, by the settings that turn it on; the first adds no tensors."""
 HISTORY = "proprio_history_proj"
 """The tensors that the second adds."""

@@ -1,4 +1,4 @@
-"""Datasets, caches and rows that are not what was written: said in words, and before anything is trained on them."""
+"""Datasets, caches and rows that are not what was written: reported, and before anything is trained on them."""
 
 import os
 import shutil

@@ -58,11 +58,11 @@ def test_things_are_made_ahead_and_no_further() -> None:
 def test_what_goes_wrong_ahead_is_raised_where_it_is_used() -> None:
     def things():
         yield 1
-        raise UserError("broken picture")
+        raise UserError("broken image")
 
     found = ahead(things(), 2)
     assert next(found) == 1
-    with pytest.raises(UserError, match="broken picture"):
+    with pytest.raises(UserError, match="broken image"):
         next(found)
 
 

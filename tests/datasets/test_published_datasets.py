@@ -1,4 +1,4 @@
-"""The layouts in which RoboMME is published for LeRobot, made by hand: what each has, lacks, and how it is read."""
+"""The layouts in which RoboMME is published for LeRobot, made manually: what each has, lacks, and how it is read."""
 
 import json
 import logging

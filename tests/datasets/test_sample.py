@@ -14,7 +14,7 @@ from mme_vla.data.sample import EPISODES
 
 def test_the_sample_is_small_and_documented() -> None:
     assert sum(file.stat().st_size for file in SAMPLE.rglob("*") if file.is_file()) < 6_000_000
-    assert "Stale pictures" in (SAMPLE / "README.md").read_text()
+    assert "Stale images" in (SAMPLE / "README.md").read_text()
 
 
 def test_the_sample_holds_four_real_demonstrations() -> None:

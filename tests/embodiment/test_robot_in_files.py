@@ -44,7 +44,7 @@ def test_the_robot_tells_compositions_apart_and_the_panda_goes_without_saying() 
 def test_a_camera_is_a_column_of_pictures(tmp_path: Path) -> None:
     numbers = {"dtype": "float32", "shape": (8,)}
     features = {"image": numbers, "wrist_image": {"dtype": "video", "shape": (8, 8, 3)}, "state": numbers}
-    with pytest.raises(UserError, match=r"image holds 'float32', no pictures.*cameras\.front\.key"):
+    with pytest.raises(UserError, match=r"image holds 'float32', no images.*cameras\.front\.key"):
         find_columns(tmp_path, {**features, "actions": numbers}, ROBOMME_JOINT)
 
 

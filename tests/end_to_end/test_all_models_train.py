@@ -44,7 +44,7 @@ SHORT_MEMORY = {
 
 @pytest.fixture(scope="module", autouse=True)
 def opened_once() -> Iterator[None]:
-    """Every run reads the same steps of the same files: open the sample once, and decode each picture once."""
+    """Every run reads the same steps of the same files: open the sample once, and decode each image once."""
     sources = open_sources(["sample"])
     for source in sources:
         _remember_pictures(source)

@@ -108,7 +108,7 @@ def test_a_documented_command_runs_as_printed(page: str, command: str, root: Pat
 
 @pytest.mark.parametrize(("page", "command"), OTHERS)
 def test_the_words_of_other_documented_commands_are_valid(page: str, command: str) -> None:
-    filled = re.sub(r"<the words[^>]*>|(?<= )(…|\$B)", "", command)  # what stands for several words, and may be none
+    filled = re.sub(r"<the words[^>]*>|(?<= )(…|\$B)", "", command)  # what means several words, and may be none
     words = shlex.split(re.sub(r"<[^>]*>|…", "x", filled), comments=True)
     module = next((word for word in words if re.match(r"mme_vla(\.|$)", word)), None)
     if module is None:

@@ -20,7 +20,7 @@ from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
 
 EPISODES = ["tasks=[PickXtimes,StopCube]", "episodes=2", "max_steps=18", "max_batch=1", "flow_steps=3"]
-ONE, TWO = "workers=1", "workers=2"  # each worker computes for seconds before its first picture
+ONE, TWO = "workers=1", "workers=2"  # each worker computes for seconds before its first image
 
 
 def command(module: str, *words: str) -> list[str]:
@@ -85,7 +85,7 @@ def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(
     finished = lines(tmp_path / "killed")
     assert 2 <= len(finished) < 4
     said = call(*words, ONE)
-    assert "of 4 episodes: going on" in said
+    assert "of 4 episodes: continuing" in said
     assert lines(tmp_path / "killed")[: len(finished)] == finished, "what was finished was run again"
     assert {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "killed")} == whole
 

@@ -229,7 +229,7 @@ def test_a_tool_that_fails_unexpectedly_never_ends_the_script_in_silence(make: M
 
 def test_another_system_is_told_what_to_do(make: Make) -> None:
     ended = make('ID=fedora\nPRETTY_NAME="Fedora Linux 42"\n').run()
-    assert ended.status == 1 and "Fedora Linux 42" in ended.said and "by hand" in ended.said
+    assert ended.status == 1 and "Fedora Linux 42" in ended.said and "manually" in ended.said
 
 
 @pytest.mark.skipif(shutil.which("dpkg-query") is None, reason="no dpkg on this system")

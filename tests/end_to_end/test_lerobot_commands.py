@@ -1,4 +1,4 @@
-"""LeRobot's own commands with plugins/lerobot_policy_mme_vla installed: train, go on, evaluate with the video; and with
+"""LeRobot's own commands with plugins/lerobot_policy_mme_vla installed: train, continue, evaluate with the video; and with
 its own ACT on a dataset that this library wrote with LeRobot's names of columns.
 """
 

@@ -194,7 +194,7 @@ def test_a_chunk_agrees_with_the_one_under_way(package: ModuleType, theirs: Path
     ("changed", "said"),
     [
         ({"observation.state": None}, "needs the feature 'observation.state' of 8 numbers; there is none"),
-        ({"observation.images.image": None}, "No pictures of the camera 'front'"),
+        ({"observation.images.image": None}, "No images of the camera 'front'"),
     ],
 )
 def test_what_a_dataset_lacks_is_named(package: ModuleType, ours: Path, changed: dict[str, None], said: str) -> None:

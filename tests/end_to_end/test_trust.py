@@ -1,4 +1,4 @@
-"""A stranger's checkpoint: nothing it says leaves its folder, runs, or takes more memory than it has bytes."""
+"""A untrusted checkpoint: nothing it says leaves its folder, runs, or takes more memory than it has bytes."""
 
 import json
 import os
@@ -29,7 +29,7 @@ def policy() -> MMEPolicy:
 
 @pytest.fixture
 def folder(policy: MMEPolicy, tmp_path: Path) -> Path:
-    """A checkpoint without sums, which a stranger would leave out."""
+    """A checkpoint without sums, which an untrusted source would leave out."""
     policy.save_pretrained(tmp_path / "checkpoint")
     (tmp_path / "checkpoint" / SUMS).unlink()
     return tmp_path / "checkpoint"

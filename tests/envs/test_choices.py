@@ -73,7 +73,7 @@ def test_the_best_of_the_offered_letters_is_taken_and_no_other() -> None:
     among = tuple(Option(letter, "go") for letter in "bd")
     decided = SPACE.decide(scores, among)
     assert decided[:, :8].argmax(1).tolist() == [3, 1] and decided[:, :8].sum(1).tolist() == [1, 1]
-    assert decided[:, 8:].tolist() == [[0, 1], [0, 1]], "a point lies in the picture"
+    assert decided[:, 8:].tolist() == [[0, 1], [0, 1]], "a point lies in the image"
     assert SPACE.decide(scores, read_options(EIGHT, 8))[0, :8].argmax() == 6
     with pytest.raises(UserError, match="offers none"):
         SPACE.decide(scores, ())

@@ -114,7 +114,7 @@ def test_demonstrations_repeat_the_recorded_ones_step_by_step(
     np.testing.assert_allclose(np.array(actions), joints[:, :columns], atol=tolerance)
     noted = np.array([waypoint for waypoint, kept in zip(log.active, stored, strict=True) if kept])
     known = ~np.isnan(waypoints[:, 0])
-    # A demonstrator's waypoints go on where a recorder forgets them, between video and execution.
+    # A demonstrator's waypoints continue where a recorder forgets them, between video and execution.
     assert np.isfinite(noted[known]).all()
     np.testing.assert_allclose(noted[known][:, [0, 1, 2, 6]], waypoints[known][:, [0, 1, 2, 6]], atol=1e-4)
     turn = Rotation.from_euler("xyz", noted[known][:, 3:6]).inv() * Rotation.from_euler("xyz", waypoints[known][:, 3:6])

@@ -11,7 +11,7 @@ from mme_vla.envs.subtasks import Progress, SubTask
 from mme_vla.errors import UserError
 
 STEPS, LOOK = 80, 4
-"""Enough for objects to be covered (64), and for the first swap to be under way; what once differs goes on to."""
+"""Enough for objects to be covered (64), and for the first swap to be under way; what once differs continues to."""
 
 
 def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:

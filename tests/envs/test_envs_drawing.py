@@ -1,4 +1,4 @@
-"""Environments that are told what to draw: the same simulation, the same pictures, and no others."""
+"""Environments that are told what to draw: the same simulation, the same images, and no others."""
 
 from typing import Any
 

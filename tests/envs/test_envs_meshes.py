@@ -1,4 +1,4 @@
-"""The wrist camera's body is drawn with fewer triangles, and the pictures stay the same."""
+"""The wrist camera's body is drawn with fewer triangles, and the images stay the same."""
 
 from pathlib import Path
 from typing import Any

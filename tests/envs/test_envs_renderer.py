@@ -19,7 +19,7 @@ def _can_render() -> None:
 
 
 def first_pictures(episode: int) -> np.ndarray:
-    """Front and wrist picture an episode begins with, [2, 256, 256, 3]; its environment is gone afterwards."""
+    """Front and wrist image an episode begins with, [2, 256, 256, 3]; its environment is gone afterwards."""
     env = make_env("PickXtimes", "test", episode)
     observation, _ = env.reset()
     env.close()

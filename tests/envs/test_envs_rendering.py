@@ -1,4 +1,4 @@
-"""Pictures of the environment against official ones; needs Vulkan, software rendering suffices."""
+"""Images of the environment against official ones; needs Vulkan, software rendering suffices."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Robots, objects and scenes against the official episodes: same places, same pictures, same motion."""
+"""Robots, objects and scenes against the official episodes: same places, same images, same motion."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""A saved state goes on as if nothing had been between, and rewards add up to what was done."""
+"""A saved state continues as if nothing had been between, and rewards add up to what was done."""
 
 import pickle
 from typing import Any

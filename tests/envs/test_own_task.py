@@ -65,7 +65,7 @@ def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    drawn = "frames=[0]"  # a picture takes its time
+    drawn = "frames=[0]"  # an image takes its time
     words = [
         "tasks=TwoButtons",
         "episodes=1",

@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def expected(number: int) -> np.ndarray:
-    """What stands in the files: `tool_at` is so far short of `pose_at`, and a whole turn away in roll."""
+    """What is in the files: `tool_at` is so far short of `pose_at`, and a whole turn away in roll."""
     lag = [0.01, -0.02, 0.001 * number, 0.05, 0.1, -0.1]
     return np.array([*lag, pose_at(number)[6]])
 

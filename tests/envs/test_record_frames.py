@@ -100,7 +100,7 @@ def test_what_is_drawn_is_what_a_whole_recording_shows(recorded: EpisodeRef) -> 
         with pytest.raises(UserError, match=r"front was not drawn at step 1; .* frames=decisions"):
             episode.front(1)
     assert choice == {"at": "decisions", "memory": {"name": "framesamp", "budget": 64}}
-    # What of a whole recording is compared, and the steps before, whose pictures these would be if any were stale.
+    # What of a whole recording is compared, and the steps before, whose images these would be if any were stale.
     more = {int(k) + d for steps in drawn.values() for k in np.flatnonzero(steps) for d in (-1, 0)}
     task = make_task("PatternLock", render=True, seed=seed, difficulty="easy")
     whole = Recorder(task, render_request=RenderRequest({"front": more, "wrist": more})).record().frames

@@ -1,4 +1,4 @@
-"""The official episodes at hand, replayed: same words, same picture, same success, in every action space.
+"""The official episodes at hand, replayed: same words, same image, same success, in every action space.
 
 `MME_VLA_ROBOMME_H5` names another folder of `record_dataset_<Task>.h5` files; every episode in it is replayed.
 """
@@ -32,7 +32,7 @@ REFS = list_episodes(find_files([FOLDER])) if FOLDER.is_dir() else []
 RECOVERY = ("z", "z", "z", "xy", "xy", "xy")  # of train episodes 0 to 5
 SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
 PIXELS = 1.0
-"""Mean absolute difference allowed between the first pictures, of 255."""
+"""Mean absolute difference allowed between the first images, of 255."""
 PIXELS_ALONG = 0.5
 """The same along an episode."""
 MOST_PICTURES = 12
@@ -62,7 +62,7 @@ class Episode:
         return self._group[f"timestep_{step}/{key}"][()]
 
     def picture_steps(self, view: str, most: int) -> list[int]:
-        """Steps with a picture of their own, spread over the episode; small files link others to the one before."""
+        """Steps with an image of their own, spread over the episode; small files link others to the one before."""
         paths = [f"timestep_{k}/obs/{view}" for k in range(self.length)]
         places = [h5py.h5o.get_info(self._group[path].id).addr for path in paths]
         own = [k for k in range(self.length) if k == 0 or places[k] != places[k - 1]]
@@ -123,7 +123,7 @@ def test_pictures_along_the_replay_are_the_recorded_ones(episode: Episode) -> No
     # The list that an episode begins with ends with a frame that no step was stored for.
     numbers = {view: frozenset(k + (k >= episode.execution) for k in steps) for view, steps in wanted.items()}
     env = make_env(episode.ref.task, max_steps=5000, **episode.scene)
-    # A picture takes as long as dozens of steps.
+    # An image takes as long as dozens of steps.
     env.render_request = RenderRequest(
         {"front": numbers["front_rgb"], "wrist": numbers["wrist_rgb"]}, now=(), grounded=False
     )

@@ -1,4 +1,4 @@
-"""Films are compressed beside the simulation: the same film, and mistakes that are not lost."""
+"""Videos are compressed beside the simulation: the same video, and mistakes that are not lost."""
 
 import threading
 from pathlib import Path

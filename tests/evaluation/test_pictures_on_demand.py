@@ -33,7 +33,7 @@ MEMORIES: dict[str, dict[str, Any]] = {
 
 
 class WatchedEnv(ScriptedEnv):
-    """Draws only what it is asked for, as the simulated environments do; counts its pictures by camera."""
+    """Draws only what it is asked for, as the simulated environments do; counts its images by camera."""
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)
@@ -127,7 +127,7 @@ def test_a_predictor_that_watches_is_shown_every_frame_of_its_camera() -> None:
 
 
 class Glancer(Watcher):
-    """Looks at the current picture alone."""
+    """Looks at the current image alone."""
 
     sees_video = sees_passing = False
 

@@ -166,7 +166,7 @@ def test_a_run_file_changed_by_hand_is_noticed(tmp_path: Path) -> None:
     claim_run(tmp_path, {"a": 1})
     path = tmp_path / "run.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), "settings": {"a": 2}}))
-    with pytest.raises(UserError, match="changed by hand"):
+    with pytest.raises(UserError, match="changed manually"):
         read_run(tmp_path)
     path.write_text("{")
     with pytest.raises(UserError, match="not valid JSON"):

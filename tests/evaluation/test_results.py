@@ -69,13 +69,13 @@ def demo() -> Results:
 
 @pytest.fixture(scope="module")
 def made_up() -> list[EpisodeRecord]:
-    """One run of each method: that these are made up, and which there are, does not depend on how many."""
+    """One run of each method: that these are synthetic, and which there are, does not depend on how many."""
     return demo_records(results_command.DEMO, checkpoints=(60_000,), seeds=(7,))
 
 
 @pytest.fixture
 def drawn_once(monkeypatch: pytest.MonkeyPatch, made_up: list[EpisodeRecord]) -> None:
-    """The command's made-up records are drawn for all tests at once."""
+    """The command's synthetic records are drawn for all tests at once."""
     monkeypatch.setattr(results_command, "demo_records", lambda methods: list(made_up))
 
 
@@ -369,7 +369,7 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     assert "memory ttt, 512 tokens, integration expert" in trained and "data: robomme" in trained
     assert "updates 80000, samples an update 64, peak learning rate 5e-05" in trained
     assert "joint_angle actions, at most 1300 steps, model seeds 7, 42" in trained
-    assert unknown.count("state it by hand") == 2
+    assert unknown.count("state it manually") == 2
 
 
 @pytest.mark.usefixtures("drawn_once")
@@ -424,7 +424,7 @@ def test_latex_escapes_comparison_signs() -> None:
     [
         ({"memory": {"name": "ttt"}, "card": {"recipe": {"lr": "1e-4", "steps": 5}}}, "peak learning rate 1e-4"),
         ({"memory": {"budget": 64}, "card": {"recipe": {}}}, "memory without a name, 64 tokens"),
-        ({"memory": "ttt", "integration": "expert", "card": "by hand"}, "memory ttt, integration expert"),
+        ({"memory": "ttt", "integration": "expert", "card": "manually"}, "memory ttt, integration expert"),
         ({"card": {"recipe": "as released"}}, "training: as released"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Spacetime: past pictures in the vision tower and past states as tokens, as LeRobot's π0.5 has it."""
+"""Spacetime: past images in the vision tower and past states as tokens, as LeRobot's π0.5 has it."""
 
 import json
 from dataclasses import replace
@@ -173,7 +173,7 @@ def test_it_joins_with_others_and_two_that_look_back_are_refused() -> None:
 
 
 def test_where_it_has_no_place_a_sentence_says_so() -> None:
-    with pytest.raises(UserError, match="'nano' sees one picture at a time"):
+    with pytest.raises(UserError, match="'nano' sees one image at a time"):
         small_policy("spacetime_modul", backbone="nano")
     with pytest.raises(UserError, match="hands over no tokens as it is set"):
         small_policy("spacetime_context", memory={"states": False})

@@ -140,4 +140,4 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
     assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page
     assert "framesamp_modul@4 is significantly better than pi05 (p < 0.001)" in page
-    assert "| films | 2.0 | 1.0 |" in page and (tmp_path / "learning.png").is_file()
+    assert "| videos | 2.0 | 1.0 |" in page and (tmp_path / "learning.png").is_file()

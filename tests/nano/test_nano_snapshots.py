@@ -1,4 +1,4 @@
-"""Snapshots of a scene: pictures drawn afterwards are those that the episode shows."""
+"""Snapshots of a scene: images drawn afterwards are those that the episode shows."""
 
 import numpy as np
 import pytest

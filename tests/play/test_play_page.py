@@ -212,7 +212,7 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         assert browser.text("#do").startswith("Do it")
         browser.wait("document.querySelector('#badge').innerText === 'Present'")  # the video has played to its end
 
-        # Scrub back into the video, and see that a point is only taken in the present picture.
+        # Scrub back into the video, and see that a point is only taken in the present image.
         browser.press("ArrowLeft", shift=True)
         browser.wait("document.querySelector('#frame').classList.contains('video')")
         browser.click('.option[data-label="a"]')
@@ -225,7 +225,7 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         browser.wait("document.querySelectorAll('#history li').length === 1")
         assert browser.text("#history").endswith(f"press the block at row {row}, column {column}")
 
-        # The second choice with the keyboard alone: from the middle of the picture to the red block.
+        # The second choice with the keyboard alone: from the middle of the image to the red block.
         browser.wait("document.querySelectorAll('.option:not(:disabled)').length === 3")
         browser.press("a")
         for _ in range(6):

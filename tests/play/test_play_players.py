@@ -175,7 +175,7 @@ def test_a_tiny_qwen_plays_and_its_nonsense_is_survived():
     usage = player.notes()["usage"]
     assert (session.status, session.record(player.model).model) == ("fail", "tiny")
     assert usage["calls"] == usage["problems"]["malformed"] + usage["problems"].get("empty", 0) == 2
-    # Two video frames make a token grid of 8×8; four frames and the picture are read whole, nothing is shrunk.
+    # Two video frames make a token grid of 8×8; four frames and the image are read whole, nothing is shrunk.
     assert usage["input_tokens"] > 2 * (2 * 64 + 64)
     frames = np.zeros((16, 256, 256, 3), np.uint8)
     grid = QwenPlayer(vlm=player.vlm, clip_frames=16).vlm.processor.video_processor(

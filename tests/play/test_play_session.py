@@ -90,8 +90,8 @@ def test_an_error_of_the_planner_ends_the_episode_and_is_kept():
         ({"choice": "a", "point": ["x", 2]}, "needs two numbers"),
         ({"choice": "a", "point": [float("nan"), 2]}, "needs two numbers"),
         ({"choice": "a", "point": {"y": 1}}, "needs two numbers"),
-        ({"choice": "a", "point": [256, 2]}, "lies outside of the picture"),
-        ({"choice": "a", "point": [5, -1]}, "lies outside of the picture"),
+        ({"choice": "a", "point": [256, 2]}, "lies outside of the image"),
+        ({"choice": "a", "point": [5, -1]}, "lies outside of the image"),
     ],
 )
 def test_a_choice_that_cannot_be_made_is_refused_and_changes_nothing(action, message):

@@ -95,7 +95,7 @@ def test_a_broken_memory_is_told_which_promise_it_breaks(
 
 
 class _Unread(Context):
-    """Memory stands in the prefix and nobody may look at it."""
+    """Memory is in the prefix and nobody may look at it."""
 
     def __init__(self, backbone: Any) -> None:
         super().__init__(backbone)

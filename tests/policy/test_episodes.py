@@ -170,7 +170,7 @@ def test_damaged_and_missing_videos_are_named(copy: Path) -> None:
     video = next(copy.glob("videos/image/**/*.mp4"))
     whole = video.read_bytes()
     video.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UserError, match=r"file-000.mp4 holds no picture at 42.650 s"):
+    with pytest.raises(UserError, match=r"file-000.mp4 holds no image at 42.650 s"):
         EpisodeSource(copy).frames(3, [200])
     video.write_bytes(b"no video at all")
     with pytest.raises(UserError, match=r"file-000.mp4 is damaged: it cannot be read as a video"):

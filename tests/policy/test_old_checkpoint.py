@@ -1,4 +1,4 @@
-"""A checkpoint written before the folders were rearranged loads, goes on training and acts as it did then."""
+"""A checkpoint written before the folders were rearranged loads, continues training and acts as it did then."""
 
 import json
 import shutil

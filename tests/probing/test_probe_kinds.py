@@ -50,7 +50,7 @@ KINDS = {
 
 
 def chunks(policy: Any, word: str | None, step: int = 36) -> tuple[ProbedPolicy, list[np.ndarray]]:
-    """What a policy chooses under an arm at two moments of a made-up episode."""
+    """What a policy chooses under an arm at two moments of a synthetic episode."""
     recordings = made_up(robot=policy.embodiment)
     own = recordings[0]
     arm = read_arm(word) if word else UNPROBED

@@ -1,4 +1,4 @@
-"""Both resize paths give the released pixels, and refuse what is no picture."""
+"""Both resize paths give the released pixels, and refuse what is no image."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_w
 
 
 def cases(tensors: dict[str, Tensor], output: str) -> list[tuple[Tensor, Tensor]]:
-    """(input, golden output) of every golden case that stores whole pictures."""
+    """(input, golden output) of every golden case that stores whole images."""
     names = sorted({key.split("/")[0] for key in tensors if key.endswith(f"/{output}")})
     pairs = [(tensors[f"{name}/in_uint8"], tensors[f"{name}/{output}"]) for name in names]
     assert pairs
@@ -43,7 +43,7 @@ def test_both_paths_shrink_a_simulator_frame_as_released(parity: Path) -> None:
     tensors = load_file(parity / "unit_resize_with_pad.safetensors")
     what = json.loads((parity / "unit_resize_with_pad.json").read_text())["what"]
     numbers = re.search(r"repeated (\d+)x\1 .*?(\d+), rows (\d+):(\d+), cols (\d+):(\d+)", what)
-    assert numbers, "the description no longer says which part of the picture is stored"
+    assert numbers, "the description no longer says which part of the image is stored"
     repeat, size, top, bottom, left, right = map(int, numbers.groups())
     (small,) = (value for key, value in tensors.items() if key.startswith("case0/in_"))
     frame = small.repeat_interleave(repeat, 0).repeat_interleave(repeat, 1)
@@ -82,7 +82,7 @@ def test_float_and_channel_first_pictures_become_the_same_bytes() -> None:
 @pytest.mark.parametrize(
     ("picture", "message"),
     [
-        (np.zeros((4, 4), np.uint8), "Expected a picture"),
+        (np.zeros((4, 4), np.uint8), "Expected an image"),
         (np.zeros((4, 4, 4), np.uint8), "three channels"),
         (np.full((4, 4, 3), -0.5, np.float32), r"must lie in \[0, 1\]"),
         (np.full((4, 4, 3), np.nan, np.float32), r"must lie in \[0, 1\]"),

@@ -149,7 +149,7 @@ def test_shapes_that_do_not_fit_are_refused() -> None:
         processor(action_dim=4)
     with pytest.raises(UserError, match="Expected 2 views"):
         processor().images([frames(8, 8)])
-    with pytest.raises(UserError, match="as many pictures"):
+    with pytest.raises(UserError, match="as many images"):
         processor().images([frames(8, 8), frames(2, 8, 8)])
 
 

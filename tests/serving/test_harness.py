@@ -29,7 +29,7 @@ STEPS, VIDEO = 37, 5
 
 
 class Scripted(StepBenchmark):
-    """What the harness's RoboMME sends, of an environment whose pictures follow the actions."""
+    """What the harness's RoboMME sends, of an environment whose images follow the actions."""
 
     def __init__(self, number: int, fails_at: int | None = None) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Who holds a place: hundreds of clients that never say goodbye, strangers without the key, and the silent."""
+"""Who holds a place: hundreds of clients that never say goodbye, untrusted sources without the key, and the silent."""
 
 import gc
 import re

@@ -139,7 +139,7 @@ def test_an_interrupted_build_continues_and_ends_the_same(h5, built, tmp_path, m
     assert Counter(written) == Counter(e.name for e in episodes), "no episode is built twice"
     files = sorted(p.relative_to(built) for p in built.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(output) for p in output.rglob("*") if p.is_file())
-    # Encoders may differ in the last bits of such tiny pictures, and so may the sums of their files; that the videos
+    # Encoders may differ in the last bits of such tiny images, and so may the sums of their files; that the videos
     # are there is checked above.
     same = [f for f in files if f.suffix != ".mp4" and f.name != SUMS]
     assert [f for f in same if (built / f).read_bytes() != (output / f).read_bytes()] == []

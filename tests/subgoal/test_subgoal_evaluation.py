@@ -159,7 +159,7 @@ def test_in_the_background_only_the_first_subgoal_is_waited_for() -> None:
     slow.go.release()
     assert predictor.predict([episode]) == [Subgoal("go 0", queried=True)]
     episode.observe(frames(1, 16))
-    assert predictor.predict([episode]) == [Subgoal("go 0")], "the policy goes on with the last one"
+    assert predictor.predict([episode]) == [Subgoal("go 0")], "the policy continues with the last one"
     episode.observe(frames(17, 16))
     assert predictor.predict([episode]) == [Subgoal("go 0")]
     slow.go.release()

@@ -95,7 +95,7 @@ def test_a_route_is_no_longer_than_its_steps_and_a_notebook_has_an_end() -> None
 
 
 class Model:
-    """Sees a subgoal complete where the newest picture is bright, and counts; keeps what it was asked."""
+    """Sees a subgoal complete where the newest image is bright, and counts; keeps what it was asked."""
 
     def __init__(self, server: ChatServer) -> None:
         self.asked: list[str] = []

@@ -27,7 +27,7 @@ class Scripted:
 
 
 def frames(count, first=0, size=256):
-    """Pictures that show their number in every pixel."""
+    """Images that show their number in every pixel."""
     return np.stack([np.full((size, size, 3), (first + t) % 256, np.uint8) for t in range(count)])
 
 

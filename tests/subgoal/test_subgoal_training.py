@@ -120,7 +120,7 @@ def test_damaged_rows_and_missing_pictures_are_named(tmp_path, data):
         read_rows(tmp_path / "rows.jsonl")
     with pytest.raises(UserError, match=r"mme_vla\.subgoal\.build"):
         read_rows(tmp_path / "nothing.jsonl")
-    with pytest.raises(UserError, match="is missing; expected a picture"):
+    with pytest.raises(UserError, match="is missing; expected an image"):
         question_of(read_rows(data / "simple.jsonl")[0], tmp_path)
 
 

@@ -1,4 +1,4 @@
-"""The command itself: killed in the middle and resumed, it goes on exactly where it was."""
+"""The command itself: killed in the middle and resumed, it continues exactly where it was."""
 
 import io
 import json
@@ -65,11 +65,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> None:
     whole, killed = runs[0] / "whole", runs[0] / "killed"
-    # The killed run may have come further than one checkpoint: go on from the first.
+    # The killed run may have come further than one checkpoint: continue from the first.
     for late in sorted((killed / "checkpoints").glob("step_*"))[1:]:
         late.rename(runs[0] / f"late_{late.name}")
     printed = finish(start(runs[0], f"resume={killed}", "output=unused"))
-    assert f"going on from {killed / 'checkpoints' / f'step_{SAVE_EVERY:06d}'}" in printed
+    assert f"continuing from {killed / 'checkpoints' / f'step_{SAVE_EVERY:06d}'}" in printed
     assert numbers(killed) == numbers(whole)
     assert not (runs[0] / "unused").exists()
     ours, theirs = (json.loads((folder / "summary.json").read_text()) for folder in (killed, whole))

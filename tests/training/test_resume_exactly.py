@@ -1,4 +1,4 @@
-"""A run that goes on from a checkpoint has the weights of one that never stopped, to the last bit."""
+"""A run that continues from a checkpoint has the weights of one that never stopped, to the last bit."""
 
 import shutil
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Films, contact sheets and the border of conditioning videos."""
+"""Videos, contact sheets and the border of conditioning videos."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -65,7 +65,7 @@ def test_an_episodes_film_shows_every_camera_of_the_robot(tmp_path: Path, names:
     order = [*names, *(name for name in ("front", "wrist") if name not in names)]  # the benchmark's own come last
     for colour, name in zip(inside, order, strict=True):
         assert np.abs(colour - {"front": GREEN, "wrist": BLUE, "side": YELLOW}[name]).max() < 25, name
-    assert frames[2][56, 32].max() < 25, "a lower picture stands on the upper edge, on black"
+    assert frames[2][56, 32].max() < 25, "a lower image stands on the upper edge, on black"
 
 
 def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
@@ -96,7 +96,7 @@ def test_a_film_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
     assert write_video([plain(GREEN)] * 3, path) == len(decoded(path)) == 3
     with pytest.raises(ValueError, match="at least one frame"):
         write_video([], path)
-    assert len(decoded(path)) == 3, "the old film stays"
+    assert len(decoded(path)) == 3, "the old video stays"
 
 
 def test_equal_frames_make_equal_bytes_and_odd_sides_are_kept(tmp_path: Path) -> None:

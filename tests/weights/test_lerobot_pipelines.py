@@ -31,7 +31,7 @@ def exportable() -> MMEPolicy:
 
 @pytest.fixture
 def fetched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """LeRobot's tokenizers come from the hub; here the shipped one stands for whatever is asked for."""
+    """LeRobot's tokenizers come from the hub; here the shipped one means whatever is asked for."""
     import lerobot.processor.tokenizer_processor as theirs
 
     names: list[str] = []

@@ -25,7 +25,7 @@ _SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """A list of frames that every demonstration is drawn at; all other steps have no pictures.
+    """A list of frames that every demonstration is drawn at; all other steps have no images.
 
     at: the frames that both cameras show. `decisions`: the last frame before each planned motion of the execution,
         where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
@@ -56,7 +56,7 @@ class FrameChoice:
         return RenderRequest(dict.fromkeys(CAMERAS, numbers), now=())
 
     def render_request(self, steps: Sequence["RecordedStep"]) -> RenderRequest:
-        """What is drawn of a demonstration whose steps are known, from a recording without pictures."""
+        """What is drawn of a demonstration whose steps are known, from a recording without images."""
         video = _video(steps)
         numbers = self._frame_numbers(steps, video)
         frames = {camera: frozenset(numbers) for camera in CAMERAS}

@@ -111,8 +111,8 @@ class Recorder:
 
     Args:
         task: created with the observation mode `none`.
-        render: take pictures; without them frames hold states, actions and plain texts only.
-        drawing: which stored steps are drawn, counted from 0, by which cameras; `obs` of the others has no pictures.
+        render: take images; without them frames hold states, actions and plain texts only.
+        drawing: which stored steps are drawn, counted from 0, by which cameras; `obs` of the others has no images.
             By default all. Where a text needs a pixel, the front camera looks all the same.
         on_step: takes each stored step; by default they are collected in `Recording.frames`.
     """

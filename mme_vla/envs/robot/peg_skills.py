@@ -102,7 +102,7 @@ class PegPrimitives(RobotControl):
             if flip:
                 # The tool is turned where it is, which puts the peg's other end into the box ...
                 inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
-                # ... and only in this case is that made up for.
+                # ... and only in this case is that synthetic for.
                 along += grip.p[0] if head_first and along < 0 else 0.0
             return inserted * sapien.Pose([along, 0, -raised])
 
@@ -121,7 +121,7 @@ class PegPrimitives(RobotControl):
             grasped_end: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
-            begun: the peg is in the hole already, and only has to go on.
+            begun: the peg is in the hole already, and only has to continue.
         """
         head_first = grasped_end in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail

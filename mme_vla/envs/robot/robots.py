@@ -105,7 +105,7 @@ def _add_mount(robot: ElementTree.Element, donor: ElementTree.Element) -> None:
     joints = [joint for joint in donor.findall("joint") if joint.find("child").attrib["link"] in MOUNT]  # type: ignore[union-attr]
     links = [link for link in donor.findall("link") if link.attrib["name"] in MOUNT]
     for visual in [visual for link in links for visual in link.findall("visual")]:
-        for material in visual.findall("material"):  # the camera is white in the official pictures
+        for material in visual.findall("material"):  # the camera is white in the official images
             visual.remove(material)
     robot.extend([*links, *joints])
 

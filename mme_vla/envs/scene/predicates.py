@@ -48,7 +48,7 @@ def dropped(env: "Task", thing: Thing) -> bool:
 
 
 def dropped_onto(env: "Task", thing: Thing, target: Thing) -> bool:
-    """The object was let go on the target."""
+    """The object was let continue the target."""
     return distance_xy(thing.position, target.position) <= ON_TARGET and dropped(env, thing)
 
 
@@ -63,7 +63,7 @@ def over(position: np.ndarray, target: Thing, distance: float = 0.01, height: fl
 
 
 def pressed(button: "Button") -> bool:
-    """The button is held down at this moment."""
+    """The button is held down at this time step."""
     return button.depth > PRESSED
 
 

@@ -26,14 +26,15 @@ class Stage(BaseEnv):
 
     Args:
         seed: fixes the scene and the script; the `seed` of `reset` has no effect.
-        second_tries: the demonstrator goes on where the benchmark's own gives up; without it, it fails where that does.
+        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
+        does.
     """
 
     SUPPORTED_REWARD_MODES = ("none", "dense")
     stick: ClassVar[bool] = False
     """The robot holds a stick instead of a gripper."""
     spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
-    """From where, and to where, the camera for people looks; no policy sees its pictures."""
+    """From where, and to where, the camera for people looks; no policy sees its images."""
 
     _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the cameras' settings that were asked for
 
@@ -80,7 +81,7 @@ class Stage(BaseEnv):
         """Give up the scene. What it holds points back to it, so this circle is cut here.
 
         ManiSkill has all garbage of the process collected instead, before and after every episode: 0.4 s of the 0.5 s
-        that an episode without pictures takes to begin and end.
+        that an episode without images takes to begin and end.
         """
         self._close_viewer()
         if self.scene is not None:

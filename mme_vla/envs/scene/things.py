@@ -61,7 +61,7 @@ class Thing:
         self._draw(bool(self.position[2] > UNDER_THE_FLOOR))
 
     def _draw(self, visible: bool) -> None:
-        """Leave out of the pictures what the floor hides anyway: dozens of marks cost a third of the rendering."""
+        """Leave out of the images what the floor hides anyway: dozens of marks cost a third of the rendering."""
         body = self.entity._objs[0].find_component_by_type(RenderBodyComponent) if self._may_sink else None
         if body is not None and bool(body.visibility) != visible:
             body.visibility = float(visible)

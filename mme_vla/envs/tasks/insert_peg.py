@@ -101,7 +101,8 @@ class InsertPeg(Task):
     def _flung(self) -> bool:
         """Whether the peg left at once where it was put back: it keeps what speed the hand or the box gave it.
 
-        No official episode shows that, since its demonstrator could not go on from there; the peg is laid down at rest.
+        No official episode shows that, since its demonstrator could not continue from there; the peg is laid down at
+        rest.
         """
         return float(np.linalg.norm(self.peg.position - self.peg.initial_pose.p)) > FLUNG
 

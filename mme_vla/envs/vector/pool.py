@@ -182,7 +182,7 @@ class VecEnv:
         """Wait until at least one worker is ready, and take the replies of all that are.
 
         A worker that died or hangs, or whose renderer failed, is replaced, and reported by a reply with `crashed` and
-        the status `error`; the others go on.
+        the status `error`; the others continue.
 
         Args:
             timeout: seconds to wait at most; None waits as long as commands may take.

@@ -22,7 +22,7 @@ BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 # outcome of a command. FAILURE: the command raised. LOST: it raised, and the process is of no further use.
 PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
-RESET, STEP, CLOSE, CONTINUE = "reset", "step", "close", "go on"
+RESET, STEP, CLOSE, CONTINUE = "reset", "step", "close", "continue"
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def read(block: Any, slots: list[Slot]) -> list[np.ndarray]:
 
 
 def restore(value: Any, arrays: list[np.ndarray]) -> Any:
-    """Put the arrays back where `Placed` stands for them."""
+    """Put the arrays back where `Placed` means them."""
     if isinstance(value, Placed):
         return arrays[value.index]
     if isinstance(value, dict):

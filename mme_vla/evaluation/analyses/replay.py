@@ -20,8 +20,8 @@ def replay(
 ) -> Iterator[tuple[int, Episode]]:
     """Show a recorded episode frame by frame and let the policy act at every `stride`-th execution step.
 
-    The recorded actions go on being executed, whatever the policy answers. Subgoals, where the policy reads them, are
-    the recorded ones.
+    The recorded actions continue being executed, whatever the policy answers. Subgoals, where the policy reads them,
+    are the recorded ones.
 
     Args:
         most: chunks at most, spread over the episode.

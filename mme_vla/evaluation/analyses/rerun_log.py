@@ -1,4 +1,4 @@
-"""Episodes for the Rerun viewer: pictures, numbers and words over the steps, in one `.rrd` file."""
+"""Episodes for the Rerun viewer: images, numbers and words over the steps, in one `.rrd` file."""
 
 from pathlib import Path
 from types import TracebackType
@@ -39,7 +39,7 @@ class RerunLog:
         self._stream.set_time("step", sequence=step)
 
     def log_image(self, name: str, pixels: np.ndarray | Image.Image) -> None:
-        """Log a picture [H, W, 3] uint8."""
+        """Log an image [H, W, 3] uint8."""
         image = self._rerun.Image(np.asarray(pixels))
         self._log(name, image.compress(jpeg_quality=_JPEG_QUALITY))
 
@@ -52,7 +52,7 @@ class RerunLog:
         self._log(name, self._rerun.TextDocument(text))
 
     def views(self, source: EpisodeSource, episode: int, step: int) -> None:
-        """Go to a step of a recorded episode, and log its pictures and words."""
+        """Go to a step of a recorded episode, and log its images and words."""
         self.at(episode, step)
         for view in source.robot.camera_names:
             self.log_image(f"views/{view}", source.frames(episode, np.array([step]), view)[0])

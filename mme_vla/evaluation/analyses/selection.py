@@ -20,14 +20,14 @@ def selection_sheets(
     Selections need no weights: the tokens stored are empty.
 
     Yields:
-        (step, picture); pictures grow with what is remembered.
+        (step, image); images grow with what is remembered.
     """
     import torch
 
     if not 0 <= episode < len(source):
         raise UserError(f"episode={episode}: {source.name} has episodes 0 … {len(source) - 1}.")
     if every < 1:
-        raise UserError(f"every={every} must be at least 1: the steps between two pictures.")
+        raise UserError(f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
     history, patches = OnlineHistory(memory.storage, memory.make_scorer(), start), memory.storage.grid**2

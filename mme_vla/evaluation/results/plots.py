@@ -1,4 +1,4 @@
-"""The report's figures, as SVG text that stands in a page by itself."""
+"""The report's figures, as SVG text that is in a page by itself."""
 
 import io
 from collections.abc import Iterator, Sequence
@@ -189,7 +189,7 @@ def figure(size: tuple[float, float], panels: int = 1) -> "Iterator[tuple[Canvas
 
 
 def svg(canvas: "Canvas") -> str:
-    """The figure as an element that stands in a page."""
+    """The figure as an element that is in a page."""
     out = io.StringIO()
     canvas.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()

@@ -1,4 +1,4 @@
-"""One self-contained HTML page of results: no script, no address, pictures inside."""
+"""One self-contained HTML page of results: no script, no address, images inside."""
 
 from collections.abc import Sequence
 from datetime import UTC, datetime

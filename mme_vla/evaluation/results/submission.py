@@ -8,7 +8,7 @@ from mme_vla.evaluation.results.aggregate import Method
 from mme_vla.evaluation.results.tables import escape_markdown
 from mme_vla.evaluation.store import RUN_FILE, read_run
 
-UNKNOWN = "not recorded with these results: state it by hand"
+UNKNOWN = "not recorded with these results: state it manually"
 RECIPE = {
     "steps": "updates", "batch_size": "samples an update", "lr": "peak learning rate", "warmup": "warm-up updates",
     "ema": "decay of the averaged weights", "weight_decay": "weight decay",

@@ -212,7 +212,7 @@ def to_markdown(table: Table) -> str:
 
 
 def escape_markdown(text: str) -> str:
-    """Text in one line of Markdown: no name in it becomes a link, a picture, HTML, or a cell of its own."""
+    """Text in one line of Markdown: no name in it becomes a link, an image, HTML, or a cell of its own."""
     return re.sub(r"[\\|<`]|(?<=\])[(:\[]", r"\\\g<0>", " ".join(text.splitlines()))
 
 

@@ -40,13 +40,13 @@ The robot's `readings`, if it has any, are lists of all frames.
 
 
 class RenderClock:
-    """Adds up what the simulator spends on taking pictures, where its scene is within reach."""
+    """Adds up what the simulator spends on taking images, where its scene is within reach."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def watch(self, env: Any) -> None:
-        """Time the pictures of this environment; those of the official package cannot be told from its simulation."""
+        """Time the images of this environment; those of the official package cannot be told from its simulation."""
         scene = getattr(getattr(env, "task", None), "scene", None)
         if scene is None:
             return
@@ -102,7 +102,7 @@ class ChunkEnv:
         """All frames of the conditioning video, the current one last, and the report.
 
         Args:
-            draw: the pictures that are asked for; by default all.
+            draw: the images that are asked for; by default all.
         """
         self._ask(draw)
         with self._simulation():
@@ -118,7 +118,7 @@ class ChunkEnv:
         """Execute actions one after the other until they, or the episode, are over.
 
         Args:
-            command: `actions` [n, w]; `subgoal`, the text that stands in the video meanwhile; `draw`, the pictures that
+            command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that
                 are asked for, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
@@ -147,7 +147,7 @@ class ChunkEnv:
             count = frames.add(observation)
             self._note_pose(observation)
             n_frames += count
-            self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could go on for ever
+            self._steps += max(count, 1)  # a choice that moves nothing takes time too, or it could continue for ever
             self._draw(frames, count, caption=command.get("subgoal"))
             spent = self._executed == self._max_actions
             if not (terminated or truncated) and (spent or self._steps > self._max_steps):
@@ -177,7 +177,7 @@ class ChunkEnv:
             self._pose = np.asarray(poses[-1], np.float64)
 
     def _ask(self, request: RenderRequest | None) -> None:
-        # A film shows everything; and not every environment can leave pictures out.
+        # A video shows everything; and not every environment can leave images out.
         if self._video is None and hasattr(self._env, "render_request"):
             self._env.render_request = request
 
@@ -248,7 +248,7 @@ class _Frames:
         return len(joints)
 
     def leave(self, draw: RenderRequest | None, first: int) -> int:
-        """Leave out the pictures that were not asked for; from the first frame's number to the one that follows."""
+        """Leave out the images that were not asked for; from the first frame's number to the one that follows."""
         stop = first + len(self._states)
         if draw is not None:
             for frame in range(first, stop):
@@ -259,7 +259,7 @@ class _Frames:
         return stop
 
     def newest(self, count: int) -> Iterator[tuple[Any, ...]]:
-        """The last frames before any was left out, each as its pictures: the robot's cameras, then the benchmark's."""
+        """The last frames before any was left out, each as its images: the robot's cameras, then the benchmark's."""
         return zip(*(images[len(self._states) - count :] for images in self._images.values()), strict=True)
 
     def observation(self) -> Observation:

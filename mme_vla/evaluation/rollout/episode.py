@@ -55,7 +55,7 @@ class RunningEpisode:
         self.process: dict[str, Any] = {}
         """Where the chain of sub-tasks broke, once the episode is over; empty where the environment does not tell."""
         self.redrawn: int | None = None
-        """Frames of the conditioning video, once it is being simulated again for its pictures."""
+        """Frames of the conditioning video, once it is being simulated again for its images."""
         self._actions = hashlib.sha256()
         self._robot = policy.embodiment
         self._sent = np.zeros((0, self._robot.action.width), np.float32)
@@ -125,7 +125,7 @@ class RunningEpisode:
         self.add_policy_seconds(time.perf_counter() - begun)
 
     def _views(self, part: slice) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """Pictures of every camera, and their places in this part of the frames."""
+        """Images of every camera, and their places in this part of the frames."""
         views, rendered = {}, {}
         for name in self._robot.camera_names:
             images = self._frames[name][part]

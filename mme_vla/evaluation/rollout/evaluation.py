@@ -124,7 +124,7 @@ def evaluate(
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
     shard = shard or Shard()
     with RecordLog(output / shard.file) as log:
-        remove_drafts(output / VIDEOS)  # films of workers that were killed
+        remove_drafts(output / VIDEOS)  # videos of workers that were killed
         done = _done(output, jobs, facts)
         missing = [job for job in jobs if (job.task, job.episode) not in finished(done)]
         durations = Durations(earlier_records(output, times_from))
@@ -132,7 +132,7 @@ def evaluate(
         completed = [record for record in done if record.outcome != "error"]
         with RolloutProgress(len(jobs), completed, show_progress) as progress:
             if completed:
-                progress.say(f"{output} holds {len(completed)} of {len(jobs)} episodes: going on with the others")
+                progress.say(f"{output} holds {len(completed)} of {len(jobs)} episodes: continuing with the others")
             workers = settings.worker_count(-(-len(missing) // shard.count))
             if forecast := durations.forecast(missing, workers, shard.count):
                 progress.say(str(forecast))

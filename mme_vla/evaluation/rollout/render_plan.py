@@ -1,7 +1,7 @@
-"""Which pictures a rollout asks its environments for: those that the policy and its predictor look at, no others.
+"""Which images a rollout asks its environments for: those that the policy and its predictor look at, no others.
 
 When a policy acts is known beforehand, so what its memory reads is too, but for one thing: how long the conditioning
-video is. An episode therefore begins without those of its pictures that depend on it. Where some turn out to be
+video is. An episode therefore begins without those of its images that depend on it. Where some turn out to be
 needed, it begins once more, and the same simulation then draws them.
 """
 

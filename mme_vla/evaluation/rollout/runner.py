@@ -109,7 +109,7 @@ class Rollout:
         facts: what the records say of the policy.
         record: called with every record, as soon as there is one.
         subgoals: who says the subgoal; None leaves it out of the prompt.
-        subgoal_folder: where every subgoal is written down with its picture; None keeps the scores alone.
+        subgoal_folder: where every subgoal is written down with its image; None keeps the scores alone.
     """
 
     policy: Policy
@@ -186,7 +186,7 @@ class Rollout:
         self._scheduler.reading.append(running)
 
     def _draws_again(self, running: RunningEpisode, reply: Reply) -> bool:
-        """Let the episode begin once more if pictures of its video are needed that it did not draw."""
+        """Let the episode begin once more if images of its video are needed that it did not draw."""
         missing, length = self._render_plan.missing(reply.observation), len(reply.observation["state"]) - 1
         if running.redrawn not in (None, length):
             raise UserError(

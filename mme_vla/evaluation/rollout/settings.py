@@ -24,10 +24,10 @@ class RolloutSettings:
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
     encode_chunk: frames encoded before other episodes may act.
-    retries: how often an episode whose environment failed is tried again before the run goes on without it.
+    retries: how often an episode whose environment failed is tried again before the run continues without it.
     timeout_s: seconds after which an environment that does not answer is replaced.
-    draw: `needed`: pictures of what the policy and its subgoals look at; `all`: of every frame. Outcomes are the same.
-    subgoal_log: whether every subgoal is written down with its picture, where a predictor says them.
+    draw: `needed`: images of what the policy and its subgoals look at; `all`: of every frame. Outcomes are the same.
+    subgoal_log: whether every subgoal is written down with its image, where a predictor says them.
     """
 
     seed: int = 42

@@ -32,7 +32,7 @@ class SubgoalScore:
 
     chunks: times the policy acted. judged: of these, how often the environment had a subgoal to compare with.
     right: how often the words were the environment's. points, distance: points compared, and the sum of their distances
-    in pixels of the front picture. asked: questions to a model. problems: unusable answers by kind.
+    in pixels of the front image. asked: questions to a model. problems: unusable answers by kind.
     """
 
     chunks: int = 0
@@ -152,7 +152,7 @@ SUBGOALS = "subgoals"
 class SubgoalTrace:
     """Scores the subgoals of an episode and, given a folder, writes them down as they come.
 
-    `<folder>/<name>.jsonl` has a line for each time the policy acted, `<folder>/<name>/<step>.jpg` the picture it acted
+    `<folder>/<name>.jsonl` has a line for each time the policy acted, `<folder>/<name>/<step>.jpg` the image it acted
     on. A subgoal that was kept, or came in the background, is older: `asked_step` is the step of its question.
     What an earlier try of the same episode left there is replaced.
 

@@ -36,7 +36,7 @@ class EpisodeVideo:
         self._waiting: deque[Future[None]] = deque()
 
     def add(self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False) -> None:
-        """Append the pictures [H, W, 3] uint8 that all cameras took at one moment."""
+        """Append the images [H, W, 3] uint8 that all cameras took at one moment."""
         if self._video is None:
             self._video, self._thread = self._open(), ThreadPoolExecutor(1, "film")
         assert self._thread is not None

@@ -1,4 +1,4 @@
-"""Actions: an LSTM over what the robot itself felt and did; no picture is read (CAMP).
+"""Actions: an LSTM over what the robot itself felt and did; no image is read (CAMP).
 
 After "Remember what you did?" (CAMP, arXiv 2606.21188), whose code is not public: a recurrent memory of the robot's own
 actions is a strong history where scenes look alike. The paper trains it first to reconstruct the past actions (their
@@ -35,7 +35,7 @@ from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 NEVER = 1_000_000
-"""Frames between two whose pictures are kept: the first alone."""
+"""Frames between two whose images are kept: the first alone."""
 
 
 class MotionRows(History):
@@ -140,7 +140,7 @@ class ActionMemory(RecurrentMemory):
         stride: int = 4,
         **options: Any,
     ) -> None:
-        """See `RecurrentMemory`, whose frames these are; there are no pictures, so no grid and no pooling.
+        """See `RecurrentMemory`, whose frames these are; there are no images, so no grid and no pooling.
 
         Args:
             budget: memory tokens. hidden: width of the LSTM; None is a quarter of `d_vision`, at least 64.

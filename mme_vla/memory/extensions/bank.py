@@ -309,7 +309,7 @@ class MemoryBank(Retrieval):
         Args:
             tokens: [m, n, d], all moments. times: [m] int64.
             sequences: places in them, each sequence in the order of time.
-            states: banks the sequences go on with; empty ones by default.
+            states: banks the sequences continue with; empty ones by default.
 
         Returns:
             Fused tokens [m, n, d], and the bank after each sequence.

@@ -1,4 +1,4 @@
-"""Spacetime: past pictures enter the vision tower itself, and past states are tokens (MEM, LeRobot's option of π0.5).
+"""Spacetime: past images enter the vision tower itself, and past states are tokens (MEM, LeRobot's option of π0.5).
 
 After MEM's short-horizon memory (arXiv 2603.03596) as LeRobot's π0.5 has it (`use_visual_memory`,
 `use_proprioceptive_memory`; huggingface/lerobot#4076, read and not copied): six frames a second apart; every fourth
@@ -7,7 +7,7 @@ what the tower made of past frames is dropped above the last such layer. So the 
 weight is added. Each frame's state, normalised and padded with zeros, becomes one token through one linear layer.
 
 LeRobot takes the state out of the prompt where states are tokens; here prompts hold none unless a format asks for it.
-There the tokens stand between pictures and words; here the integration says where they go, and
+There the tokens stand between images and words; here the integration says where they go, and
 `integration.mutual=true` of `context` puts them there. Frames of the conditioning video are past frames as any other.
 """
 
@@ -30,7 +30,7 @@ class SpaceTime(Memory):
     """Views of `frames` frames for the tower, and their states as so many tokens; `select` names the frames.
 
     No cache serves it: it would have to hold what every layer that looks through time makes of every frame of every
-    camera, where others store one pooled grid of one camera. So pictures are read anew, in training too.
+    camera, where others store one pooled grid of one camera. So images are read anew, in training too.
     """
 
     timed = True
@@ -53,7 +53,7 @@ class SpaceTime(Memory):
             d_vision: width of a vision token, to which a state is padded on its way. width: of a memory token.
             frames: how many, the current one among them. stride: frames between two.
             every: each so-many-th layer of the tower looks through time, and at least its last.
-            views: give the tower past pictures. states: hand over past states as tokens.
+            views: give the tower past images. states: hand over past states as tokens.
             state_dim: numbers a state is padded to before its layer.
             budget: most memory tokens there is room for; None for as many as there are frames, which it takes at least.
         """

@@ -93,7 +93,7 @@ CHANNELS = 512
 def build_image_encoder() -> nn.Sequential:
     """ResNet-18 without pooling and classifier, fresh, a group norm of 16 channels a group for each batch norm.
 
-    Pictures [n, 3, H, W] → [n, 512, ⌈H/32⌉, ⌈W/32⌉].
+    Images [n, 3, H, W] → [n, 512, ⌈H/32⌉, ⌈W/32⌉].
     """
     try:
         from torchvision.models import resnet18
@@ -251,7 +251,7 @@ class ConditionalUnet1d(nn.Module):
 
 
 class DiffusionNetwork(nn.Module):
-    """What learns: one picture encoder for all cameras, keypoints, a projection of the words, and the U-Net.
+    """What learns: one image encoder for all cameras, keypoints, a projection of the words, and the U-Net.
 
     With a memory, a frozen vision tower turns remembered frames into the tokens that memories store.
     """
@@ -299,5 +299,5 @@ class DiffusionNetwork(nn.Module):
         return steps if memory is None else torch.cat([steps, memory], dim=-1)
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        """Pictures [n, 3, s, s] in [−1, 1] → tokens [n, grid², d_vision] as memories store them."""
+        """Images [n, 3, s, s] in [−1, 1] → tokens [n, grid², d_vision] as memories store them."""
         return pool_grid(self.vision(images), grid, pooling)

@@ -161,11 +161,11 @@ class DiffusionPolicy(Policy):
             return self.memory(history)
 
     def recompute(self, mode: Recompute) -> None:
-        """Compute the pictures' features again in the backward pass instead of keeping them, or keep them."""
+        """Compute the images' features again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recomputed = mode
 
     def shard_groups(self) -> Sequence[ShardGroup]:
-        """The memory's tower, the picture encoder, and the U-Net."""
+        """The memory's tower, the image encoder, and the U-Net."""
         tower = [] if self.memory is None else [ShardGroup(self.backbone.vision, full=True)]
         return [*tower, ShardGroup(self.backbone.image_encoder), ShardGroup(self.backbone.unet)]
 
@@ -173,7 +173,7 @@ class DiffusionPolicy(Policy):
         return model.noise_schedule(self.sizes.diffusion_steps)
 
     def _cropped_images(self, images: Tensor, corner: tuple[int, int] | None) -> Tensor:
-        """Pictures [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
+        """Images [..., H, W] uint8, all cropped at one place, in [−1, 1]."""
         margins = [side - size for side, size in zip(images.shape[-2:], self.sizes.cropped, strict=True)]
         if corner is None and self.training and self.augment:
             top, left = (int(torch.randint(most + 1, ())) for most in margins)
@@ -313,7 +313,7 @@ def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledI
     if not (isinstance(kind, type) and issubclass(kind, PooledIntegration)):
         raise UserError(
             f"Diffusion Policy has no place for what the integration {section['name']!r} brings: memory reaches it as "
-            "one vector. Choose integration=film."
+            "one vector. Choose integration=video."
         )
     built: PooledIntegration = INTEGRATIONS.build(section, sizes)
     return built

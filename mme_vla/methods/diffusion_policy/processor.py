@@ -1,4 +1,4 @@
-"""What stands between raw data and Diffusion Policy: pictures as they are, extremes, a text's vector, a window."""
+"""What stands between raw data and Diffusion Policy: images as they are, extremes, a text's vector, a window."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -105,7 +105,7 @@ BY = "extremes"
 class DiffusionBatch(TensorStruct):
     """What Diffusion Policy reads, and for training what it should answer.
 
-    images: [b, t, v, 3, H, W] uint8; the window's pictures, the current ones last. state: [b, t, s] normalised.
+    images: [b, t, v, 3, H, W] uint8; the window's images, the current ones last. state: [b, t, s] normalised.
     text: [b, d] the goal's vector. actions: [b, h, a] normalised. action_mask: [b, h] bool; None counts all steps.
     history: the memory's selection, None for a policy without memory.
     """
@@ -120,7 +120,7 @@ class DiffusionBatch(TensorStruct):
 
 @PROCESSORS.register("diffusion_policy")
 class DiffusionProcessor(PolicyProcessor):
-    """Pictures of one size without augmentation, states and actions between their extremes, and the goal's vector."""
+    """Images of one size without augmentation, states and actions between their extremes, and the goal's vector."""
 
     counted = Counted(horizon=1, every=True, extremes=True)
 
@@ -138,10 +138,10 @@ class DiffusionProcessor(PolicyProcessor):
         """Put it together.
 
         Args:
-            picture: (height, width) of the pictures before cropping; pictures of this size are left as they are.
+            image: (height, width) of the images before cropping; images of this size are left as they are.
             text: `clip`, `hashed`, or the folder of a CLIP. text_dim: width of its vectors.
             window: frames of an observation. frames: `consecutive`, or `asked`: those at which the policy was asked.
-            memory_size: side of the pictures that a memory's vision tower reads.
+            memory_size: side of the images that a memory's vision tower reads.
         """
         if frames not in FRAMES:
             raise UserError(f"processor.frames={brief(frames)}. {did_you_mean(str(frames), FRAMES)}")
@@ -182,7 +182,7 @@ class DiffusionProcessor(PolicyProcessor):
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Pictures of all cameras [v, 3, H, W] uint8, or [n, v, 3, H, W]; with black bars where the shape is another."""
+        """Images of all cameras [v, 3, H, W] uint8, or [n, v, 3, H, W]; with black bars where the shape is another."""
         names = self.embodiment.camera_names
         if len(views) != len(names):
             raise UserError(f"Expected {len(names)} views ({', '.join(names)}), got {len(views)}.")
@@ -223,7 +223,7 @@ class DiffusionProcessor(PolicyProcessor):
     # Batches
 
     def item(self, sample: Sample) -> dict[str, Any]:
-        """One training step: the window's pictures and states, the goal's vector, the chunk."""
+        """One training step: the window's images and states, the goal's vector, the chunk."""
         return {
             "images": self.images(list(sample.views.values())),
             "state": self.states(sample.states),
@@ -262,7 +262,7 @@ class DiffusionProcessor(PolicyProcessor):
         """Read what `save` wrote.
 
         Args:
-            folder: of a checkpoint, which may be a stranger's.
+            folder: of a checkpoint, which may be an untrusted.
             tokenizer: the folder of a CLIP, in place of what `processor.json` names.
         """
         return load_with_goal_encoder(cls, "diffusion_policy", Path(folder), tokenizer, trusted=(CLIP_NAME, HASHED))

@@ -284,7 +284,7 @@ def build_core(config: MemoryVlaConfig, recalls: bool) -> Core:
 
 
 def cognition_token(hidden: Tensor, patches: int, words: Tensor) -> Tensor:
-    """The state that stands for the moment: of the last word, behind the pictures' tokens.
+    """The state that means the moment: of the last word, behind the images' tokens.
 
     Args:
         hidden: [m, n, d] of `<s>`, patches, words. words: [m] how many there are, `<s>` among them.

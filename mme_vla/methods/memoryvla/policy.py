@@ -85,7 +85,7 @@ class MemoryVlaPolicy(Policy):
             config: what `from_config` was given; saved with the weights.
             compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
             history_dtype: dtype of stored vision tokens; banks hold what the network computes.
-            augment: crop and colour pictures while training.
+            augment: crop and colour images while training.
         """
         super().__init__()
         self.vlm, self.core, self.memory, self.processor = vlm, core, memory, processor
@@ -139,7 +139,7 @@ class MemoryVlaPolicy(Policy):
         """Moments of a batch without its padding, and the places of each group among them.
 
         Args:
-            changes: [g, m', 6] of the pictures, m' ≥ m; by default the middle is cut out.
+            changes: [g, m', 6] of the images, m' ≥ m; by default the middle is cut out.
         """
         images = batch.images[batch.valid]
         if changes is None:
@@ -182,7 +182,7 @@ class MemoryVlaPolicy(Policy):
         }
 
     def image_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """While training with augmentation `changes` [n, m, 6]: what happens to the pictures of `count` groups."""
+        """While training with augmentation `changes` [n, m, 6]: what happens to the images of `count` groups."""
         if not (self.training and self.augment):
             return {}
         size = self.group_size
@@ -327,7 +327,7 @@ class MemoryVlaPolicy(Policy):
         return encode_frames(self, frames, self.vlm.pooled_tokens, self.sizes.vision.width, batch_size)
 
     def vision_fingerprint(self) -> str:
-        """A hash of the towers, the dtype they run in, and what a memory's pictures go through before them."""
+        """A hash of the towers, the dtype they run in, and what a memory's images go through before them."""
         image_format = "" if self.processor is None else self.processor.memory_image_format
         return tower_fingerprint(self.vlm.vision, self.compute_dtype, image_format, str(self.vlm.vision.dino_standard))
 

@@ -117,16 +117,16 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         return ClippedQuantiles.of(stats, scaled)
 
     def resized(self, frames: np.ndarray) -> Tensor:
-        """Frames [..., H, W, 3] uint8 of that camera as pictures [..., 3, s, s] uint8."""
+        """Frames [..., H, W, 3] uint8 of that camera as images [..., 3, s, s] uint8."""
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(self._resized(frames), -1, -3)))
 
     def prepare_images(self, images: Tensor) -> Tensor:
-        """Of pictures [..., v, 3, s, s] those of the one camera this policy looks through."""
+        """Of images [..., v, 3, s, s] those of the one camera this policy looks through."""
         robot = self.embodiment
         return images[..., robot.camera_names.index(robot.memory_camera), :, :, :]
 
     def item(self, sample: Sample) -> dict[str, Any]:
-        """One moment: its picture [3, s, s], prompt [l] and actions [h, a]."""
+        """One moment: its image [3, s, s], prompt [l] and actions [h, a]."""
         state, camera = sample.states[-1], self.embodiment.memory_camera
         prompt, mask = self.prompt(sample.goal, subgoal=sample.subgoal)
         return {

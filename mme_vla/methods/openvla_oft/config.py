@@ -47,7 +47,7 @@ class FusedVisionConfig:
 
     @property
     def grid(self) -> int:
-        """Side of a picture's token grid."""
+        """Side of an image's token grid."""
         return self.image_size // self.patch_size
 
 

@@ -72,7 +72,7 @@ class TokenSequence:
 
 @BACKBONES.register("openvla")
 class OpenVlaBackbone(Backbone):
-    """`<s>`, pictures, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
+    """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
     Nothing is causal and no block is hidden from another, so an integration's visibility table has no say here; memory
     stands after the state, wherever the integration names it. A slot is answered by the hidden state *before* it, as
@@ -123,7 +123,7 @@ class OpenVlaBackbone(Backbone):
     # Observation
 
     def encode_images(self, images: Tensor) -> Tensor:
-        """Pictures [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision], before the projector."""
+        """Images [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision], before the projector."""
         return self.vlm.encode_images(images)
 
     def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:

@@ -16,9 +16,9 @@ from mme_vla.types import Batch
 
 @POLICIES.register("openvla")
 class OpenVlaPolicy(MMEPolicy):
-    """Backbone × memory × integration, with OpenVLA's pictures and a normalised state.
+    """Backbone × memory × integration, with OpenVLA's images and a normalised state.
 
-    In training every picture is cropped and coloured by its own draws; else each is cropped in the middle, so that the
+    In training every image is cropped and coloured by its own draws; else each is cropped in the middle, so that the
     network sees the same share of a scene.
     """
 

@@ -1,4 +1,4 @@
-"""Pictures as OpenVLA's family sees them: Lanczos-3 on uint8, a crop of 90 % of the area, four changes of colour."""
+"""Images as OpenVLA's family sees them: Lanczos-3 on uint8, a crop of 90 % of the area, four changes of colour."""
 
 import io
 import math
@@ -71,7 +71,7 @@ class ClippedQuantiles:
         return x.new_tensor(self.low), x.new_tensor(self.high - self.low + EPSILON), scaled, motionless
 
 
-SIDE = math.sqrt(0.9)  # of the crop, as a fraction of the picture's
+SIDE = math.sqrt(0.9)  # of the crop, as a fraction of the image's
 BRIGHTNESS, CONTRAST, SATURATION, HUE = 0.2, (0.8, 1.2), (0.8, 1.2), 0.05
 JPEG_QUALITY = 95
 RADIUS = 3.0  # lobes of the Lanczos kernel
@@ -106,7 +106,7 @@ def _weights(length: int, size: int) -> np.ndarray:
 
 
 def jpeg_round_trip(frames: np.ndarray) -> np.ndarray:
-    """Write pictures [..., H, W, 3] uint8 as JPEG of quality 95 and read them again."""
+    """Write images [..., H, W, 3] uint8 as JPEG of quality 95 and read them again."""
     from PIL import Image
 
     out = np.empty_like(frames)
@@ -121,7 +121,7 @@ def crop(pixels: Tensor, top: Tensor, left: Tensor) -> Tensor:
     """Cut a square of 90 % of the area and resize it back, bilinear, corner on corner, without antialiasing.
 
     Args:
-        pixels: [n, 3, s, s]. top, left: [n] fractions of the picture, in [0, 1 − √0.9].
+        pixels: [n, 3, s, s]. top, left: [n] fractions of the image, in [0, 1 − √0.9].
 
     Returns:
         [n, 3, s, s].
@@ -149,14 +149,14 @@ def _lines(pixels: Tensor, places: Tensor, axis: int) -> Tensor:
 
 
 def centre_crop(images: Tensor) -> Tensor:
-    """What test time shows of pictures [..., 3, s, s] uint8: the middle 90 % of the area, resized back; uint8."""
+    """What test time shows of images [..., 3, s, s] uint8: the middle 90 % of the area, resized back; uint8."""
     flat = images.flatten(0, -4)
     middle = torch.full((len(flat),), (1 - SIDE) / 2, device=images.device, dtype=torch.float64)
     return quantised(crop(flat.float() / 255, middle, middle).clamp(0, 1)).view(images.shape)
 
 
 def centre_cut(images: Tensor) -> Tensor:
-    """As `centre_crop`, but of whole pixels and resized back with Lanczos-3: how MemoryVLA shows pictures."""
+    """As `centre_crop`, but of whole pixels and resized back with Lanczos-3: how MemoryVLA shows images."""
     if images.is_meta:  # shapes alone: there is nothing to resize
         return images
     size = images.shape[-1]
@@ -172,7 +172,7 @@ def quantised(pixels: Tensor) -> Tensor:
 
 
 def draw_changes(count: int, generator: torch.Generator | None = None, device: torch.device | None = None) -> Tensor:
-    """Draws of `count` pictures [n, 6], made on the CPU: top, left, brightness, contrast, saturation, hue."""
+    """Draws of `count` images [n, 6], made on the CPU: top, left, brightness, contrast, saturation, hue."""
     u = torch.rand(count, 6, generator=generator)
     low = torch.tensor([0, 0, -BRIGHTNESS, CONTRAST[0], SATURATION[0], -HUE])
     high = torch.tensor([1 - SIDE, 1 - SIDE, BRIGHTNESS, CONTRAST[1], SATURATION[1], HUE])
@@ -180,7 +180,7 @@ def draw_changes(count: int, generator: torch.Generator | None = None, device: t
 
 
 def augment(images: Tensor, draws: Tensor) -> Tensor:
-    """Crop and change the colours of pictures, each by its own draws.
+    """Crop and change the colours of images, each by its own draws.
 
     Args:
         images: [n, 3, s, s] uint8. draws: [n, 6] as `draw_changes` makes them.
@@ -201,7 +201,7 @@ def brighten(pixels: Tensor, by: Tensor) -> Tensor:
 
 
 def contrast(pixels: Tensor, by: Tensor) -> Tensor:
-    """Stretch about the picture's mean of each colour."""
+    """Stretch about the image's mean of each colour."""
     mean = pixels.mean((-2, -1), keepdim=True)
     return (pixels - mean) * by + mean
 
@@ -220,12 +220,12 @@ def shift_hue(pixels: Tensor, by: Tensor) -> Tensor:
 
 @PROCESSORS.register("openvla")
 class OpenVlaProcessor(Processor):
-    """Lanczos-3 pictures, Llama's words, clipped quantiles of raw numbers, and the state for the network."""
+    """Lanczos-3 images, Llama's words, clipped quantiles of raw numbers, and the state for the network."""
 
     counted = Counted(horizon=1, every=True, extremes=True, exact=True)
     full_chunks_only = True
     jpeg: bool = False
-    """Write every picture as JPEG and read it again before it is resized, as the original's data were."""
+    """Write every image as JPEG and read it again before it is resized, as the original's data were."""
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
@@ -242,7 +242,7 @@ class OpenVlaProcessor(Processor):
         built.jpeg = jpeg
         return built
 
-    # Pictures
+    # Images
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
         """As `Processor.images`, resized with Lanczos-3; a crop or an augmentation is the policy's."""

@@ -15,10 +15,10 @@ LARGEST = 2**16
 
 @dataclass(frozen=True)
 class EncoderSizes:
-    """SAM2's picture encoder (Hiera and its neck); Hiera-B+ by default.
+    """SAM2's image encoder (Hiera and its neck); Hiera-B+ by default.
 
     width, heads: of the first stage; both double from stage to stage. blocks, windows: number of blocks and side of the
-    attention windows, of each stage. global_blocks: blocks, counted through all stages, that look at the whole picture.
+    attention windows, of each stage. global_blocks: blocks, counted through all stages, that look at the whole image.
     background: side of the table of positions. neck: width of the maps it answers with. lora: rank of the adapters.
     """
 
@@ -49,12 +49,12 @@ class EncoderSizes:
 class SAM2ActSizes:
     """The network: both looks have the same sizes.
 
-    grid, patch: patches of a virtual picture, and their side in pixels; a picture has grid · patch of them.
+    grid, patch: patches of a virtual image, and their side in pixels; an image has grid · patch of them.
     width, heads, depth: of the multi-view transformer. language, words: width and number of the goal's tokens.
-    sam, pictures, state: what of a token's width the encoder's map, the picture and the robot's state take.
+    sam, images, state: what of a token's width the encoder's map, the image and the robot's state take.
     state_dim: numbers of the robot's state. rotation_bins: of a whole turn. head: first width of the heads.
     memory: width of a remembered place; memory_layers, memory_feedforward: of the attention over memories.
-    mask_stages: halvings between a heatmap's picture and the grid. remembered: most keyframes that are read.
+    mask_stages: halvings between a heatmap's image and the grid. remembered: most keyframes that are read.
     """
 
     encoder: EncoderSizes = field(default_factory=EncoderSizes)
@@ -95,7 +95,7 @@ class SAM2ActSizes:
 
     @property
     def side(self) -> int:
-        """Side of a virtual picture in pixels."""
+        """Side of a virtual image in pixels."""
         return self.grid * self.patch
 
     @property

@@ -105,7 +105,7 @@ class KeyframeEpisode(Episode):
         actions: np.ndarray | None = None,
         rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
-        """Take frames in order, with what the cameras read beside their pictures; see `Episode.observe`.
+        """Take frames in order, with what the cameras read beside their images; see `Episode.observe`.
 
         Args:
             frames: of every camera also `<name>_depth` [t, H, W, 1] in millimetres and `<name>_camera_extrinsic`

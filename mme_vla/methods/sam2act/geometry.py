@@ -12,7 +12,7 @@ ZOOM = 4.0
 
 
 def unproject(depth: np.ndarray, intrinsic: np.ndarray, extrinsic: np.ndarray) -> np.ndarray:
-    """World points [h, w, 3] float64 of a depth picture.
+    """World points [h, w, 3] float64 of a depth image.
 
     A pixel stands at its whole-numbered column and row, not at its centre, as in the released code.
 
@@ -92,7 +92,7 @@ _ABOVE, _AHEAD, _BESIDE = 1.0, 1.0, 0.5  # where the eyes stand; the third one s
 
 
 def project(points: Tensor, side: int) -> Tensor:
-    """Columns and rows [..., 3 views, 2] of points [..., 3], in pixels of pictures of `side` and not rounded."""
+    """Columns and rows [..., 3 views, 2] of points [..., 3], in pixels of images of `side` and not rounded."""
     x, y, z = points.unbind(-1)
     half = side / 2
     columns = torch.stack([x, y, -x], -1)
@@ -107,7 +107,7 @@ def depths(points: Tensor) -> Tensor:
 
 
 def constant_channels(side: int, device: torch.device | None = None) -> Tensor:
-    """What each picture says of itself, [3 views, 3, side, side]: its number from −1 to 1, and every row and column."""
+    """What each image says of itself, [3 views, 3, side, side]: its number from −1 to 1, and every row and column."""
     line = torch.linspace(-1, 1, side, device=device)
     number = torch.linspace(-1, 1, VIEWS, device=device)[:, None, None].expand(VIEWS, side, side)
     rows, columns = line[:, None].expand(side, side), line[None].expand(side, side)
@@ -173,7 +173,7 @@ _CUT = 4.5  # a target is zero where its Gaussian's exponent is below −4.5, th
 def targets(pixels: Tensor, side: int, sigma: float = SIGMA) -> Tensor:
     """Heatmaps [n, side, side] that sum to 1, with a peak at each of the pixels [n, 2] (column, row).
 
-    With a `sigma` below 0 all of a target stands in the one pixel that is nearest.
+    With a `sigma` below 0 all of a target is in the one pixel that is nearest.
     """
     if sigma < 0:
         base = pixels.round().to(torch.int64)
@@ -212,7 +212,7 @@ def corners(pixels: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
         pixels: [..., 2] (column, row), not rounded.
 
     Returns:
-        int64 [..., 4] numbers of pixels, row by row, and weights [..., 4] that sum to 1, or to 0 outside the picture.
+        int64 [..., 4] numbers of pixels, row by row, and weights [..., 4] that sum to 1, or to 0 outside the image.
     """
     low, high = pixels.floor(), pixels.ceil()
     columns = torch.stack([low[..., 0], low[..., 0], high[..., 0], high[..., 0]], -1)

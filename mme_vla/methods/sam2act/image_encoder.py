@@ -1,4 +1,4 @@
-"""SAM2's picture encoder with adapters: transformers' `Sam2VisionModel`, LoRA on its queries and values."""
+"""SAM2's image encoder with adapters: transformers' `Sam2VisionModel`, LoRA on its queries and values."""
 
 import math
 from typing import Any
@@ -10,7 +10,7 @@ from mme_vla.errors import missing_extra
 from mme_vla.methods.sam2act.config import LEVELS, EncoderSizes, SAM2ActSizes
 
 _REDUCTION = 16
-"""Pixels of the encoder's pictures to a patch of its third map."""
+"""Pixels of the encoder's images to a patch of its third map."""
 
 
 class LoraProjection(nn.Module):
@@ -40,7 +40,7 @@ class LoraProjection(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Virtual pictures → maps at three sizes. One encoder serves both looks."""
+    """Virtual images → maps at three sizes. One encoder serves both looks."""
 
     def __init__(self, sizes: SAM2ActSizes) -> None:
         super().__init__()
@@ -70,7 +70,7 @@ def _vision_model(sizes: EncoderSizes, side: int) -> Any:
     try:
         import transformers
     except ImportError as error:
-        raise missing_extra("SAM2's picture encoder", "baselines") from error
+        raise missing_extra("SAM2's image encoder", "baselines") from error
     hiera: dict[str, Any] = {
         "hidden_size": sizes.width,
         "num_attention_heads": sizes.heads,

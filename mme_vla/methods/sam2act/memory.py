@@ -1,4 +1,4 @@
-"""Attention of a picture's tokens over remembered places: SAM2's memory attention, one head, with axial rotations."""
+"""Attention of an image's tokens over remembered places: SAM2's memory attention, one head, with axial rotations."""
 
 import itertools
 import math
@@ -131,7 +131,7 @@ class MemoryLayer(nn.Module):
 
 
 class MemoryAttention(nn.Module):
-    """Tokens of a picture, enriched with what is remembered."""
+    """Tokens of an image, enriched with what is remembered."""
 
     def __init__(self, width: int, memory: int, inner: int, layers: int) -> None:
         super().__init__()
@@ -193,7 +193,7 @@ class KeyframeBank(nn.Module):
 
         Args:
             grid: side of a view's grid of tokens. token: their width. memory: width of what is kept of each.
-            layers, feedforward: of the attention. mask_stages: halvings from a heatmap's picture to the grid.
+            layers, feedforward: of the attention. mask_stages: halvings from a heatmap's image to the grid.
             remembered: most keyframes that are read.
         """
         super().__init__()

@@ -1,4 +1,4 @@
-"""The multi-view transformer: three virtual pictures, the goal and the robot's state → a token for every patch."""
+"""The multi-view transformer: three virtual images, the goal and the robot's state → a token for every patch."""
 
 import math
 from dataclasses import dataclass, replace
@@ -66,7 +66,7 @@ _WIDER = 4  # feed-forward layers, inside
 class EncodedViews:
     """What one look at the scene gives the network.
 
-    pictures: [b, 3, 10, s, s] of `virtual_pictures`. maps: of the picture encoder for all views, finest first:
+    images: [b, 3, 10, s, s] of `virtual_pictures`. maps: of the image encoder for all views, finest first:
     [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p]. language: [b, l, w].
     """
 
@@ -185,7 +185,7 @@ class MultiViewTransformer(nn.Module):
 
 
 class HeatmapDecoder(nn.Module):
-    """Patch tokens and the encoder's finer maps → heatmap logits at the pictures' size."""
+    """Patch tokens and the encoder's finer maps → heatmap logits at the images' size."""
 
     def __init__(self, sizes: SAM2ActSizes) -> None:
         super().__init__()
@@ -278,7 +278,7 @@ def code_rates(width: int) -> Tensor:
 
 
 COLOURS = slice(3, 6)
-"""The channels of a virtual picture that the encoder sees."""
+"""The channels of a virtual image that the encoder sees."""
 
 
 class SAM2ActNetwork(nn.Module):
@@ -305,7 +305,7 @@ class SAM2ActNetwork(nn.Module):
         self.coarse.transformer.recomputed = self.fine.transformer.recomputed = mode
 
     def encode_views(self, images: Tensor, state: Tensor, language: Tensor) -> EncodedViews:
-        """What a branch reads: virtual pictures [b, 3, 10, s, s], the state [b, p], the goal's tokens [b, l, w]."""
+        """What a branch reads: virtual images [b, 3, 10, s, s], the state [b, p], the goal's tokens [b, l, w]."""
         return EncodedViews(images, self.encoder(images[:, :, COLOURS].flatten(0, 1)), state, language)
 
     def coarse_step(self, views: EncodedViews, remembered: BankState) -> tuple[Tensor, BankState]:

@@ -280,7 +280,7 @@ class SAM2ActPolicy(Policy):
         )
 
     def warm_up_vision(self) -> None:
-        """Run the encoder on the virtual pictures of nothing."""
+        """Run the encoder on the virtual images of nothing."""
         side = self.backbone.encoder.side
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))
 

@@ -44,7 +44,7 @@ class KeyframeBatch(TensorStruct):
 
 MILLIMETRES = 1000.0
 CHANNELS = 10
-"""Of a virtual picture."""
+"""Of a virtual image."""
 
 
 @dataclass(frozen=True)
@@ -232,7 +232,7 @@ class SAM2ActProcessor(PolicyProcessor):
 
         Args:
             text: `hashed`, or the folder of a CLIP. language, words: width and number of its tokens.
-            side: pixels that pictures are brought to before they become points.
+            side: pixels that images are brought to before they become points.
             bounds: of the scene in metres, lowest corner first; what is outside is not seen.
             trained_waypoints, waypoints: keyframes that the clock counts to, in training and when acting.
             video_frames: frames of the conditioning video that are looked at, evenly spread.
@@ -283,7 +283,7 @@ class SAM2ActProcessor(PolicyProcessor):
     # Observations
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
-        """Pictures of all cameras as they are, [v, 3, H, W] uint8, or [n, v, 3, H, W]; points are made of shots."""
+        """Images of all cameras as they are, [v, 3, H, W] uint8, or [n, v, 3, H, W]; points are made of shots."""
         stacked = np.stack([np.asarray(view) for view in views], axis=-4)
         return torch.from_numpy(np.ascontiguousarray(np.moveaxis(stacked, -1, -3)))
 
@@ -306,7 +306,7 @@ class SAM2ActProcessor(PolicyProcessor):
         """The cameras' shots of one of the frames that an environment delivers, at the size that points are made of.
 
         Args:
-            views: of every camera its pictures [t, H, W, 3], depths [t, H, W, 1] in millimetres and poses [t, 3, 4].
+            views: of every camera its images [t, H, W, 3], depths [t, H, W, 1] in millimetres and poses [t, 3, 4].
         """
         shots = []
         for camera in self.embodiment.cameras:
@@ -334,7 +334,7 @@ class SAM2ActProcessor(PolicyProcessor):
         return torch.tensor([opened, finger, finger, self.clock(place, self.waypoints)], dtype=torch.float32)
 
     def commanded_state(self, opened: bool, place: int) -> Tensor:
-        """The same in training, where fingers are made up from the command, as released."""
+        """The same in training, where fingers are synthetic from the command, as released."""
         finger = FINGER_OPEN if opened else 0.0
         clock = self.clock(place, self.trained_waypoints)
         return torch.tensor([float(opened), finger, finger, clock], dtype=torch.float32)
@@ -398,7 +398,7 @@ class SAM2ActProcessor(PolicyProcessor):
         """Read what `save` wrote.
 
         Args:
-            folder: of a checkpoint, which may be a stranger's.
+            folder: of a checkpoint, which may be an untrusted.
             tokenizer: the folder of a CLIP, in place of what `processor.json` names.
         """
         return load_with_goal_encoder(cls, NAME, Path(folder), tokenizer, trusted=(HASHED,))

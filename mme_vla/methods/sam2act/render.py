@@ -1,4 +1,4 @@
-"""The virtual pictures of a cloud of points: a z-buffer in millimetres, small splats, centred depth; plain PyTorch.
+"""The virtual images of a cloud of points: a z-buffer in millimetres, small splats, centred depth; plain PyTorch.
 
 The same rules as the released renderer, which is a CUDA kernel: depths count in whole millimetres, what is behind a
 camera counts as depth 0 and so stands before everything, and equal depths go to the point that comes first.
@@ -23,7 +23,7 @@ def z_buffer(points: Tensor, features: Tensor, side: int) -> tuple[Tensor, Tenso
         points: [n, 3] in the cube's coordinates. features: [n, c].
 
     Returns:
-        pictures [3, side, side, c], zero where nothing is, and depths [3, side, side], `EMPTY` there.
+        images [3, side, side, c], zero where nothing is, and depths [3, side, side], `EMPTY` there.
     """
     count, free = len(points), torch.iinfo(torch.int64).max
     pixels = project(points, side).permute(1, 0, 2)  # v n 2
@@ -84,7 +84,7 @@ def centred(depth: Tensor) -> Tensor:
 
 
 def render(points: Tensor, features: Tensor, side: int, radius: float = RADIUS) -> Tensor:
-    """Pictures [3, side, side, c + 1] of a cloud: its features and, last, the centred depth.
+    """Images [3, side, side, c + 1] of a cloud: its features and, last, the centred depth.
 
     Args:
         points: [n, 3] in the cube's coordinates. features: [n, c].

@@ -3,7 +3,7 @@
 `mme-vla subgoal-build input=<HDF5 files, folders of them, or LeRobot datasets> output=<new folder>`
 
 Writes one JSON-lines file for each set (`simple.jsonl`, `grounded.jsonl`, `memer.jsonl`) in the layout of ms-swift,
-with the pictures and videos beside it; paths in the rows are relative to the output folder. An interrupted run goes on
+with the images and videos beside it; paths in the rows are relative to the output folder. An interrupted run continues
 with the episodes that are missing, and the same input always gives the same files.
 """
 
@@ -48,7 +48,7 @@ PARTS = "parts"
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode to build from: its labels, and its front pictures at some frames, both read when asked for."""
+    """One episode to build from: its labels, and its front images at some frames, both read when asked for."""
 
     task: str
     number: int
@@ -132,7 +132,7 @@ def _build_episode(episode: Demonstration, output: Path, sets: Sequence[str], op
     for t, pixels in zip(steps, episode.read_images(steps), strict=True):
         for path in missing[t]:
             _write_once(path, partial(_write_png, pixels))
-    for name in sets:  # the rows last: where they are, their pictures are
+    for name in sets:  # the rows last: where they are, their images are
         rows = episode_rows(name, labels, options).rows
         with write_atomically(_part(output, name, episode)) as draft:
             draft.write_text("".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows))

@@ -1,6 +1,6 @@
 """Which steps of a demonstration become training rows of the subgoal predictors, and which frames are keyframes.
 
-Everything here is arithmetic on an episode's labels and joint angles; pictures are not looked at (paper, appendix: VLM
+Everything here is arithmetic on an episode's labels and joint angles; images are not looked at (paper, appendix: VLM
 subgoal prediction, and the released builders).
 """
 
@@ -10,7 +10,7 @@ from itertools import pairwise
 
 import numpy as np
 
-STRIDE = 16  # steps a row stands for, as often as a policy asks
+STRIDE = 16  # steps a row means, as often as a policy asks
 _STRIDE = {"StopCube": 32}
 _FIXED = {"PatternLock": 32}  # tasks whose rows follow the clock, not the changes of subgoal
 _STILL = ("PatternLock", "RouteStick")  # tasks in which the arm comes to rest at what matters
@@ -22,7 +22,7 @@ FRAME_STEP, WINDOW = 2, 8  # MemER: every second frame, eight a row
 
 @dataclass(frozen=True)
 class Labels:
-    """What is known of a demonstration without its pictures.
+    """What is known of a demonstration without its images.
 
     task, number: its name and number; goal: in words, lower-case.
     exec_start: first execution frame. simple, grounded: [t] the planner's subgoals, lower-case.

@@ -31,7 +31,7 @@ from mme_vla.utils import Sums, inside, is_text, read_json_lines
 Row = dict[str, Any]
 SETS = {"simple": ("qwenvl", "simple"), "grounded": ("qwenvl", "grounded"), "memer": ("memer", "grounded")}
 SETS |= {"memer_simple": ("memer", "simple")}
-"""A set's name → (folder of its pictures, kind of subgoal). The paper trains the first three."""
+"""A set's name → (folder of its images, kind of subgoal). The paper trains the first three."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class RowOptions:
 
 @dataclass(frozen=True)
 class EpisodeRows:
-    """The rows of one episode in one set, and the pictures they refer to: frames by file name, and the video's name."""
+    """The rows of one episode in one set, and the images they refer to: frames by file name, and the video's name."""
 
     rows: list[Row]
     images: dict[str, int]
@@ -196,7 +196,7 @@ def texts_of(row: Row) -> tuple[str, str, str]:
 
 
 def question_of(row: Row, folder: Path) -> Question:
-    """A row with its pictures; paths are relative to `folder`."""
+    """A row with its images; paths are relative to `folder`."""
     system, user, target = texts_of(row)
     images = [read_image(inside(folder, name, "picture")) for name in row.get("images", [])]
     videos = [Clip.read(inside(folder, name, "video")) for name in row.get("videos", [])]
@@ -204,7 +204,7 @@ def question_of(row: Row, folder: Path) -> Question:
 
 
 class RowDataset(torch.utils.data.Dataset[Question]):
-    """The rows of a file that are no longer than `max_length` tokens, pictures read when asked for.
+    """The rows of a file that are no longer than `max_length` tokens, images read when asked for.
 
     left_out: how many are longer.
     """
@@ -215,7 +215,7 @@ class RowDataset(torch.utils.data.Dataset[Question]):
         rows = read_rows(file)
         example = next((name for row in rows for name in row.get("images", [])), None)
         if example is None:
-            raise UserError(f"{file} has no row with a picture. Build the training data again.")
+            raise UserError(f"{file} has no row with an image. Build the training data again.")
         image = _image_tokens(read_image(inside(self.folder, example, "picture")).shape)
         self.rows = [row for row in rows if _longest(row, tokenizer, image) <= max_length]
         self.left_out = len(rows) - len(self.rows)
@@ -260,7 +260,7 @@ class Collator:
 def hf_dataset(file: str | Path) -> Any:
     """A file of rows as a Hugging Face dataset in trl's conversational form.
 
-    Columns: `messages` (role, and content as a list of parts with `type` and `text`), `images` (pictures, decoded when
+    Columns: `messages` (role, and content as a list of parts with `type` and `text`), `images` (images, decoded when
     asked for) and `videos` (absolute paths).
     """
     from datasets import Dataset, Features, Image, List, Value
@@ -289,7 +289,7 @@ def _image_tokens(shape: Sequence[int]) -> int:
 
 
 def _longest(row: Row, tokenizer: Any, image: int) -> int:
-    """An upper bound of the row's tokens, without reading its pictures."""
+    """An upper bound of the row's tokens, without reading its images."""
     words = sum(len(tokenizer.encode(text, add_special_tokens=False)) for text in texts_of(row))
     pairs = VIDEO_FRAMES // 2
     video = pairs * (VIDEO_TOKENS + _TIME + 2)

@@ -86,11 +86,11 @@ def accumulation(batch: int, per_device: int, processes: int) -> int:
 
 
 def find_checkpoint(output: Path, resume: str | None) -> str | None:
-    """Where to go on from: a checkpoint's path, or None to start."""
+    """Where to continue from: a checkpoint's path, or None to start."""
     checkpoints = sorted(output.glob("checkpoint-*"), key=lambda path: int(path.name.split("-")[-1]))
     if resume is None:
         if checkpoints or (output / ADAPTER).exists():
-            raise UserError(f"{output} holds a run: go on with resume=auto, or choose another output.")
+            raise UserError(f"{output} holds a run: continue with resume=auto, or choose another output.")
         return None
     if resume == "auto":
         return str(checkpoints[-1]) if checkpoints else None

@@ -235,7 +235,7 @@ class Api:
             digest.update(f"\n{role}".encode())
             for item in parts:
                 part = item.pixels if isinstance(item, MediaPart) else item
-                # The pictures themselves, not their encoding, which may differ between versions of the encoder.
+                # The images themselves, not their encoding, which may differ between versions of the encoder.
                 raw = part.encode() if isinstance(part, str) else np.ascontiguousarray(part).tobytes()
                 digest.update(f"\n{getattr(part, 'shape', 'text')} {len(raw)} ".encode() + raw)
         name = digest.hexdigest()

@@ -11,7 +11,7 @@ import numpy as np
 from mme_vla.errors import UserError
 
 Message = tuple[str, list[Any]]
-"""Role (`user` or `model`); parts: texts, pictures [H, W, 3], videos [t, H, W, 3], bare or as `Shown`."""
+"""Role (`user` or `model`); parts: texts, images [H, W, 3], videos [t, H, W, 3], bare or as `Shown`."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ _WANTED = {
 
 @dataclass
 class MediaPart:
-    """A picture [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
+    """An image [H, W, 3] or video [t, H, W, 3] of a conversation, encoded once however many questions show it."""
 
     pixels: np.ndarray
     _encoded: dict[str, Any] = field(default_factory=dict)

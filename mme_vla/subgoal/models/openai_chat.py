@@ -22,7 +22,7 @@ class OpenAISettings(Settings):
     """As `Settings`, for OpenAI's chat completions.
 
     base_url: of the endpoint, such as http://127.0.0.1:8000/v1; None for OpenAI's own.
-    video_frames: pictures that stand for a video, which these endpoints take none of; even, 2 or more.
+    video_frames: images that stand for a video, which these endpoints take none of; even, 2 or more.
     """
 
     model: str = "gpt-5-mini"
@@ -37,7 +37,7 @@ class OpenAISettings(Settings):
         super().__post_init__()
         frames = self.video_frames
         if isinstance(frames, bool) or not isinstance(frames, int) or frames < 2 or frames % 2:
-            raise UserError(f"video_frames={frames!r} must be an even number of pictures, 2 or more.")
+            raise UserError(f"video_frames={frames!r} must be an even number of images, 2 or more.")
         if self.base_url is not None and _scheme(self.base_url) not in ("http", "https"):
             shown = str(self.base_url).rpartition("@")[2]  # without a password
             raise UserError(f"base_url={shown!r} must be an address such as http://127.0.0.1:8000/v1, or null.")
@@ -58,7 +58,7 @@ class OpenAISettings(Settings):
 
 
 class OpenAIConnection(Connection):
-    """OpenAI's chat completions; a video is sent as pictures out of it.
+    """OpenAI's chat completions; a video is sent as images out of it.
 
     client: an object with `chat.completions.create(model=, messages=, …)`, as openai's.
     """

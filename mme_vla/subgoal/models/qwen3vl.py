@@ -1,4 +1,4 @@
-"""Qwen3-VL through transformers: questions with pictures and videos in, answers out, in batches."""
+"""Qwen3-VL through transformers: questions with images and videos in, answers out, in batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ from mme_vla.subgoal.models.tiny import make_tiny
 from mme_vla.subgoal.text import IMAGE, VIDEO, split_media
 from mme_vla.utils.media import FPS
 
-IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: a picture; a video frame
+IMAGE_TOKENS, VIDEO_TOKENS = 256, 64  # at most: an image; a video frame
 TOKEN_SIDE = 32  # pixels of a token: patches of 16, merged 2×2
 TINY = "tiny"
 DTYPES = ("float32", "bfloat16", "float16")
@@ -25,7 +25,7 @@ DTYPES = ("float32", "bfloat16", "float16")
 class Question:
     """One question.
 
-    system, user: texts; `<image>` and `<video>` in the user's mark where pictures go.
+    system, user: texts; `<image>` and `<video>` in the user's mark where images go.
     images: [H, W, 3] uint8 each. videos: what is looked at of each.
     target: what the model is to learn to say; None where it is asked.
     """
@@ -167,7 +167,7 @@ def _check_batch(size: int) -> None:
 
 
 def limit_images(processor: Any) -> None:
-    """Hold pictures and videos to the released limits; nothing of 256×256 pixels is resized by them."""
+    """Hold images and videos to the released limits; nothing of 256×256 pixels is resized by them."""
     area = TOKEN_SIDE**2
     processor.image_processor.size = {"shortest_edge": 4 * area, "longest_edge": IMAGE_TOKENS * area}
     processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": VIDEO_FRAMES * VIDEO_TOKENS * area}

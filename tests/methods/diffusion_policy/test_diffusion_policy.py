@@ -137,7 +137,7 @@ def test_the_window_holds_consecutive_frames_or_those_it_was_asked_at() -> None:
         episode = policy.start_episode("push the button")
         episode.observe({name: of[:3] for name, of in pictures.items()}, states[:3], np.array([True, True, False]))
         first = episode.window[1]
-        assert torch.equal(first[0], first[1]), "the video is no part of it: the first frame stands for those before"
+        assert torch.equal(first[0], first[1]), "the video is no part of it: the first frame means those before"
         episode.observe({name: of[3:] for name, of in pictures.items()}, states[3:])
         found[consecutive] = episode.window[1][:, 0].tolist()
     assert found == {True: [states[7, 0], states[8, 0]], False: [states[2, 0], states[8, 0]]}

@@ -229,7 +229,7 @@ def test_it_is_evaluated_served_probed_and_inspected(trained: Path, tmp_path: Pa
 
 
 def test_what_cannot_stand_there_is_refused_in_words() -> None:
-    with pytest.raises(UserError, match="the tower of the backbone 'memoryvla' sees one picture at a time"):
+    with pytest.raises(UserError, match="the tower of the backbone 'memoryvla' sees one image at a time"):
         build_policy("memoryvla", memory="spacetime")
     with pytest.raises(UserError, match="no place for the integration 'context'"):
         build_policy("memoryvla", memory="framesamp", integration="context")

@@ -1,4 +1,4 @@
-"""OpenVLA-OFT's pictures and numbers: resize, crops, colours, channels and clipped quantiles, as the original's."""
+"""OpenVLA-OFT's images and numbers: resize, crops, colours, channels and clipped quantiles, as the original's."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ def test_openvla_oft_resize_and_centre_crop(folder: Path) -> None:
 
 
 def test_openvla_oft_resize_after_jpeg_is_near_the_originals(folder: Path) -> None:
-    """Another JPEG library may differ by a few levels; without the round trip the pictures differ by more."""
+    """Another JPEG library may differ by a few levels; without the round trip the images differ by more."""
     golden, about = case(folder, "pictures")
     raw, expected = golden["raw"].numpy(), golden["resized_after_jpeg"].numpy().astype(int)
 

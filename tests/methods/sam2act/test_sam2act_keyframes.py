@@ -206,7 +206,7 @@ def test_depth_becomes_a_table_at_its_height(folder: Path) -> None:
     points, colours = cloud_of(shots, 128)
     assert points.shape == colours.shape == (2 * 128**2, 3)
     assert np.allclose(points[:, 2], 0.2, atol=1e-6)
-    # 0.8 m away a picture of 90° / 2 of slope ½ is 0.4 m wide.
+    # 0.8 m away an image of 90° / 2 of slope ½ is 0.4 m wide.
     assert np.allclose([points[:, 0].min(), points[:, 0].max()], [-0.2, 0.2], atol=0.01)
 
 

@@ -23,7 +23,7 @@ TINY_ENCODER = EncoderSizes(width=8, heads=1, blocks=(1, 1, 2, 1), windows=(8, 4
 
 
 def fill(module: nn.Module, theirs: dict[str, Tensor], place: str, stages: int) -> None:
-    """Give a module the tensors that the released code names so; `place` is where it stands in our network."""
+    """Give a module the tensors that the released code names so; `place` is where it is in our network."""
     table = released_names([f"{place}{name}" for name in module.state_dict()], stages)
     module.load_state_dict({name.removeprefix(place): value for name, value in read(table, theirs).items()})
 

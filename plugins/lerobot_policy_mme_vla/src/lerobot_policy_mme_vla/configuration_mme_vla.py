@@ -102,7 +102,7 @@ class MMEVLAConfig(PreTrainedConfig):
 
 
 def image_key(camera: Camera, features: Collection[str]) -> str:
-    """The feature that holds a camera's pictures: under its column's name, or its own.
+    """The feature that holds a camera's images: under its column's name, or its own.
 
     Raises:
         UserError: there is neither.
@@ -112,6 +112,6 @@ def image_key(camera: Camera, features: Collection[str]) -> str:
         if name in features:
             return str(name)
     raise UserError(
-        f"No pictures of the camera {camera.name!r}: none of {', '.join(names)} is among {listed(sorted(features))}. "
+        f"No images of the camera {camera.name!r}: none of {', '.join(names)} is among {listed(sorted(features))}. "
         'Say which it is with --rename_map=\'{"observation.images.<theirs>": "' + names[0] + "\"}'."
     )

@@ -81,7 +81,7 @@ class RoboMMEWithVideo(gym.Env):
         return self._frame, 0.0, over, bool(truncated), {"is_success": status == "success", "status": status}
 
     def render(self) -> np.ndarray:
-        """The front picture that is shown."""
+        """The front image that is shown."""
         image: np.ndarray = self._frame["pixels"]["image"]
         return image
 

@@ -206,6 +206,6 @@ def _built(config: MMEVLAConfig) -> Policy:
 
 
 def _as_uint8(images: Tensor) -> np.ndarray:
-    """LeRobot's pictures [b, 3, H, W] in [0, 1] as they were, [b, H, W, 3] uint8."""
+    """LeRobot's images [b, 3, H, W] in [0, 1] as they were, [b, H, W, 3] uint8."""
     converted = images if images.dtype == torch.uint8 else (images.float() * 255).round().to(torch.uint8)
     return converted.permute(0, 2, 3, 1).cpu().numpy()

@@ -26,7 +26,7 @@ class Row:
     _demo: list[bool] = field(default_factory=list)
 
     def see(self, images: Mapping[str, np.ndarray], state: np.ndarray, is_demo: bool) -> None:
-        """Take a frame: pictures [H, W, 3] uint8 by camera, and the state [s]."""
+        """Take a frame: images [H, W, 3] uint8 by camera, and the state [s]."""
         self._frames.append(images)
         self._states.append(state)
         self._demo.append(is_demo)
