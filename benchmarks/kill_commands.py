@@ -65,7 +65,7 @@ def _cache(inputs: Path, folder: Path) -> None:
 
 
 def _write_demonstrations(folder: Path) -> None:
-    from h5_files import write_file
+    from helpers.h5_files import write_file
 
     write_file(folder / "record_dataset_Alpha.h5", [6, 5], videos=[2, 0], size=64)
     write_file(folder / "record_dataset_Beta.h5", [4], size=64)
@@ -80,9 +80,9 @@ def _convert(inputs: Path, folder: Path) -> None:
 
 def _evaluate(inputs: Path, folder: Path) -> None:
     import torch
-    from rollout_stand_ins import FACTS, JOBS, InlineEnvs, make_scripted_env, quick_policy
 
     import mme_vla.evaluation.rollout.evaluation as module
+    from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, make_scripted_env, quick_policy
     from mme_vla.evaluation.rollout.settings import RolloutSettings
 
     class Envs(InlineEnvs):

@@ -18,9 +18,9 @@ os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(2**31 - 1))
 os.environ.setdefault("MALLOC_TOP_PAD_", str(2**26))
 
 import pytest
+
 import shared_compositions
 from forked_workers import Collected
-
 from mme_vla.envs.vector import processes
 
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -117,7 +117,7 @@ def _own_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of docs/parity.md."""
     if os.environ.get("MME_VLA_PARITY_TABLE"):
-        import golden
+        from helpers import golden
 
         terminalreporter.write_line("| test | largest absolute error |\n|---|---|")
         for test, worst in sorted(golden.ERRORS.items()):

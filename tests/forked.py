@@ -13,8 +13,7 @@ from collections.abc import Mapping, Sequence
 from multiprocessing import forkserver
 from pathlib import Path
 
-from conftest import REPOSITORY
-
+from helpers import REPOSITORY
 from mme_vla.envs.vector import processes
 
 

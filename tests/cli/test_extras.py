@@ -16,12 +16,12 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from typing import NamedTuple
 
-import forked
 import pytest
-from h5_files import write_file
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+import forked
+from helpers.h5_files import write_file
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
 

@@ -8,8 +8,8 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from h5_files import write_file
 
+from helpers.h5_files import write_file
 from mme_vla import cli
 from mme_vla.config.errors import print_user_errors
 from mme_vla.data.convert import ConvertOptions, convert

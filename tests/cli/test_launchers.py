@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-import forked
 import pytest
+
+import forked
 
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="launchers: uv sync --inexact --extra sweep")
 pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="launchers: uv sync --inexact --extra sweep")

@@ -5,13 +5,13 @@ import sys
 import textwrap
 from pathlib import Path
 
-import forked
 import pytest
 from hydra import initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+import forked
 from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins, options_first
 from mme_vla.config.naming import join_memories, resolve_name
 from mme_vla.errors import UserError

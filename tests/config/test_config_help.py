@@ -5,10 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import forked
 import pytest
-from conftest import REPOSITORY
 
+import forked
+from helpers import REPOSITORY
 from mme_vla.config.composition import compose, config_dir, help_text
 from mme_vla.config.help import COMMANDS, choices, defaults, keys, near_keys
 from mme_vla.errors import UserError

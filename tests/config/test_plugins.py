@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli import analyse, inspect
 from mme_vla.cli.weights import convert

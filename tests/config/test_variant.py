@@ -4,9 +4,9 @@ import json
 import textwrap
 from pathlib import Path
 
-import forked
 import pytest
 
+import forked
 from mme_vla.config.composition import compose
 from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
 from mme_vla.evaluation.results.aggregate import aggregate

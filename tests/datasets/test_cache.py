@@ -3,13 +3,13 @@
 import json
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 import torch
-from fakes import WIDTH, LastFrames, encode
-from h5_files import write_file
 
+import forked
+from helpers.h5_files import write_file
+from helpers.memory_fakes import WIDTH, LastFrames, encode
 from mme_vla.data import cache as store
 from mme_vla.data import cache_building as cache_build
 from mme_vla.data.cache import (

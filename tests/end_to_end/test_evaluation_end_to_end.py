@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import forked
 import pytest
-from conftest import REPOSITORY
+
+import forked
+from helpers import REPOSITORY
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 

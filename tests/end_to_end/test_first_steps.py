@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import Memory, cli
 from mme_vla.cli import train as train_command
 from mme_vla.config.composition import compose

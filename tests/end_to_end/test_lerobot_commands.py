@@ -1,15 +1,13 @@
-"""LeRobot's own commands with plugins/lerobot_policy_mme_vla installed: train, continue, evaluate with the video; and with
-its own ACT on a dataset that this library wrote with LeRobot's names of columns.
-"""
+"""LeRobot's own commands with plugins/lerobot_policy_mme_vla installed, and its ACT on a dataset of this library."""
 
 import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from h5_files import write_file
-from lerobot_commands import EVAL, TRAIN, VIZ, LeRobot, lerobot
 
+from helpers.h5_files import write_file
+from helpers.lerobot_commands import EVAL, TRAIN, VIZ, LeRobot, lerobot
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 

@@ -5,6 +5,7 @@ import socket
 from pathlib import Path
 
 import pytest
+
 from forked import Command
 
 pytest.importorskip("lerobot", reason="LeRobot is not installed")
@@ -15,7 +16,7 @@ def test_the_first_process_builds_the_cache_and_the_others_open_it(tmp_path: Pat
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1]), "WORLD_SIZE": "2"}
-    words = ["tests/lerobot_two_processes.py", str(tmp_path)]
+    words = ["tests/helpers/lerobot_two_processes.py", str(tmp_path)]
     started = [Command(*words, env={**rendezvous, "RANK": str(rank), "LOCAL_RANK": str(rank)}) for rank in range(2)]
     ended = [command.finish(120) for command in started]
     assert [end.returncode for end in ended] == [0, 0], ended[0].stderr + ended[1].stderr

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 

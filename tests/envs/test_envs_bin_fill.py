@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 import sapien
-from envs_cubes import COLOURS, Flags, Hand, steps_of_demonstration
-from envs_unmask import make, push_down, texts, wait
 
+from helpers.env_cubes import COLOURS, Flags, Hand, steps_of_demonstration
+from helpers.env_unmask import make, push_down, texts, wait
 from mme_vla.envs.scene.objects import Cube
 from mme_vla.envs.tasks.bin_fill import BinFill
 

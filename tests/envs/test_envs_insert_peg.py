@@ -9,9 +9,8 @@ import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_cubes import steps_of_demonstration
-from envs_unmask import make, same_twice, texts, wait
-
+from helpers.env_cubes import steps_of_demonstration
+from helpers.env_unmask import make, same_twice, texts, wait
 from mme_vla.envs.robot.control import PlanningError
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import Peg

@@ -8,9 +8,8 @@ import sapien
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_cubes import read_cube, read_disc, steps_of_demonstration
-from envs_unmask import make, same_twice, texts, wait
-
+from helpers.env_cubes import read_cube, read_disc, steps_of_demonstration
+from helpers.env_unmask import make, same_twice, texts, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import H
 from mme_vla.envs.scene.placement import Region

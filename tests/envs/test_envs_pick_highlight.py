@@ -6,9 +6,8 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_cubes import COLOURS, Hand, least_distance, read_button, read_cube, steps_of_demonstration
-from envs_unmask import make, push_down, released, texts, wait
-
+from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube, steps_of_demonstration
+from helpers.env_unmask import make, push_down, released, texts, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.placement import Region
 from mme_vla.envs.tasks.pick_highlight import PickHighlight

@@ -9,9 +9,8 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_testing import replay, setup
-from envs_unmask import lift, make, names, same_twice, skip_place, texts, turn, under, wait
-
+from helpers.env_scenes import replay, setup
+from helpers.env_unmask import lift, make, names, same_twice, skip_place, texts, turn, under, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS
 from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Region

@@ -5,13 +5,13 @@ import signal
 import time
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 import torch
-from rollout_scripted_env import make_far_env, make_mortal_env
-from rollout_stand_ins import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
 
+import forked
+from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
+from helpers.scripted_env import make_far_env, make_mortal_env
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_device
 from mme_vla.envs.vector.pool import Job

@@ -6,9 +6,9 @@ import re
 from types import ModuleType
 
 import pytest
-from conftest import REPOSITORY
-from noop_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 
+from helpers import REPOSITORY
+from helpers.mock_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 from mme_vla.testing.small import MODELS
 
 DOCS, BENCHMARKS = REPOSITORY / "docs", REPOSITORY / "benchmarks"

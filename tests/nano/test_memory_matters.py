@@ -3,8 +3,8 @@
 from functools import partial
 
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla.testing.small import BEYOND
 
 GUESSING = 0.75

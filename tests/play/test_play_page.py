@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from browser import Browser
-from play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
 
+from helpers.browser import Browser
+from helpers.play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
 from mme_vla.play import web
@@ -160,7 +160,9 @@ def test_an_address_that_cannot_be_had_is_refused():
 
 def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
     script = (
-        "import logging; from test_play_page import *; from mme_vla.play.web import serve\n"
+        "import logging; from pathlib import Path; from helpers.play_fakes import a_session, an_episode\n"
+        "from mme_vla.play.desk import Desk; from mme_vla.play.run import Identity, PlayRun\n"
+        "from mme_vla.play.web import serve\n"
         "logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
         "session = a_session()\n"
         "who = Identity('human', 'anna', 0, 1300, {})\n"

@@ -3,11 +3,11 @@
 import json
 from types import SimpleNamespace
 
-import forked
 import numpy as np
 import pytest
-from play_fakes import BLOCKS, MOTION, VIDEO, a_session
 
+import forked
+from helpers.play_fakes import BLOCKS, MOTION, VIDEO, a_session
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
 from mme_vla.play import GeminiPlayer, OraclePlayer, QwenPlayer, build_player

@@ -5,9 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import forked
 import numpy as np
 import pytest
+
+import forked
 
 vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness")
 from vla_eval.api import serve_background  # noqa: E402

@@ -8,11 +8,11 @@ import re
 import socket
 from types import SimpleNamespace
 
-import forked
 import numpy as np
 import pytest
-from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
 
+import forked
+from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, serving_policy, wait_until
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
@@ -33,15 +33,6 @@ def policy():
 def served(policy):
     with Served(policy) as server:
         yield server
-
-
-def ask(served: Served, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, str, bytes]:
-    connection = http.client.HTTPConnection(*served.address, timeout=60)
-    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-    answer = connection.getresponse()
-    found = answer.status, answer.headers["Content-Type"], answer.read()
-    connection.close()
-    return found
 
 
 def by_http(served: Served, parts: list, **headers: str) -> list[np.ndarray]:

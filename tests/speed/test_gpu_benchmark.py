@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import REPOSITORY
+
 from forked import Command
+from helpers import REPOSITORY
 
 SMALL = ["--backbone", "tiny", "--device", "cpu", "--rounds", "1", "--batch", "2", "--eager"]
 

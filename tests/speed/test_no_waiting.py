@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 import torch
-from noop_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from helpers.mock_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch, small_policy
 

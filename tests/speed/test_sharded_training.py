@@ -4,12 +4,12 @@ import json
 from pathlib import Path
 from typing import Any
 
-import forked
 import pytest
-import sharded_runs
 import torch
-from sharded_runs import RUNS, trainer
 
+import forked
+from helpers import sharded_runs
+from helpers.sharded_runs import RUNS, trainer
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint

@@ -4,12 +4,12 @@ import json
 import threading
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 from PIL import Image
-from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
+import forked
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_subgoals
 from mme_vla.envs.vector.pool import Job

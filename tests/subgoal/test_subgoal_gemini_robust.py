@@ -5,9 +5,9 @@ import sys
 import time
 
 import pytest
-from conftest import REPOSITORY
-from subgoal_fakes import frames, kinds, play, predictor_of, says, started
 
+from helpers import REPOSITORY
+from helpers.subgoal_fakes import frames, kinds, play, predictor_of, says, started
 from mme_vla.errors import UserError
 from mme_vla.subgoal.models.api import side_by_side
 

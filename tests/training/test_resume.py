@@ -8,10 +8,10 @@ from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-import forked
 import pytest
 import torch
 
+import forked
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.train import main
 from mme_vla.config.composition import compose

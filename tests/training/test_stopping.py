@@ -5,11 +5,11 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-import forked
 import pytest
 import torch
-from test_training import loggers, policy, trainer
 
+import forked
+from helpers.trainings import loggers, policy, trainer
 from mme_vla.policy.run_folders import resolve_checkpoint
 from mme_vla.training.logging import ProgressLine, Window, read_metrics
 from mme_vla.training.stopping import stop_requests

@@ -3,8 +3,9 @@
 import json
 from pathlib import Path
 
-import forked
 import pytest
+
+import forked
 
 
 def test_a_killed_conversion_ends_as_an_undisturbed_one(tmp_path: Path) -> None:

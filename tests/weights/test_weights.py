@@ -6,11 +6,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import forked
 import pytest
 import torch
 from safetensors.torch import save_file
 
+import forked
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats

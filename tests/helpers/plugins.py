@@ -4,10 +4,11 @@ import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from types import ModuleType
 
-PLUGINS = Path(__file__).resolve().parent.parent / "plugins"
+from helpers import REPOSITORY
+
+PLUGINS = REPOSITORY / "plugins"
 
 
 @contextmanager

@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from golden import ERRORS
 from torch import Tensor
 
-SHARED = Path(__file__).resolve().parent.parent.parent / "shared" / "parity_baselines"
+from helpers import REPOSITORY
+from helpers.golden import ERRORS
+
+SHARED = REPOSITORY.parent / "shared" / "parity_baselines"
 
 
 def baselines_folder(method: str) -> Path:

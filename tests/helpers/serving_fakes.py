@@ -1,6 +1,7 @@
 """A policy server in a thread of the test's own process, and the messages clients send it."""
 
 import asyncio
+import http.client
 import threading
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
@@ -149,3 +150,12 @@ def acted_directly(policy: MMEPolicy, parts: list, steps: int = 2, seed: int = 4
         episode.subgoal = subgoal.get("subgoal")
         chunks.append(policy.act([episode], steps)[0])
     return chunks
+
+
+def ask(served: Served, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, str, bytes]:
+    connection = http.client.HTTPConnection(*served.address, timeout=60)
+    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    found = answer.status, answer.headers["Content-Type"], answer.read()
+    connection.close()
+    return found

@@ -12,8 +12,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from plugin_packages import PLUGINS
-
+from helpers.plugins import PLUGINS
 from mme_vla.envs.vector import processes
 
 TRAIN, EVAL, VIZ = (f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval", "dataset_viz"))

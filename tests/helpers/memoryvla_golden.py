@@ -8,11 +8,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mme_vla import build_policy
 from mme_vla.memory.extensions.bank import MemoryBank
 from mme_vla.methods.memoryvla.action_head import DitConfig
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig, MemoryVlaCore
+from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.methods.memoryvla.weights import memoryvla_piece, memoryvla_table
 from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
+from mme_vla.testing.small import unit_stats
 from mme_vla.weights.tables import read
 
 OPTIONS = {"consolidate_type": "consolidation", "fusion_type": "fusion", "update_fused": "store_fused"}
@@ -68,3 +71,15 @@ def golden_name(ours: str) -> str:
     piece = memoryvla_piece(ours)
     assert piece is not None, ours
     return piece.path
+
+
+def reached(**options: Any) -> MemoryVlaPolicy:
+    """A small policy in which everything that is read reaches the chunk."""
+    policy = build_policy("memoryvla", **options)
+    assert isinstance(policy, MemoryVlaPolicy)
+    policy.require_processor().stats = unit_stats(policy.embodiment)
+    generator = torch.Generator().manual_seed(0)
+    for name, parameter in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
+        if name.endswith(("head.output.weight", "in_proj_weight")):
+            torch.nn.init.normal_(parameter, std=0.3, generator=generator)
+    return policy

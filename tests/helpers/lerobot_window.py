@@ -1,6 +1,6 @@
 """LeRobot's π0.5 with its short-window memory: weights and inputs that follow from names, and what it answered.
 
-    python tests/lerobot_window.py    # where a LeRobot is installed that has it: writes data/lerobot_window.json
+    python -m helpers.lerobot_window    # where a LeRobot is installed that has it: writes data/lerobot_window.json
 
 The option is newer than LeRobot 0.6.1, so what it computes is recorded. Recorded with huggingface/lerobot#4076 as it
 stood on main in autumn 2026 (attention in space and time composed, appendix C of MEM).
@@ -8,19 +8,19 @@ stood on main in autumn 2026 (attention in space and time composed, appendix C o
 
 import json
 import zlib
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from helpers import REPOSITORY
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import small_policy
 from mme_vla.types import Batch, HistoryTokens, PastViews
 from mme_vla.weights.ports import LEROBOT_PREFIX, port_adapter
 
-RECORDED = Path(__file__).parent / "data" / "lerobot_window.json"
+RECORDED = REPOSITORY / "tests" / "data" / "lerobot_window.json"
 FRAMES, STRIDE, EVERY, STATE = 3, 5, 2, 8
 SETTINGS = {"memory_frames": FRAMES, "memory_stride": STRIDE, "memory_temporal_attention_every": EVERY}
 VISION = {"image_size": 32, "patch_size": 8, "width": 32, "depth": 3, "mlp_dim": 48, "num_heads": 2}
@@ -88,7 +88,8 @@ def as_batch(policy: MMEPolicy) -> Batch:
 def their_chunk(views: bool, states: bool) -> Tensor:
     """What LeRobot's own policy answers, [b, h, a]."""
     import pytest
-    from lerobot_pi05 import reduce_sizes
+
+    from helpers.lerobot_pi05 import reduce_sizes
 
     policy, given = window_policy(views, states), inputs()
     with pytest.MonkeyPatch.context() as patch:

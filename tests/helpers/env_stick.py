@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import sapien
 import torch
-from envs_testing import recorded, setup
 
+from helpers.env_scenes import recorded, setup
 from mme_vla.envs.robot.stick_skills import arc
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.things import Thing

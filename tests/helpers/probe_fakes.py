@@ -4,14 +4,17 @@ from typing import Any
 
 import numpy as np
 import torch
-from rollout_stand_ins import quick_policy
 from torch import Tensor
 
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
+from helpers.scripted_env import make_far_env
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.envs.vector.pool import Job
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.probing.arms import Arm, read_arms
+from mme_vla.probing.arms import Arm, read_arm, read_arms
 from mme_vla.probing.lines import Line
 from mme_vla.probing.offline import OfflineSettings, probe_offline
+from mme_vla.probing.probed import ProbedPolicy
 from mme_vla.probing.recordings import Recording
 
 SIDE = 64
@@ -94,3 +97,13 @@ def probed(policy: Any, words: list[Any], folder: Any, count: int = 1, **setting
     chosen = OfflineSettings(**{"draws": 3, "moments": 2, "flow_steps": 2, **settings})
     torch.manual_seed(0)
     return probe_offline(policy, arms, recordings[:count], recordings, folder / "offline.jsonl", chosen)
+
+
+JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
+
+
+def actions(policy: MMEPolicy, word: str, **settings: object) -> list[np.ndarray]:
+    probe = ProbedPolicy(policy, read_arm(word), made_up(), None).eval()
+    envs = InlineEnvs(base=make_far_env)
+    roll(probe, JOBS, envs, **settings)
+    return [np.stack(envs.made[job].actions) for job in JOBS]

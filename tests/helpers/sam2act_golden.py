@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from baselines import baselines_folder
 from torch import Tensor
+
+from helpers.baselines import baselines_folder
 
 
 def load(name: str) -> dict[str, np.ndarray]:

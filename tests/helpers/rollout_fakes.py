@@ -9,8 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rollout_scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
-
+from helpers.scripted_env import ScriptedEnv, make_scripted_env, make_slow_env
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.environment import ChunkEnv, make_rollout_env
@@ -84,3 +83,10 @@ def whole_run(
 if __name__ == "__main__":
     os.environ["STEP_S"] = sys.argv[3]
     whole_run(MMEPolicy.from_pretrained(sys.argv[2]), Path(sys.argv[1]))
+
+
+def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:
+    return [
+        EpisodeRecord(model, 1, seed, "PickXtimes", e, e, "easy", "success" if w else "fail", 9, split=split)
+        for e, w in enumerate(won)
+    ]

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 import sapien
-from envs_unmask import wait
 
+from helpers.env_unmask import wait
 from mme_vla.envs.recording.recorder import demonstrate
 from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.scene.draws import Draws

@@ -8,6 +8,20 @@ import numpy as np
 from sapien.physx import PhysxArticulationLinkComponent, PhysxCollisionShapeBox
 
 from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.objects import (
+    build_aperture_box,
+    build_board,
+    build_button,
+    build_container,
+    build_cube,
+    build_disc,
+    build_hidden_cube,
+    build_highlight,
+    build_moving_cube,
+    build_obstacle,
+    build_peg,
+    build_sphere,
+)
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 
@@ -84,3 +98,19 @@ def replay(env: Task, folder: Path, episode: int) -> np.ndarray:
     assert list(dict.fromkeys(subtasks)) == list(dict.fromkeys(text.decode() for text in texts))
     assert success == recorded(folder, type(env).__name__, episode, "info/is_completed")[-1]
     return error
+
+
+def one_of_everything(env: Scene) -> None:
+    env.add(build_cube(env, "cube", "red", (0.1, 0.1), 0.3))
+    env.add(build_hidden_cube(env, "hidden_cube", "green", (0.1, -0.1)))
+    env.add(build_moving_cube(env, "moving_cube", (0.2, 0.3, 0.4), (0.0, 0.0), 0.01))
+    env.add(build_container(env, "container", (0.1, -0.1), 0.5))
+    env.add(build_disc(env, "target", 0.04, 0.005, "purple", (0.0, -0.2)))
+    env.add(build_highlight(env, "highlight", 0.05, 0.001))
+    env.add(build_highlight(env, "rings", 0.04, 0.014, (1.0, 0.0, 0.0), rings=True))
+    env.add(build_sphere(env, "dot", 0.005))
+    env.add(build_button(env, (-0.2, 0.1)))
+    env.add(build_board(env, (0.2, 0.2), 0.2))
+    env.add(build_aperture_box(env, (-0.1, -0.3), 1.2))
+    env.add(build_obstacle(env, "obstacle", (0.1, 0.35), 0.3, (0.0, 0.0, 1.0)))
+    env.add(build_peg(env, "peg", 0.1, 0.01, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-0.1, 0.25), 0.4))

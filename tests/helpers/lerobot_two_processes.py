@@ -10,9 +10,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from plugin_packages import plugin
 from torch import distributed
 
+from helpers.plugins import plugin
 from mme_vla.data import cache_building
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.testing.small import SMALL_VISION, small_policy

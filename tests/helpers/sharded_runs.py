@@ -17,9 +17,9 @@ from typing import Any
 
 import torch
 from accelerate import Accelerator
-from test_training import RECIPE, Samples, collate, policy
 from torch import Tensor, distributed
 
+from helpers.trainings import RECIPE, Samples, collate, policy
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.finetune import apply_finetuning

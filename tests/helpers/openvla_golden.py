@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from baselines import rule_weight
 from torch import Tensor
 
+from helpers.baselines import rule_weight
 from mme_vla.methods.openvla_oft.model import OpenVlaBackbone
 from mme_vla.methods.openvla_oft.weights import VLA, openvla_name
 from mme_vla.policy.finetune import apply_finetuning

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import REPOSITORY
+
+from helpers import REPOSITORY
 
 SOURCE = REPOSITORY.parent / "shared" / "noop_gpu" / "stub.c"
 SITE = Path(torch.__file__).parents[1]
