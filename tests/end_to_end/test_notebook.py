@@ -10,6 +10,8 @@ from helpers import REPOSITORY
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
 NOTEBOOK = REPOSITORY / "examples" / "evaluate.ipynb"
 SETTINGS = {"OUTPUT =": 'OUTPUT = "records"', "EPISODES =": "EPISODES = [0]", "MAX_STEPS =": "MAX_STEPS = 3"}

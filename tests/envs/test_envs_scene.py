@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import sapien
 
-import forked
+from helpers import commands
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
@@ -98,6 +98,7 @@ def test_a_pressed_button_springs_back(everything):
     assert button.depth == 0 and button.base_z == pytest.approx(0.0075)
 
 
+@pytest.mark.slow
 def test_scenes_can_be_built_without_a_vulkan_driver(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
@@ -110,7 +111,7 @@ def test_scenes_can_be_built_without_a_vulkan_driver(tmp_path):
         "except RuntimeError: print('built')"
     )
     hidden = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
-    result = forked.run(str(script), env=hidden)
+    result = commands.run(str(script), env=hidden)
     assert result.stdout.strip().endswith("built"), result.stderr
 
 

@@ -25,3 +25,7 @@ def main() -> None:
 
     lerobot_train.load_training_state, lerobot_train.update_policy = loading, updating
     lerobot_train.main()
+
+
+if __name__ == "__main__":
+    main()

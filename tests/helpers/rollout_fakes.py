@@ -80,13 +80,13 @@ def whole_run(
     return evaluate(policy, jobs, folder, FACTS, chosen, base=base, show_progress=False)
 
 
-if __name__ == "__main__":
-    os.environ["STEP_S"] = sys.argv[3]
-    whole_run(MMEPolicy.from_pretrained(sys.argv[2]), Path(sys.argv[1]))
-
-
 def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:
     return [
         EpisodeRecord(model, 1, seed, "PickXtimes", e, e, "easy", "success" if w else "fail", 9, split=split)
         for e, w in enumerate(won)
     ]
+
+
+if __name__ == "__main__":
+    os.environ["STEP_S"] = sys.argv[3]
+    whole_run(MMEPolicy.from_pretrained(sys.argv[2]), Path(sys.argv[1]))

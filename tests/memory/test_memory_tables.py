@@ -50,6 +50,7 @@ def counted(noop_gpu: NoopGpu) -> dict[str, dict[str, float]]:  # noqa: F811
     return dict(zip(jobs, map(json.loads, lines), strict=True))
 
 
+@pytest.mark.slow
 @needs_noop_gpu
 @pytest.mark.parametrize("model", ["pi05", "tokendrop_expert"])
 def test_a_chunk_takes_what_the_page_says(counted: dict[str, dict[str, float]], model: str) -> None:
@@ -61,6 +62,7 @@ def test_a_chunk_takes_what_the_page_says(counted: dict[str, dict[str, float]], 
     assert found["peak"] <= 6.61
 
 
+@pytest.mark.slow
 @needs_noop_gpu
 def test_a_shared_update_takes_what_the_page_says(counted: dict[str, dict[str, float]]) -> None:
     found = counted["shared pi05:8:8"]

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from forked import Command
-from helpers import REPOSITORY
+from helpers import REPOSITORY, commands
 
 SMALL = ["--backbone", "tiny", "--device", "cpu", "--rounds", "1", "--batch", "2", "--eager"]
 
@@ -71,6 +70,7 @@ def test_lerobots_own_network_stands_beside_ours(gpu: Any) -> None:
     assert row["training"]["samples_per_s"] > 0 and row["chunk"]["eager"]["p50_ms"] > 0
 
 
+@pytest.mark.slow
 def test_many_processes_add_a_line_for_each_way_to_share(tmp_path: Path) -> None:
     report = tmp_path / "gpu.json"
     with socket.socket() as free:
@@ -78,8 +78,8 @@ def test_many_processes_add_a_line_for_each_way_to_share(tmp_path: Path) -> None
         port = free.getsockname()[1]
     words = ["benchmarks/gpu.py", *SMALL, "--models", "tokendrop_expert", "--output", str(report)]
     rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    started = [Command(*words, env={**rendezvous, "RANK": str(r), "LOCAL_RANK": str(r)}) for r in range(2)]
-    first, second = (command.finish(120) for command in started)
+    started = [commands.start(*words, env={**rendezvous, "RANK": str(r), "LOCAL_RANK": str(r)}) for r in range(2)]
+    first, second = (commands.finish(process, 120) for process in started)
     assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
     found = json.loads(report.read_text())["processes"]["2"]
     assert found.keys() == {"tokendrop_expert, ddp", "tokendrop_expert, fsdp"}

@@ -107,6 +107,7 @@ for model in ("framesamp_modul", "rmt_context"):
 """
 
 
+@pytest.mark.slow
 @needs_noop_gpu
 def test_a_gpu_that_does_nothing_counts_no_wait_and_one_launch_a_chunk(noop_gpu: NoopGpu) -> None:  # noqa: F811
     told = noop_gpu.run("-c", COUNTING)

@@ -66,6 +66,7 @@ def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
     assert kinds(last[2]["parts"]) == kinds(last[4]["parts"]) == ["video/mp4", "text"]
 
 
+@pytest.mark.slow
 def test_an_interrupt_does_not_wait_for_answers_under_way():
     code = """
 import signal, threading, time

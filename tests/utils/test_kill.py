@@ -5,13 +5,14 @@ from pathlib import Path
 
 import pytest
 
-import forked
+from helpers import commands
 
 
+@pytest.mark.slow
 def test_a_killed_conversion_ends_as_an_undisturbed_one(tmp_path: Path) -> None:
     report = tmp_path / "killed.json"
     words = ["benchmarks/kill.py", "convert", "--first=4", "--every=4000", f"--json={report}"]
-    done = forked.run(*words, timeout=300)
+    done = commands.run(*words, timeout=300)
     if "no filter of system calls" in done.stderr or "Operation not permitted" in done.stderr:
         pytest.skip("this system does not let processes be traced")
     assert done.returncode == 0, done.stdout + done.stderr[-2000:]
