@@ -49,7 +49,9 @@ def _imports(tree: ast.Module) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             for alias in node.names:
                 name = f"{node.module}.{alias.name}"
-                yield from (target for target in (name, node.module)[name not in modules() :][:1] if target in modules())
+                yield from (
+                    target for target in (name, node.module)[name not in modules() :][:1] if target in modules()
+                )
 
 
 def test_every_package_has_a_place_in_the_order() -> None:

@@ -1,8 +1,8 @@
-"""Eight clients, well-behaved and not, against one server: `python benchmarks/serving_soak.py [seconds]`.
+"""Eight clients, well-behaved and not, against one server: `python benchmarks/soak.py [seconds]`.
 
 Starts `python -m mme_vla.serve` in a process of its own and lets eight clients loose on it for two minutes. Each does
 one thing after the other at random: an episode in either schema or by HTTP, a first message of 1,000 small frames, a
-disconnect in the middle of a request, garbage in a message or on the wire, a message over the limit. Four episodes
+disconnect in the middle of a request, malformed messages, garbage on the wire, a message over the limit. Four episodes
 are known beforehand, each served alone: every chunk of theirs is compared, and must differ from the other episodes'.
 Reads memory from /proc (Linux).
 """
@@ -14,6 +14,7 @@ import random
 import re
 import socket
 import statistics
+import struct
 import subprocess
 import sys
 import tempfile
@@ -34,7 +35,73 @@ from mme_vla.testing.small import moving_frames, small_policy
 CLIENTS, EPISODES, ROUNDS, MESSAGE_MIB = 8, 4, 3, 32
 LONG = 1000  # frames of a long first message
 COMMAND = ["-m", "mme_vla.serve", "port=0", f"limits.message_mib={MESSAGE_MIB}"]
+MALFORMED = 20  # malformed messages a client sends before something else
 TOLERANCE = 1e-4  # between batches of different sizes
+
+ODD: list[Any] = [
+    None, True, -1, 2**63, 1e400, float("nan"), "", "\u202e", "x" * 5000, b"", [], {}, [[]] * 50, {"a": {}}, [None],
+]  # fmt: skip
+
+
+class Mutations:
+    """Malformed messages, the same for the same seed."""
+
+    def __init__(self, seed: int) -> None:
+        self._rng = random.Random(seed)
+        frames, states = moving_frames(8, size=8), np.zeros((8, 8), np.float32)
+        first, later = (
+            challenge(frames[part], states[part], first=i == 0) for i, part in enumerate((slice(4), slice(4, 8)))
+        )
+        image = np.zeros((8, 8, 3), np.uint8)
+        state = np.zeros(8, np.float32)
+        view = {"observation/image": image, "observation/wrist_image": image, "observation/state": state}
+        buffer = {"add_buffer": True, "images": image[None, None], "state": state[None], "exec_start_idx": 0}
+        self._messages: list[dict[str, Any]] = [first, later, {**view, "prompt": "go"}, buffer, {"reset": True}]
+        self._packed = [pack(message) for message in self._messages]
+
+    def next(self) -> bytes:
+        """The next message."""
+        kinds = (self._noise, self._bytes, self._cut, self._splice, self._values, self._values, self._claims)
+        return self._rng.choice(kinds)()
+
+    def _noise(self) -> bytes:
+        return self._rng.randbytes(self._rng.randrange(1, 400))
+
+    def _bytes(self) -> bytes:
+        data = bytearray(self._rng.choice(self._packed))
+        for _ in range(self._rng.randrange(1, 8)):
+            data[min(self._rng.randrange(len(data)), self._rng.randrange(len(data)))] = self._rng.randrange(256)
+        return bytes(data)
+
+    def _cut(self) -> bytes:
+        data = self._rng.choice(self._packed)
+        return data[: self._rng.randrange(1, len(data))]
+
+    def _splice(self) -> bytes:
+        one, other = self._rng.sample(self._packed, 2)
+        return one[: self._rng.randrange(1, len(one))] + other[self._rng.randrange(len(other)) :]
+
+    def _values(self) -> bytes:
+        message = dict(self._rng.choice(self._messages))
+        key = self._rng.choice(list(message))
+        odd = self._rng.choice(ODD)
+        how = self._rng.randrange(4)
+        if how == 0 and isinstance(message[key], list):
+            message[key] = [*message[key], odd]
+        elif how == 1:
+            del message[key]
+            message[str(key)[:-1]] = odd
+        elif how == 2 and isinstance(message[key], np.ndarray):
+            message[key] = message[key][..., :-1].astype(self._rng.choice(["<f8", "|b1", "<U1", ">i2"]))
+        else:
+            message[key] = odd
+        return pack(message)
+
+    def _claims(self) -> bytes:
+        size = self._rng.choice([0, 1, 17, 2**16, 2**31, 2**32 - 1])
+        tag = self._rng.choice([0xC6, 0xC9, 0xDB, 0xDD, 0xDF])
+        inner = self._rng.choice([b"\x80", b"\x90", b"\x91" * 600, b"\xc0", b"\xdd\x00\x01\x00\x00"])
+        return bytes([tag]) + struct.pack(">I", size) + inner * self._rng.randrange(1, 200)
 
 
 class Soak:
@@ -133,15 +200,19 @@ class Soak:
         client.close()
 
     def garbage(self, rng: random.Random) -> None:
-        first, later, *_ = self.episodes[0]
-        bad = [rng.randbytes(rng.randrange(1, 5000)), pack({"nonsense": 1}), pack({**first, "task_goal": 3}),
-               pack(first)[:-7], pack(later), pack([1, 2, 3])]  # fmt: skip
-        client = self.connect()
-        client._socket.send(rng.choice(bad))
-        reply = client._socket.recv(60)
-        client.close()
-        if not isinstance(reply, str) or "Traceback" in reply:
-            raise AssertionError(f"garbage was answered with {reply[:100]!r}")
+        """Malformed messages by websocket and HTTP: each gets an error message, or happens to be well-formed."""
+        mutations = Mutations(rng.randrange(2**32))
+        for _ in range(MALFORMED):
+            data = mutations.next()
+            with self.connect() as client:
+                client._socket.send(data)
+                reply = client._socket.recv(60)
+            status, body = self.post(data, "garbage")
+            if status >= 500 or "Traceback" in str(reply) or b"Traceback" in body or not (reply and body):
+                raise AssertionError(
+                    f"{data[:100]!r} was answered with {reply[:100]!r} and HTTP {status} {body[:100]!r}"
+                )
+            self.counts["malformed messages"] += 2
 
     def garbage_on_the_wire(self, rng: random.Random) -> None:
         noise = rng.randbytes(2000)

@@ -1,16 +1,27 @@
-"""Result logs, answers of predictors and players, fine-tuning rows, official metadata."""
+"""Small valid files of every kind that the library reads, and all of their content as the library reads it."""
 
+import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
-from benchmarks.fuzz_targets.base import Target, digest, every_file
+from helpers.h5_files import write_file
+from mme_vla.data.cache import VisionCache, fingerprint
+from mme_vla.data.cache_building import build_cache
+from mme_vla.data.convert import convert
+from mme_vla.data.episodes import EpisodeSource
+from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
+from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.envs import metadata
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.store import RECORDS, RecordLog, claim_run, read_records, read_run
+from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.play.game import Option
 from mme_vla.play.vlm_players import parse_choice
 from mme_vla.subgoal.base import Usage
@@ -19,6 +30,123 @@ from mme_vla.subgoal.models.api import Api, Reply, Settings
 from mme_vla.subgoal.text import MalformedReply, parse_gemini, parse_memer, parse_subgoal, pixels_of_pairs
 from mme_vla.utils import read_text, write_sums
 from mme_vla.utils.media import png_bytes, video_bytes
+
+
+def digest(*values: object) -> str:
+    """A hash of arrays and of whatever has a faithful `repr`."""
+    hasher = hashlib.sha256()
+    for value in values:
+        if isinstance(value, np.ndarray):
+            hasher.update(f"{value.dtype} {value.shape}".encode() + np.ascontiguousarray(value).tobytes())
+        else:
+            hasher.update(repr(value).encode("utf-8", "surrogatepass"))
+    return hasher.hexdigest()
+
+
+LENGTHS, VIDEO, SIDE = (12, 9), 4, 32  # steps of the episodes, of which so many are video; pixels
+H5 = "record_dataset_PickXtimes.h5"
+
+
+def write_recording(folder: Path) -> None:
+    """A file in the layout of RoboMME's recorder."""
+    write_file(folder / H5, LENGTHS, videos=[VIDEO, VIDEO], size=SIDE)
+
+
+def read_recording(folder: Path) -> object:
+    """Every frame of every episode."""
+    read: list[object] = []
+    for ref in list_episodes(find_files([folder / H5])):
+        with open_episode(ref) as episode:
+            read += [ref.index, ref.task, episode.goals, episode.seed, episode.difficulty, episode.exec_start]
+            for frame in episode:
+                read += [
+                    frame.front,
+                    frame.wrist,
+                    frame.state,
+                    frame.action,
+                    frame.is_demo,
+                    sorted(frame.subgoals.items()),
+                ]
+    return digest(*read)
+
+
+def write_dataset(folder: Path) -> None:
+    """The same as a LeRobot dataset with videos, without checksums."""
+    work = folder / "recording"
+    work.mkdir()
+    write_recording(work)
+    convert(list_episodes(find_files([work])), folder / "dataset")
+    shutil.rmtree(work)
+    (folder / "dataset" / "SHA256SUMS").unlink(missing_ok=True)
+
+
+def write_summed_dataset(folder: Path) -> None:
+    """The same with checksums."""
+    write_dataset(folder)
+    write_sums(folder / "dataset")
+
+
+def read_dataset(folder: Path) -> object:
+    """Every column and image, and the checksums as `inspect` compares them."""
+    source = EpisodeSource(folder / "dataset", name="fuzzed")
+    source.verify()
+    read: list[object] = [source.fps, source.lengths, source.exec_starts, source.subgoal_names]
+    for e in range(len(source)):
+        steps = range(int(source.lengths[e]))
+        read += [source.goal(e), source.task(e), source.states(e), source.actions(e)]
+        read += [sorted(source.subgoals(e, t).items()) for t in steps]
+        read += [source.frames(e, list(steps), view) for view in source.columns]
+    return digest(*read)
+
+
+class SyntheticSource:
+    """As much of an `EpisodeSource` as a cache asks for."""
+
+    name, fingerprint = "fuzzed", "0123456789abcdef"
+    lengths, exec_starts = np.array(LENGTHS), np.array([VIDEO, VIDEO])
+    robot, columns = ROBOMME_JOINT, {"front": "image", "wrist": "wrist_image"}
+
+    def __len__(self) -> int:
+        return len(LENGTHS)
+
+    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+        return np.ones(LENGTHS[episode], bool)
+
+    def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
+        values = np.random.default_rng(episode).integers(0, 255, (LENGTHS[episode], SIDE, SIDE, 3), np.uint8)
+        return values[np.asarray(indices)]
+
+
+def _memory() -> TokenDrop:
+    return TokenDrop(d_vision=8, width=8, budget=8, grid=2, stride=2)
+
+
+def _encode(frames: np.ndarray) -> Tensor:
+    return torch.from_numpy(frames.reshape(len(frames), -1)[:, :32].astype(np.float32)).view(-1, 4, 8)
+
+
+def expected_fingerprint() -> dict[str, Any]:
+    source: Any = SyntheticSource()
+    return fingerprint(source, _memory().storage, "encoder")
+
+
+def write_cache(folder: Path) -> None:
+    """The vision cache of two episodes, with scores."""
+    source: Any = SyntheticSource()
+    build_cache(source, _memory(), _encode, folder / "cache", expected_fingerprint(), shard=(0, 1))
+
+
+def read_cache(folder: Path) -> object:
+    """Every token and score."""
+    source: Any = SyntheticSource()
+    cache = VisionCache(folder / "cache", source, expected_fingerprint())
+    read: list[object] = [cache.width]
+    for episode in range(len(source)):
+        history = cache.history(episode)
+        stored = cache.spec.stored_frames(len(history))
+        every = np.stack([np.repeat(stored, 4), np.tile(np.arange(4), len(stored))], axis=1)
+        read += [history.gather(every).view(torch.int16).numpy(), history.scores.frames, history.scores.values]
+    return digest(*read)
 
 
 def write_logs(folder: Path) -> None:
@@ -41,7 +169,7 @@ def read_logs(folder: Path) -> object:
     return digest(sorted(map(repr, run.items()))), tuple(map(repr, read_records(folder / RECORDS)))
 
 
-def _is_shorter(valid: Any, result: Any) -> bool:
+def is_shorter(valid: Any, result: Any) -> bool:
     """A log cut after a whole line is that of a run that was stopped there: it continues with the missing episodes."""
     return result[0] == valid[0] and result[1] == valid[1][: len(result[1])]
 
@@ -142,16 +270,3 @@ def write_metadata(folder: Path) -> None:
 def read_metadata(folder: Path) -> object:
     """Every episode."""
     return tuple(map(repr, metadata.episodes("PickXtimes", "test", folder)))
-
-
-def _always(valid: object, result: object) -> bool:
-    return True
-
-
-TARGETS = [
-    Target("logs", write_logs, every_file, read_logs, _is_shorter),
-    Target("kept-answers", write_answers, every_file, read_answers),
-    Target("answers", write_replies, every_file, read_replies, _always),
-    Target("rows", write_rows, every_file, read_rows),
-    Target("metadata", write_metadata, every_file, read_metadata, _always),
-]
