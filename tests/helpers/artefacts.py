@@ -109,7 +109,7 @@ class SyntheticSource:
     def __len__(self) -> int:
         return len(LENGTHS)
 
-    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+    def rendered(self, episode: int, camera: str | None = None) -> np.ndarray:
         return np.ones(LENGTHS[episode], bool)
 
     def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
