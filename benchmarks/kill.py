@@ -99,7 +99,7 @@ def run(words: str, base: Path, kill_at: int = 0, after: float | None = None) ->
     log = base / "changes.log"
     log.unlink(missing_ok=True)
     path = os.pathsep.join([str(REPOSITORY), *sys.path[:1]])
-    variables = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1"}
+    variables = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "HF_HUB_OFFLINE": "1", "PYTHONHASHSEED": "0"}
     process = subprocess.Popen(
         [sys.executable, "-W", "ignore", "-c", RUN, str(kill_at), str(log), *words.split()], cwd=base, env=variables,
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,

@@ -76,14 +76,3 @@ def under(things: Sequence[Thing], containers: Sequence[Thing]) -> bool:
 def texts(env: Task) -> list[tuple[str, str, str]]:
     """Text, grounded text and choice of every sub-task."""
     return [(step.text, step.grounded_text, step.choice) for step in env.progress.subtasks]
-
-
-def same_twice(task: type[Task], seed: int, difficulty: str, steps: int) -> bool:
-    """Whether two environments made alike are in the same state, to the bit, after a number of steps."""
-    states = []
-    for _ in range(2):
-        env = make(task, seed, difficulty)
-        wait(env, steps)
-        states.append(env.get_state())
-        env.close()
-    return bool((states[0] == states[1]).all())
