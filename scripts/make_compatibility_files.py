@@ -178,7 +178,7 @@ def actions(policy: Any, width: int = 8, depth: bool = False) -> list[Any]:
 
 def make_dataset(folder: Path, scratch: Path) -> None:
     """Two synthetic episodes as a dataset of images and as one of videos, and the side file of first frames."""
-    from h5_files import write_file
+    from helpers.h5_files import write_file
 
     recordings = scratch / "h5"
     recordings.mkdir()
@@ -294,7 +294,7 @@ def evaluate(folder: Path) -> None:
 
 def evaluate_scripted(folder: Path, output: Path) -> Any:
     """Run, or continue with, four episodes in the tests' own environment, which needs no simulator."""
-    from rollout_scripted_env import make_far_env
+    from helpers.scripted_env import make_far_env
 
     return mme_vla.evaluate(
         folder / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3, output=output, base=make_far_env,

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from test_sight import TABLES, blocks_of, validity
 from torch import Tensor
 
+from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
 from mme_vla.backbone.attention import attend, build_mask, select_rows
 from mme_vla.backbone.blocks import MaskLayout, Visibility

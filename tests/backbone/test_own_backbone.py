@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.evaluation.store import read_records
 from mme_vla.testing import check_backbone

@@ -1,37 +1,18 @@
 """Who may see whom, run by run: the visibility table for whatever a valid token asks, and no row without a key."""
 
 import math
-from collections.abc import Mapping
 
 import pytest
 import torch
 from torch import Tensor
 
+from helpers.visibility import TABLES, blocks_of, validity
 from mme_vla import UserError
 from mme_vla.backbone import attention, gemma
 from mme_vla.backbone.attention import ALIGNMENT, BIG_NEGATIVE, layout_mask
 from mme_vla.backbone.blocks import PI05_VISIBILITY, MaskLayout, Span, Visibility, attention_mask
-from mme_vla.integration.base import MEMORY_VISIBILITY, memory_visibility
+from mme_vla.integration.base import MEMORY_VISIBILITY
 from mme_vla.testing.small import random_batch, small_policy
-
-OWN: Visibility = {
-    "memory": {"memory", "images"}, "images": {"prompt"}, "prompt": {"memory", "action"},
-    "action": {"memory", "images", "prompt", "action"},
-}  # fmt: skip
-TABLES: Mapping[str, Visibility] = {
-    "pi05": PI05_VISIBILITY,
-    "memory": MEMORY_VISIBILITY,
-    "paper": memory_visibility(prompt_sees_memory=False),
-    "own": OWN,
-}
-
-
-def blocks_of(table: Visibility) -> list[Span]:
-    return [Span(name, length) for name, length in zip(table, (5, 7, 6, 4), strict=False)]
-
-
-def validity(n: int, seed: int = 0) -> Tensor:
-    return torch.rand(3, n, generator=torch.Generator().manual_seed(seed)) < 0.7
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=TABLES)

@@ -5,7 +5,6 @@ and the words that install it.
 """
 
 import ast
-import json
 import os
 import re
 import subprocess
@@ -16,12 +15,11 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 from typing import NamedTuple
 
-import forked
 import pytest
-from h5_files import write_file
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from helpers.h5_files import write_file
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import find_records, read_folders
 
@@ -30,7 +28,6 @@ FOLDER = REPOSITORY / "tests" / "extras"
 NEW = "uv sync --inexact --extra {}"
 
 
-# The first test to run waits for all commands.
 pytestmark = pytest.mark.timeout(600)
 
 
@@ -118,31 +115,36 @@ NEED = [
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Where the commands are run."""
-    return tmp_path_factory.mktemp("extras")
-
-
-@pytest.fixture(scope="module")
-def ended(folder: Path) -> dict[Case, tuple[int, str]]:
-    """How every command ended, and what it said."""
-    drawn = can_draw()
-    there = [
-        case for case in [*SUFFICE, *NEED] if all(is_installed(e) for e in case.extras) and (drawn or not case.draws)
-    ]
-    asked = [[case.words.split(), hidden(case.extras), case.wait] for case in there]
+    folder = tmp_path_factory.mktemp("extras")
     write_file(folder / "record_dataset_Alpha.h5", [9, 7])
+    return folder
+
+
+def run(case: Case, folder: Path) -> tuple[int, str]:
+    """Exit code and output of a command, run where only its own extras are installed."""
+    if not all(is_installed(extra) for extra in case.extras):
+        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
+    if case.draws and not can_draw():
+        pytest.skip("no Vulkan driver: scripts/install_vulkan.sh installs one")
     path = os.pathsep.join([str(FOLDER), str(REPOSITORY)])
-    variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(())), "HF_HUB_OFFLINE": "1",
-                 "OMP_NUM_THREADS": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
+    variables = {**os.environ, "PYTHONPATH": path, "HIDDEN_MODULES": " ".join(hidden(case.extras)),
+                 "HF_HUB_OFFLINE": "1", "GEMINI_API_KEY": "none", "GOOGLE_API_KEY": "none",
                  "OPENAI_API_KEY": "none"}  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(FOLDER / "commands.py")], input=json.dumps(asked), env=variables,
-        cwd=folder, capture_output=True, text=True, timeout=550,
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-m", *case.words.split()], env=variables, cwd=folder,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    answers = [tuple(answer) for answer in json.loads(done.stdout.splitlines()[-1])]
-    return dict(zip(there, answers, strict=True))
+    with process:
+        assert process.stdout is not None
+        printed = ""
+        for line in process.stdout:
+            printed += line
+            if case.wait and case.wait in line:
+                process.terminate()
+    return process.returncode, printed
 
 
+@cache
 def can_draw() -> bool:
     from mme_vla.envs.rendering import render_backend
 
@@ -157,41 +159,32 @@ def name_of(case: Case) -> str:
     return f"{'+'.join(case.extras) or 'none'}:{case.words.split()[0].removeprefix('mme_vla.')}:{case.says}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SUFFICE, ids=name_of)
-def test_the_command_runs_with_this_extra_alone(ended: dict[Case, tuple[int, str]], case: Case) -> None:
-    if case not in ended:
-        driver = "; scripts/install_vulkan.sh installs the driver" if case.draws else ""
-        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}{driver}")
-    code, said = ended[case]
-    assert code == case.code and case.says in said, said[-3000:]
+def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> None:
+    code, output = run(case, folder)
+    assert code == case.code and case.says in output, output[-3000:]
+    if case.words.endswith(NANO):  # run again, it computes nothing twice
+        nano = folder / "nano"
+        records = read_folders(find_records([nano / "framesamp_modul"]))
+        assert sorted(record.episode for record in records) == [0, 1]
+        assert {record.action_space for record in records} == {"waypoint"}
+        page = (nano / "page.md").read_text()
+        assert "| framesamp_modul" in page and "| planner" in page and (nano / "learning.png").is_file()
+        videos = list(nano.glob("films/failure/**/*.mp4"))
+        assert len(videos) == 1 and videos[0].name in page
+        written = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
+        assert run(case, folder)[0] == 0
+        assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == written
+        assert len(read_folders(find_records([nano / "framesamp_modul"]))) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", NEED, ids=name_of)
-def test_a_command_names_the_extra_that_it_needs(ended: dict[Case, tuple[int, str]], case: Case) -> None:
-    if case not in ended:
-        pytest.skip(f"not installed: {NEW.format(' --extra '.join(case.extras))}")
-    code, said = ended[case]
-    assert code == case.code and "Traceback" not in said, said[-3000:]
-    assert f"extra `{case.says}`" in said and NEW.format(case.says) in said
-
-
-def test_nano_goes_from_nothing_to_a_page_and_again_without_doing_anything_twice(
-    ended: dict[Case, tuple[int, str]], folder: Path
-) -> None:
-    if not any(case.words.endswith(NANO) for case in ended):
-        pytest.skip(f"needs the simulator, {NEW.format('sim')}, and a driver: scripts/install_vulkan.sh")
-    made = folder / "nano"
-    records = read_folders(find_records([made / "framesamp_modul"]))
-    assert [record.episode for record in sorted(records, key=lambda r: r.episode)] == [0, 1]
-    assert {record.action_space for record in records} == {"waypoint"}
-    page = (made / "page.md").read_text()
-    assert "| framesamp_modul" in page and "| planner" in page and (made / "learning.png").is_file()
-    films = list(made.glob("films/failure/**/*.mp4"))
-    assert len(films) == 1 and films[0].name in page
-    written = {path: path.stat().st_mtime_ns for path in made.rglob("*.npz")}
-    assert forked.run("mme_vla.nano", *NANO.split(), cwd=folder).returncode == 0
-    assert {path: path.stat().st_mtime_ns for path in made.rglob("*.npz")} == written
-    assert len(read_folders(find_records([made / "framesamp_modul"]))) == 2
+def test_a_command_names_the_extra_that_it_needs(folder: Path, case: Case) -> None:
+    code, output = run(case, folder)
+    assert code == case.code and "Traceback" not in output, output[-3000:]
+    assert f"extra `{case.says}`" in output and NEW.format(case.says) in output
 
 
 def test_every_command_is_among_the_cases() -> None:

@@ -71,6 +71,7 @@ def said() -> dict[str, str]:
     return answers
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", WITHOUT)
 def test_it_is_imported_without_what_it_does_not_need(said: dict[str, str], what: str) -> None:
     assert said[what] == ""

@@ -8,8 +8,8 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from h5_files import write_file
 
+from helpers.h5_files import write_file
 from mme_vla import cli
 from mme_vla.config.errors import print_user_errors
 from mme_vla.data.convert import ConvertOptions, convert
@@ -23,6 +23,7 @@ PNG = ConvertOptions(images="png")
 CONFIG = {"train": {"steps": 3}, "seed": 1}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("number", "code", "words"), [("SIGINT", 130, "Ctrl-C"), ("SIGTERM", 143, "SIGTERM")])
 def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str, code: int, words: str) -> None:
     script = f"""
@@ -49,6 +50,7 @@ def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sente
     assert "Stopped by Ctrl-C" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("room", ["play", "nano", "envs", "serving", "data.cache"])
 def test_nothing_slow_is_imported_before_a_command_can_be_stopped(room: str) -> None:
     """`python -m mme_vla.<room>…` imports the package first, and only then what turns signals into a sentence."""
@@ -100,6 +102,7 @@ def test_a_released_lock_leaves_nothing_and_work_stays(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["work"]
 
 
+@pytest.mark.slow
 def test_drafts_of_killed_processes_are_removed_and_those_of_others_are_not(tmp_path: Path) -> None:
     mine, theirs = draft_of(tmp_path / "a"), tmp_path / ".a.elsewhere-1-00000000.partial"
     ended = subprocess.Popen(["true"])

@@ -2,8 +2,9 @@
 
 from pathlib import Path
 
-import forked
 import pytest
+
+from helpers import commands
 
 pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="launchers: uv sync --inexact --extra sweep")
 pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="launchers: uv sync --inexact --extra sweep")
@@ -11,10 +12,11 @@ pytest.importorskip("hydra_plugins.hydra_submitit_launcher", reason="launchers: 
 TINY = ("backbone=tiny", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=1")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)  # each job is a process that imports everything
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_a_launcher_runs_every_job_of_a_sweep(launcher: str, tmp_path: Path) -> None:
-    done = forked.run(
+    done = commands.run(
         "mme_vla.probe", "--multirun", f"launcher={launcher}", "seed=7,42", "model=framesamp_modul", *TINY,
         "recordings=sample", "recorded=1", "with=[shuffle]", "draws=2", "moments=1", "scan=false",
         f"output={tmp_path}/${{seed}}", f"hydra.sweep.dir={tmp_path}/sweep", timeout=800,

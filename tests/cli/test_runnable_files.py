@@ -3,7 +3,9 @@
 import json
 from pathlib import Path
 
-import forked
+import pytest
+
+from helpers import commands
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 
@@ -26,6 +28,7 @@ print(json.dumps(ended))
 """
 
 
+@pytest.mark.slow
 def test_every_benchmark_and_example_imports_and_has_help(tmp_path: Path) -> None:
     files = sorted(
         str(file)
@@ -36,7 +39,7 @@ def test_every_benchmark_and_example_imports_and_has_help(tmp_path: Path) -> Non
     assert any(file.endswith("subgoal_cost.py") for file in files)
     all_of_them = tmp_path / "all.py"
     all_of_them.write_text(ALL)
-    done = forked.run(str(all_of_them), json.dumps(files))
+    done = commands.run(str(all_of_them), json.dumps(files))
     assert done.returncode == 0, done.stderr
     ended = json.loads(done.stdout.splitlines()[-1])
     assert {Path(file).name: code for file, (code, _) in ended.items() if code != 0} == {}

@@ -5,13 +5,13 @@ import sys
 import textwrap
 from pathlib import Path
 
-import forked
 import pytest
 from hydra import initialize_config_dir
 from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from helpers import commands
 from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins, options_first
 from mme_vla.config.naming import join_memories, resolve_name
 from mme_vla.errors import UserError
@@ -235,15 +235,17 @@ def app(tree: Path, tmp_path: Path) -> Path:
 
 
 def run(app: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return forked.run(str(app), *arguments, cwd=app.parent)
+    return commands.run(str(app), *arguments, cwd=app.parent)
 
 
+@pytest.mark.slow
 def test_a_command_runs_with_hydras_run_folder(app: Path) -> None:
     done = run(app, "model=tokendrop_expert", "hydra.run.dir=here")
     assert done.stdout == "ran tokendrop_expert 512 0.001 app\n", done.stderr
     assert (app.parent / "here" / ".hydra" / "config.yaml").is_file()
 
 
+@pytest.mark.slow
 def test_a_mistyped_command_ends_before_it_starts(app: Path) -> None:
     done = run(app, "model=tokendrp_expert")
     assert (done.returncode, done.stdout) == (2, "")
@@ -252,6 +254,7 @@ def test_a_mistyped_command_ends_before_it_starts(app: Path) -> None:
     assert not (app.parent / "outputs").exists()
 
 
+@pytest.mark.slow
 def test_a_user_error_is_printed_whole_and_a_bug_keeps_its_traceback(app: Path) -> None:
     done = run(app, "seed=13")
     assert done.returncode == 2
@@ -263,6 +266,7 @@ def test_a_user_error_is_printed_whole_and_a_bug_keeps_its_traceback(app: Path) 
     assert "app.py" in bug.stderr
 
 
+@pytest.mark.slow
 def test_a_value_still_needed_is_asked_for(app: Path, tree: Path) -> None:
     (tree / "train" / "default.yaml").write_text("lr: 1\ndata: ???")
     done = run(app)
@@ -271,6 +275,7 @@ def test_a_value_still_needed_is_asked_for(app: Path, tree: Path) -> None:
     assert run(app, "--cfg", "job").returncode == 0
 
 
+@pytest.mark.slow
 def test_hydras_own_switches_still_work(app: Path, tmp_path: Path) -> None:
     mine = write_tree(tmp_path / "mine", {"memory/mine.yaml": "{name: mine, budget: 7}"})
     swept = run(app, "--multirun", "--config-dir", str(mine), "train.lr=1,2", "memory=mine")

@@ -5,10 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import forked
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY, commands
 from mme_vla.config.composition import compose, config_dir, help_text
 from mme_vla.config.help import COMMANDS, choices, defaults, keys, near_keys
 from mme_vla.errors import UserError
@@ -19,7 +18,7 @@ MODULES = {name: words.removeprefix("python -m ") for name, words in COMMANDS.it
 def ask(module: str, *words: str, code: int = 0) -> str:
     """What a command says; it must end with `code` and never with a traceback."""
     environment = {"COLUMNS": "100", "PATH": "", "HOME": str(REPOSITORY)}
-    done = forked.run(module, *words, env=environment)
+    done = commands.run(module, *words, env=environment)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done.stdout if code == 0 else done.stderr
@@ -52,6 +51,7 @@ def test_help_names_the_files_of_a_group_and_own_ones_too(tmp_path: Path) -> Non
         help_text("train", ["memori"], [config_dir()])
 
 
+@pytest.mark.slow
 def test_help_under_a_choice_shows_its_keys() -> None:
     text = ask("mme_vla.train", "--help", "model=framesamp_modul")
     assert text.startswith("Usage: python -m mme_vla.train ")
@@ -60,6 +60,7 @@ def test_help_under_a_choice_shows_its_keys() -> None:
     assert "Did you mean 'framesamp_modul'" in ask("mme_vla.train", "--help", "model=framesamp_modl", code=2)
 
 
+@pytest.mark.slow
 def test_help_needs_no_torch() -> None:
     watch = "import sys, runpy; sys.argv = ['x', '--help']\n" \
             "try: runpy.run_module('mme_vla.train', run_name='__main__')\n" \
@@ -68,6 +69,7 @@ def test_help_needs_no_torch() -> None:
     assert done.stderr.split()[-1] == "False", done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("module", "words", "said"),
     [

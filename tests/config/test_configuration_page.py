@@ -4,7 +4,8 @@ import importlib.util
 import re
 
 import pytest
-from conftest import REPOSITORY
+
+from helpers import REPOSITORY
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.fuzz_targets import texts
+from helpers import artefacts
 from mme_vla.envs import metadata
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import RECORDS, read_records, read_run
@@ -16,7 +16,7 @@ from mme_vla.utils import verified, with_checksum
 
 
 def test_a_digit_that_changed_in_a_record_is_found(tmp_path: Path) -> None:
-    texts.write_logs(tmp_path)
+    artefacts.write_logs(tmp_path)
     path = tmp_path / RECORDS
     assert len(read_records(path)) == 5
     path.write_text(path.read_text().replace('"steps":302', '"steps":312'))
@@ -25,7 +25,7 @@ def test_a_digit_that_changed_in_a_record_is_found(tmp_path: Path) -> None:
 
 
 def test_records_written_without_a_checksum_still_read(tmp_path: Path) -> None:
-    texts.write_logs(tmp_path)
+    artefacts.write_logs(tmp_path)
     path = tmp_path / RECORDS
     lines = [json.loads(line) for line in path.read_text().splitlines()]
     path.write_text("".join(json.dumps({k: v for k, v in line.items() if k != "crc32"}) + "\n" for line in lines))
@@ -34,7 +34,7 @@ def test_records_written_without_a_checksum_still_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("value", ['"x"', "1e999", "true", "[1]", "9" * 400])
 def test_seconds_that_are_no_seconds_are_refused(tmp_path: Path, value: str) -> None:
-    texts.write_logs(tmp_path)
+    artefacts.write_logs(tmp_path)
     line = json.loads((tmp_path / RECORDS).read_text().splitlines()[0])
     del line["crc32"]
     line["seconds"]["sim"] = "HERE"
@@ -44,7 +44,7 @@ def test_seconds_that_are_no_seconds_are_refused(tmp_path: Path, value: str) -> 
 
 
 def test_an_endless_device_in_a_logs_place_is_refused(tmp_path: Path) -> None:
-    texts.write_logs(tmp_path)
+    artefacts.write_logs(tmp_path)
     for name in (RECORDS, "run.json"):
         (tmp_path / name).unlink()
         (tmp_path / name).symlink_to("/dev/zero")
@@ -55,7 +55,7 @@ def test_an_endless_device_in_a_logs_place_is_refused(tmp_path: Path) -> None:
 
 
 def test_notes_of_a_run_that_changed_are_found(tmp_path: Path) -> None:
-    texts.write_logs(tmp_path)
+    artefacts.write_logs(tmp_path)
     path = tmp_path / "run.json"
     path.write_text(path.read_text().replace('"cpu"', '"gpu"'))
     with pytest.raises(UserError, match="not what was written"):
@@ -64,19 +64,19 @@ def test_notes_of_a_run_that_changed_are_found(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "[", "[]", "null"])
 def test_a_damaged_answer_is_asked_for_again(tmp_path: Path, damage: str, caplog) -> None:
-    texts.write_answers(tmp_path)
+    artefacts.write_answers(tmp_path)
     kept = next((tmp_path / "answers").rglob("*.json"))
     kept.write_text(damage)
-    assert texts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
+    assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
     assert "asked again" in caplog.text
     kept.unlink()
     kept.mkdir()
-    assert texts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
+    assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
 
 
 @pytest.mark.parametrize("record", ['"x"', '{"episode": 0}', '{"episode": 0, "seed": 1e3, "difficulty": "easy"}'])
 def test_metadata_of_another_form_is_refused(tmp_path: Path, record: str) -> None:
-    texts.write_metadata(tmp_path)
+    artefacts.write_metadata(tmp_path)
     next(tmp_path.rglob("*.json")).write_text(f'{{"records": [{record}]}}')
     with pytest.raises(UserError, match="not official metadata"):
         metadata.episodes("PickXtimes", "test", tmp_path)

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli import analyse, inspect
 from mme_vla.cli.weights import convert
@@ -192,6 +192,7 @@ def test_episodes_of_an_own_task_have_seeds_of_their_own(stranger: Path) -> None
     assert [job.episode for job in choose_episodes("Stay", [3], "val")] == [3]
 
 
+@pytest.mark.slow
 def test_hydra_imports_nothing_from_the_folder_one_stands_in(tmp_path: Path) -> None:
     (tmp_path / "hydra_plugins" / "strange").mkdir(parents=True)
     (tmp_path / "hydra_plugins" / "strange" / "__init__.py").write_text("open('ran', 'w').close()\n")

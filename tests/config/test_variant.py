@@ -4,9 +4,9 @@ import json
 import textwrap
 from pathlib import Path
 
-import forked
 import pytest
 
+from helpers import commands
 from mme_vla.config.composition import compose
 from mme_vla.evaluation.records import EpisodeRecord, complete_compositions
 from mme_vla.evaluation.results.aggregate import aggregate
@@ -71,6 +71,7 @@ def test_own_memories_are_named_by_their_files_and_parts(own: Path) -> None:
     assert name_of("memory=mine", "integration=context", extra=own) == "mine_context"
 
 
+@pytest.mark.slow
 def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path) -> None:
     app = tmp_path / "app.py"
     app.write_text(
@@ -79,10 +80,10 @@ def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path
         '    print("at", cfg.name, cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
     )
     words = ["integration=modulator", "memory=framesamp"]
-    done = forked.run(str(app), *words, cwd=tmp_path)
+    done = commands.run(str(app), *words, cwd=tmp_path)
     assert done.stdout.startswith(f"at framesamp_modul framesamp_modul {tmp_path}/outputs/framesamp_modul/"), done
     words = ["--multirun", "integration=modulator", "memory=framesamp,tokendrop"]
-    done = forked.run(str(app), *words, cwd=tmp_path)
+    done = commands.run(str(app), *words, cwd=tmp_path)
     lines = [line.split() for line in done.stdout.splitlines() if line.startswith("at ")]
     assert [(line[1], Path(line[3]).name) for line in lines] == [
         ("framesamp_modul", "0_framesamp_modul"),

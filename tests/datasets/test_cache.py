@@ -3,13 +3,13 @@
 import json
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 import torch
-from fakes import WIDTH, LastFrames, encode
-from h5_files import write_file
 
+from helpers import commands
+from helpers.h5_files import write_file
+from helpers.memory_fakes import WIDTH, LastFrames, encode
 from mme_vla.data import cache as store
 from mme_vla.data import cache_building as cache_build
 from mme_vla.data.cache import (
@@ -93,6 +93,7 @@ def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_pa
     assert resumed.width == whole.width
 
 
+@pytest.mark.slow
 def test_drafts_of_a_killed_build_are_removed_by_the_next(source, tmp_path) -> None:
     memory = LastFrames(scored=True)
     build = tmp_path / "build.py"
@@ -102,7 +103,7 @@ def test_drafts_of_a_killed_build_are_removed_by_the_next(source, tmp_path) -> N
     )
     folder = cache_folder(tmp_path, source, expected := fingerprint(source, memory.storage, "abc", "float32"))
     folder.mkdir(parents=True)
-    assert forked.run(str(build), str(token_file(folder, 0))).returncode == -9
+    assert commands.run(str(build), str(token_file(folder, 0))).returncode == -9
     assert len(list(folder.iterdir())) == 1
     build_cache(source, memory, encode, folder, expected)
     assert not [path for path in folder.iterdir() if path.name.endswith(".partial")]

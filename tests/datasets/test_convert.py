@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from h5_files import Recorded, write_file
 
 import mme_vla.data.convert as convert_module
+from helpers.h5_files import Recorded, write_file
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes

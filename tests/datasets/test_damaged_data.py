@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from benchmarks.fuzz_targets import data, texts
+from helpers import artefacts
 from mme_vla.data.cache import VisionCache, sum_file, token_file
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.lerobot_files import SAMPLE
@@ -118,13 +118,13 @@ def test_a_dataset_with_sums_is_checked_where_it_is_read_and_whole_on_request(co
 
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
-    data.write_cache(tmp_path)
+    artefacts.write_cache(tmp_path)
     return tmp_path / "cache"
 
 
 def opened(folder: Path) -> VisionCache:
-    source: Any = data._SyntheticSource()
-    return VisionCache(folder, source, data._expected())
+    source: Any = artefacts.SyntheticSource()
+    return VisionCache(folder, source, artefacts.expected_fingerprint())
 
 
 def test_a_flipped_bit_in_cached_tokens_is_found_when_the_episode_is_first_read(cache: Path) -> None:
@@ -173,7 +173,7 @@ def test_rows_of_another_form_are_refused_by_line(tmp_path: Path, row: str) -> N
 
 
 def test_a_picture_of_the_rows_that_changed_is_found(tmp_path: Path) -> None:
-    texts.write_rows(tmp_path)
+    artefacts.write_rows(tmp_path)
     flip(tmp_path / "a.mp4")
     with pytest.raises(UserError, match=r"a.mp4 is damaged"):
-        texts.read_rows(tmp_path)
+        artefacts.read_rows(tmp_path)

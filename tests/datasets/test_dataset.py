@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fakes import LastFrames, encode, same
-from h5_files import Recorded, write_file
 from torch.utils.data import DataLoader
 
+from helpers.h5_files import Recorded, write_file
+from helpers.memory_fakes import LastFrames, encode, same
 from mme_vla.config.composition import compose
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.cache_building import ensure_cache

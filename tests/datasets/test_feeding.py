@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_training import RECIPE, policy
 
+from helpers.trainings import RECIPE, policy
 from mme_vla.config.composition import compose
 from mme_vla.data.ahead import ahead
 from mme_vla.data.cache_building import PAGE, save_aligned

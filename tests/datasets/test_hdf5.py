@@ -5,8 +5,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from h5_files import write_file
 
+from helpers.h5_files import write_file
 from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
 from mme_vla.data.hdf5_episode import EpisodeRef
 from mme_vla.errors import UserError

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from h5_files import write_file
 
+from helpers.h5_files import write_file
 from mme_vla.cli.exec_starts import main
 from mme_vla.data.cache_building import ensure_cache
 from mme_vla.data.convert import ConvertOptions, convert

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
 from omegaconf import OmegaConf
-from rollout_scripted_env import ScriptedEnv, make_scripted_env
-from rollout_stand_ins import InlineEnvs, roll
-from serving_fakes import Served
 
+from helpers import REPOSITORY
+from helpers.rollout_fakes import InlineEnvs, roll
+from helpers.scripted_env import ScriptedEnv, make_scripted_env
+from helpers.serving_fakes import Served
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.cache import main as cache_main
 from mme_vla.cli.inspect import main as inspect_main

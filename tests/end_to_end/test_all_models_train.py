@@ -20,6 +20,8 @@ from mme_vla.testing.small import ALL_MODELS, BEYOND, NEURAL, RECURRENT
 from mme_vla.training import data as training_data
 from mme_vla.training.logging import read_metrics
 
+pytestmark = pytest.mark.slow
+
 STEPS, WINDOW = 30, 6
 SMALL = [
     "backbone.depth=1", "backbone.vision.depth=1", "backbone.vision.image_size=16", "backbone.vision.patch_size=2",

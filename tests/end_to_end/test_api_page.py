@@ -3,7 +3,8 @@
 import importlib.util
 
 import pytest
-from conftest import REPOSITORY
+
+from helpers import REPOSITORY
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 from safetensors.torch import load_file
 
 import mme_vla
+from helpers import REPOSITORY
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 FOLDER = Path("tests", "data", "compatibility")

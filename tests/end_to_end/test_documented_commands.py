@@ -15,9 +15,9 @@ from pathlib import Path
 from shutil import copytree
 
 import pytest
-from conftest import REPOSITORY
 from hydra._internal.utils import get_args_parser
 
+from helpers import REPOSITORY
 from mme_vla.cli.nano import with_settings
 from mme_vla.config.composition import check_overrides, compose
 from mme_vla.config.help import COMMANDS

@@ -9,9 +9,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-import forked
 import pytest
-from conftest import REPOSITORY
+
+from helpers import REPOSITORY, commands
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
@@ -28,7 +28,7 @@ def command(module: str, *words: str) -> list[str]:
 
 
 def call(module: str, *words: str) -> str:
-    done = forked.run(f"mme_vla.{module}", *words)
+    done = commands.run(f"mme_vla.{module}", *words)
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
 
@@ -53,6 +53,7 @@ def group_is_empty(group: int) -> bool:
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(tmp_path: Path) -> None:
     try:

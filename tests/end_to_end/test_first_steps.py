@@ -9,8 +9,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import Memory, cli
 from mme_vla.cli import train as train_command
 from mme_vla.config.composition import compose
@@ -127,6 +127,7 @@ def test_a_terminal_gets_a_line_before_the_imports(
     assert before[0].startswith(said) and bool(before[0]) == bool(said)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["--help"], ["train", "--help"], ["analyse", "--help"]])
 def test_help_ends_quietly_where_its_reader_is_gone(words: list[str]) -> None:
     reading, writing = os.pipe()

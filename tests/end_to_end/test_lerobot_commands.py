@@ -1,19 +1,18 @@
-"""LeRobot's own commands with plugins/lerobot_policy_mme_vla installed: train, continue, evaluate with the video; and with
-its own ACT on a dataset that this library wrote with LeRobot's names of columns.
-"""
+"""LeRobot's own commands with plugins/lerobot_policy_mme_vla installed, and its ACT on a dataset of this library."""
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from h5_files import write_file
-from lerobot_commands import EVAL, TRAIN, VIZ, LeRobot, lerobot
 
+from helpers.h5_files import write_file
+from helpers.lerobot_commands import EVAL, TRAIN, VIZ, run_lerobot
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 
 pytest.importorskip("mani_skill", reason="lerobot-eval runs the simulator: uv sync --inexact --extra sim")
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 SMALL_ACT = (
     "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.chunk_size=4",
@@ -23,20 +22,12 @@ SMALL_ACT = (
 )  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LeRobot]:
-    with lerobot(tmp_path_factory.mktemp("hf")) as running:
-        yield running
-
-
-def test_a_policy_is_trained_resumed_and_evaluated_with_the_conditioning_video(
-    commands: LeRobot, tmp_path: Path
-) -> None:
+def test_a_policy_is_trained_resumed_and_evaluated_with_the_conditioning_video(tmp_path: Path) -> None:
     write_file(tmp_path / "record_dataset_VideoUnmask.h5", [12, 9], videos=[4, 3], size=64)
     data, run, judged = tmp_path / "data", tmp_path / "run", tmp_path / "judged"
     convert(list_episodes(find_files([tmp_path])), data, ConvertOptions(images="png", names="lerobot"))
     trained = run / "checkpoints/last/pretrained_model"
-    said = commands.run(
+    said = run_lerobot(
         tmp_path,
         [
             [TRAIN, "--policy.type=mme_vla", "--policy.model=tokendrop_expert", "--policy.device=cpu",
@@ -67,7 +58,7 @@ POLICIES = {
 
 @pytest.mark.parametrize("policy", POLICIES)
 def test_a_resumed_run_equals_an_uninterrupted_one_but_for_one_random_number_that_lerobot_draws(
-    commands: LeRobot, tmp_path: Path, policy: str
+    tmp_path: Path, policy: str
 ) -> None:
     write_file(tmp_path / "record_dataset_PickXtimes.h5", [9, 7], size=64)
     data, run = tmp_path / "data", tmp_path / "run"
@@ -80,11 +71,11 @@ def test_a_resumed_run_equals_an_uninterrupted_one_but_for_one_random_number_tha
                           f"--output_dir={run}", "--steps=4", "--save_freq=2", "--batch_size=4", "--num_workers=0",
                           "--log_freq=1", "--env_eval_freq=0"],
         "resumed": [TRAIN, *resume],
-        "resumed with the random state": ["lerobot_resume", *resume],
+        "resumed with the random state": ["helpers.lerobot_resume", *resume],
     }  # fmt: skip
     losses, weights = {}, {}
     for name, words in runs.items():
-        said = commands.run(tmp_path / name, [words], plugins={"lerobot_policy_mme_vla": "lerobot_policy_mme_vla"})
+        said = run_lerobot(tmp_path / name, [words], plugins={"lerobot_policy_mme_vla": "lerobot_policy_mme_vla"})
         losses[name] = [part.split()[0] for part in said.split(" loss:")[1:]][-2:]
         weights[name] = last.read_bytes()
     same = "resumed with the random state"
@@ -101,14 +92,14 @@ def frames_of(film: Path) -> int:
 
 
 @pytest.mark.filterwarnings("ignore:load_recording:DeprecationWarning")
-def test_act_is_trained_and_evaluated_and_the_curves_are_drawn(commands: LeRobot, tmp_path: Path) -> None:
+def test_act_is_trained_and_evaluated_and_the_curves_are_drawn(tmp_path: Path) -> None:
     rerun = pytest.importorskip("rerun", reason="lerobot-dataset-viz needs the extra viz")
     write_file(tmp_path / "record_dataset_PickXtimes.h5", [9, 7], size=64)
     data, run = tmp_path / "data", tmp_path / "run"
     convert(list_episodes(find_files([tmp_path])), data, ConvertOptions(names="lerobot"))
     dataset = ("--dataset.repo_id=local/data", f"--dataset.root={data}", "--dataset.video_backend=pyav")
     trained = run / "checkpoints/last/pretrained_model"
-    said = commands.run(
+    said = run_lerobot(
         tmp_path,
         [
             [TRAIN, *dataset, *SMALL_ACT, f"--output_dir={run}", "--steps=3", "--batch_size=4", "--num_workers=0",

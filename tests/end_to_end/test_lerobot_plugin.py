@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from h5_files import write_file
-from plugin_packages import plugin
 
+from helpers.h5_files import write_file
+from helpers.plugins import plugin
 from mme_vla import Policy
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset

@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
+
+pytestmark = pytest.mark.slow
 
 pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
 NOTEBOOK = REPOSITORY / "examples" / "evaluate.ipynb"

@@ -3,7 +3,8 @@
 import re
 
 import pytest
-from conftest import REPOSITORY
+
+from helpers import REPOSITORY
 
 LEFT_OUT = "left out by the test"
 

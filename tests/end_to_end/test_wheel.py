@@ -58,12 +58,14 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return python
 
 
+@pytest.mark.slow
 def test_the_wheel_holds_every_file_of_the_package_and_the_configs(wheel: Path) -> None:
     packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert packed == source_files("mme_vla", "mme_vla") | source_files("configs", "mme_vla/configs")
     assert "mme_vla/py.typed" in packed
 
 
+@pytest.mark.slow
 def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> None:
     pytest.importorskip("hatchling", reason="building needs hatchling (the dev extra has it)")
     run([sys.executable, "-m", "hatchling", "build", "-t", "sdist", "-d", str(tmp_path)], cwd=REPOSITORY)
@@ -73,6 +75,7 @@ def test_the_source_archive_holds_what_the_wheel_is_made_of(tmp_path: Path) -> N
     assert {"pyproject.toml", "README.md", "LICENSE", "constraints.txt", "tests/end_to_end/test_wheel.py"} <= packed
 
 
+@pytest.mark.slow
 def test_a_policy_builds_and_trains_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
     (tmp_path / "use.py").write_text(USE)
     module, kind, *_, imported = run([str(installed), "use.py", *TRAIN], cwd=tmp_path).splitlines()

@@ -7,9 +7,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 import numpy as np
-from envs_cubes import COLOURS, least_distance, read_button, read_cube
-from envs_unmask import make, wait
 
+from helpers.env_cubes import COLOURS, least_distance, read_button, read_cube
+from helpers.env_unmask import make, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.placement import Region
 from mme_vla.envs.tasks.bin_fill import BinFill

@@ -9,9 +9,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed")
 
 import sapien
-from envs_testing import Scene, recorded
 from scipy.spatial.transform import Rotation
 
+from helpers.env_scenes import Scene, recorded
 from mme_vla.envs.recording.recorder import demonstrate
 from mme_vla.envs.robot.gripper_skills import failing_offset, grasp_orientation
 from mme_vla.envs.robot.stick_skills import Demonstrator, PlanningError, arc

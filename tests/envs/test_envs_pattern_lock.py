@@ -8,9 +8,8 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_stick import Ear, Tip, read_path, recorded_moves
-from envs_unmask import make, texts, wait
-
+from helpers.env_stick import Ear, Tip, read_path, recorded_moves
+from helpers.env_unmask import make, texts, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.tasks.pattern_lock import DIRECTIONS, PatternLock
 

@@ -8,8 +8,7 @@ import torch
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_testing import Scene
-
+from helpers.env_scenes import Scene
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import H, build_board, build_button, build_container, build_cube, build_disc
 from mme_vla.envs.scene.placement import (

@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed")
 
 import sapien
-from envs_testing import Scene, recorded
 from scipy.spatial.transform import Rotation
 
+from helpers.env_scenes import Scene, recorded
 from mme_vla.envs.robot.control import LIMITS
 from mme_vla.envs.robot.kinematics import Arm, pose_distance
 from mme_vla.envs.robot.path_search import Obstacles, sample_path

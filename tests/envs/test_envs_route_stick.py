@@ -9,9 +9,8 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_stick import Ear, Flags, Tip, circle, read_route, say
-from envs_unmask import make, texts, wait
-
+from helpers.env_stick import Ear, Flags, Tip, circle, read_route, say
+from helpers.env_unmask import make, texts, wait
 from mme_vla.envs.robot.stick_skills import arc
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.tasks.route_stick import RouteStick

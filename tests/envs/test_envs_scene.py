@@ -3,33 +3,22 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-import forked
 import gymnasium
 import numpy as np
 import pytest
 import sapien
 
+from helpers import commands
+
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_testing import Scene, recorded, replay, setup
-
+from helpers.env_scenes import Scene, one_of_everything, recorded, replay, setup
 from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
 from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.robot.robots import description
 from mme_vla.envs.scene.objects import (
-    build_aperture_box,
-    build_board,
-    build_button,
-    build_container,
-    build_cube,
     build_disc,
-    build_hidden_cube,
-    build_highlight,
-    build_moving_cube,
-    build_obstacle,
-    build_peg,
-    build_sphere,
 )
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.errors import UserError
@@ -37,22 +26,6 @@ from mme_vla.errors import UserError
 PICK = ("PickXtimes", 8)
 LOCK = ("PatternLock", 8)
 TO_OPENCV = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])  # from x forward, z up
-
-
-def one_of_everything(env: Scene) -> None:
-    env.add(build_cube(env, "cube", "red", (0.1, 0.1), 0.3))
-    env.add(build_hidden_cube(env, "hidden_cube", "green", (0.1, -0.1)))
-    env.add(build_moving_cube(env, "moving_cube", (0.2, 0.3, 0.4), (0.0, 0.0), 0.01))
-    env.add(build_container(env, "container", (0.1, -0.1), 0.5))
-    env.add(build_disc(env, "target", 0.04, 0.005, "purple", (0.0, -0.2)))
-    env.add(build_highlight(env, "highlight", 0.05, 0.001))
-    env.add(build_highlight(env, "rings", 0.04, 0.014, (1.0, 0.0, 0.0), rings=True))
-    env.add(build_sphere(env, "dot", 0.005))
-    env.add(build_button(env, (-0.2, 0.1)))
-    env.add(build_board(env, (0.2, 0.2), 0.2))
-    env.add(build_aperture_box(env, (-0.1, -0.3), 1.2))
-    env.add(build_obstacle(env, "obstacle", (0.1, 0.35), 0.3, (0.0, 0.0, 1.0)))
-    env.add(build_peg(env, "peg", 0.1, 0.01, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (-0.1, 0.25), 0.4))
 
 
 @pytest.fixture(scope="module")
@@ -125,11 +98,12 @@ def test_a_pressed_button_springs_back(everything):
     assert button.depth == 0 and button.base_z == pytest.approx(0.0075)
 
 
+@pytest.mark.slow
 def test_scenes_can_be_built_without_a_vulkan_driver(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(
         f"import sys; sys.path.insert(0, {str(Path(__file__).parents[1])!r})\n"
-        "from envs_testing import Scene; from test_envs_scene import one_of_everything\n"
+        "from helpers.env_scenes import Scene, one_of_everything\n"
         "for stick in (False, True):\n"
         "    env = Scene(one_of_everything, stick=stick); env.reset(); env.step(env.reset_action); env.close()\n"
         "import sapien.render\n"
@@ -137,7 +111,7 @@ def test_scenes_can_be_built_without_a_vulkan_driver(tmp_path):
         "except RuntimeError: print('built')"
     )
     hidden = {"VK_ICD_FILENAMES": "/nonexistent.json", "VK_DRIVER_FILES": "/nonexistent.json"}
-    result = forked.run(str(script), env=hidden)
+    result = commands.run(str(script), env=hidden)
     assert result.stdout.strip().endswith("built"), result.stderr
 
 

@@ -8,9 +8,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
 import sapien
-from envs_testing import Scene
 from PIL import Image
 
+from helpers.env_scenes import Scene
 from mme_vla.envs import rendering as shaders
 from mme_vla.envs.rendering import PACK, render_backend, without_table
 from mme_vla.envs.scene import stage

@@ -8,10 +8,10 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_cubes import Hand
-from envs_unmask import make, wait
 from sapien import physx
 
+from helpers.env_cubes import Hand
+from helpers.env_unmask import make, wait
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.envs import make_env, metadata
 from mme_vla.envs.grounding import project

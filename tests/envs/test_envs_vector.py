@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from envs_stand_ins import FRAME, make_light_env
 
+from helpers.env_fakes import FRAME, make_light_env
 from mme_vla.envs import VecEnv, make_vec_env
 from mme_vla.envs.vector.pool import Job, Reply
 from mme_vla.envs.vector.processes import begin, settings, simulating_processes

@@ -7,9 +7,8 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_cubes import COLOURS, Hand, least_distance, read_button, read_cube, read_disc, steps_of_demonstration
-from envs_unmask import make, texts, wait
-
+from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube, read_disc, steps_of_demonstration
+from helpers.env_unmask import make, texts, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.placement import Region
 from mme_vla.envs.scene.things import distance_xy

@@ -9,9 +9,8 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_testing import replay, setup
-from envs_unmask import lift, make, names, same_twice, skip_place, texts, turn, under, wait
-
+from helpers.env_scenes import replay, setup
+from helpers.env_unmask import lift, make, names, skip_place, texts, turn, under, wait
 from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS
 from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Region
@@ -135,7 +134,3 @@ def test_the_recorded_actions_have_the_recorded_effect(shared: Path, folder, epi
     env.recording = True
     assert replay(env, folder, episode).max() < 1e-4
     env.close()
-
-
-def test_the_same_seed_gives_bit_equal_states():
-    assert same_twice(VideoUnmask, 6300, "hard", 70)

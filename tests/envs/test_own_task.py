@@ -4,8 +4,8 @@ from pathlib import Path
 
 import h5py
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import UserError, evaluate, make_env
 from mme_vla.cli import record
 from mme_vla.config.composition import compose

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from h5_files import pose_at, write_file
 from omegaconf import OmegaConf
-from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
-from serving_fakes import Served, challenge
 
+from helpers.h5_files import pose_at, write_file
+from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
+from helpers.serving_fakes import Served, challenge
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose

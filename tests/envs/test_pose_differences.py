@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from h5_files import pose_at, tool_at, write_file
 from omegaconf import OmegaConf
-from prior_vla_runs import run
-from rollout_scripted_env import ScriptedEnv
-from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
-from serving_fakes import Served, challenge
 
+from helpers.h5_files import pose_at, tool_at, write_file
+from helpers.prior_vla_runs import run
+from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, roll
+from helpers.scripted_env import ScriptedEnv
+from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError
 from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert

@@ -7,8 +7,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from h5_files import write_file
-
+from helpers.h5_files import write_file
 from mme_vla.cli import record
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes

@@ -8,8 +8,8 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from plugin_packages import plugin
 
+from helpers.plugins import plugin
 from mme_vla.envs import make_env, metadata
 from mme_vla.errors import UserError
 

@@ -54,6 +54,7 @@ def test_each_episode_is_taken_once(tmp_path: Path) -> None:
         assert first.take(JOBS) is None and second.take(JOBS) is None
 
 
+@pytest.mark.slow
 def test_what_a_killed_process_had_not_finished_is_taken_again(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", TAKE_TWO, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -5,13 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rollout_scripted_env import VIDEO, ScriptedEnv, make_scripted_env
-from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
+from helpers.scripted_env import VIDEO, make_scripted_env
+from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
-from mme_vla.envs.render_request import RenderRequest
-from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
@@ -19,8 +17,6 @@ from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
 from mme_vla.subgoal.oracle import Oracle
 
-STEPS = 70
-JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
 FRAMES = [VIDEO[JOBS[0].task] + 1 + STEPS, 1 + STEPS]
 MEMORIES: dict[str, dict[str, Any]] = {
     "pi05": {},
@@ -30,49 +26,6 @@ MEMORIES: dict[str, dict[str, Any]] = {
     "rmt_modul": {},
     "framesamp_ttt_modul": {},
 }
-
-
-class WatchedEnv(ScriptedEnv):
-    """Draws only what it is asked for, as the simulated environments do; counts its images by camera."""
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.render_request: RenderRequest | None = None
-        self.drawn = {"front": 0, "wrist": 0}
-
-    def _lists(self, frames: list[dict[str, Any]]) -> dict[str, Any]:
-        first = len(self.frames) - len(frames)
-        for number, frame in enumerate(frames, first):
-            newest = number == len(self.frames) - 1
-            shown = ("front", "wrist") if self.render_request is None else self.render_request.cameras(number, newest)
-            for camera in self.drawn:
-                self.drawn[camera] += camera in shown
-                frame[f"{camera}_rgb"] = frame[f"{camera}_rgb"] if camera in shown else None
-        return super()._lists(frames)
-
-
-def make_watched_env(task: str, split: str, episode: int, max_steps: int) -> WatchedEnv:
-    return WatchedEnv(task, episode, max_steps, 1e9, 0.0, "")
-
-
-def outcomes(records: list[EpisodeRecord]) -> list[tuple[Any, ...]]:
-    assert all(record.error is None for record in records)
-    return [(r.key, r.outcome, r.steps, r.extra["actions_sha256"], r.extra.get("subgoals")) for r in records]
-
-
-def both_ways(policy: Any, subgoals: Any = None, base: Any = make_watched_env) -> list[dict[str, int]]:
-    """Roll with everything drawn and with what is needed; check that they agree; what was drawn, each way."""
-    counts = []
-    found = []
-    for draw in ("all", "needed"):
-        envs = InlineEnvs(base=base, max_steps=STEPS - 1)
-        records = roll(policy, JOBS, envs, subgoals, draw=draw, max_steps=STEPS - 1, max_batch=1)
-        assert [record.steps for record in records] == [STEPS, STEPS], "an episode should take several chunks"
-        found.append(outcomes(records))
-        if base is make_watched_env:
-            counts += [env.drawn for env in envs.made.values()]
-    assert found[0] == found[1]
-    return counts
 
 
 @pytest.mark.parametrize("name", MEMORIES)

@@ -8,11 +8,10 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from envs_cubes import Hand
-from envs_unmask import lift, make, push_down, wait
-from rollout_scripted_env import ScriptedEnv
-from rollout_stand_ins import InlineEnvs, quick_policy, roll
-
+from helpers.env_cubes import Hand
+from helpers.env_unmask import lift, make, push_down, wait
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
+from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks
 from mme_vla.envs.metadata import TASK_NAMES

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from rollout_scripted_env import VIDEO, make_far_env
-from rollout_stand_ins import JOBS, InlineEnvs, quick_policy, roll
 
+from helpers.rollout_fakes import JOBS, InlineEnvs, quick_policy, roll
+from helpers.scripted_env import VIDEO, make_far_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.rollout.episode import RunningEpisode, episode_seed
 from mme_vla.policy.mme import MMEPolicy

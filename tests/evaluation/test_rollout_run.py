@@ -5,13 +5,13 @@ import signal
 import time
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 import torch
-from rollout_scripted_env import make_far_env, make_mortal_env
-from rollout_stand_ins import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
 
+from helpers import commands
+from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
+from helpers.scripted_env import make_far_env, make_mortal_env
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_device
 from mme_vla.envs.vector.pool import Job
@@ -55,6 +55,7 @@ def outcomes(folder: Path) -> dict:
     return {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records if r.outcome != "error"}
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp_path: Path) -> None:
     policy = MMEPolicy.from_pretrained(str(checkpoint))
     whole = whole_run(policy, tmp_path / "whole")
@@ -62,15 +63,15 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp
     assert len({record.outcome for record in whole.records}) > 1, "the episodes should differ"
 
     folder, records = tmp_path / "killed", tmp_path / "killed" / "episodes.jsonl"
-    run = forked.Command(str(TESTS / "rollout_stand_ins.py"), str(folder), str(checkpoint), "0.05")
+    run = commands.start("helpers.rollout_fakes", str(folder), str(checkpoint), "0.05")
     try:
         until = time.monotonic() + 120
         while not records.exists() or records.read_bytes().count(b"\n") < 2:
-            assert run.process.is_alive() and time.monotonic() < until, run.errors
+            assert run.poll() is None and time.monotonic() < until
             time.sleep(0.02)
     finally:
-        run.process.kill()
-        assert run.finish().returncode == -signal.SIGKILL
+        run.kill()
+        assert commands.finish(run).returncode == -signal.SIGKILL
     with records.open("ab") as file:
         file.write(b'{"model":"tiny","che')  # as if it had been writing
     with pytest.warns(UserWarning, match="half-written"):
@@ -274,12 +275,13 @@ def test_progress_counts_errors_apart_and_retries_not_at_all(capsys: pytest.Capt
     assert "tried again" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     importlib.util.find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed"
 )
 def test_the_command_evaluates_a_checkpoint_in_the_simulator(checkpoint: Path, tmp_path: Path) -> None:
     words = [f"checkpoint={checkpoint}", "tasks=[StopCube]", "episodes=1", "max_steps=16", "render=false", "seed=7"]
-    done = forked.run("mme_vla.evaluate", *words, f"output={tmp_path}")
+    done = commands.run("mme_vla.evaluate", *words, f"output={tmp_path}")
     assert done.returncode == 0, done.stderr
     (record,) = read_records(tmp_path / "episodes.jsonl")
     assert (record.model, record.checkpoint, record.model_seed) == ("framesamp_modul", 3, 7)

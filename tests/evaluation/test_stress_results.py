@@ -4,18 +4,11 @@ from pathlib import Path
 
 import pytest
 
+from helpers.rollout_fakes import records
 from mme_vla.cli.results import main
 from mme_vla.errors import UserError
-from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.curves import stress_curves, stress_figures
 from mme_vla.evaluation.store import RecordLog
-
-
-def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:
-    return [
-        EpisodeRecord(model, 1, seed, "PickXtimes", e, e, "easy", "success" if w else "fail", 9, split=split)
-        for e, w in enumerate(won)
-    ]
 
 
 def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:

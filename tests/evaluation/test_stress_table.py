@@ -4,8 +4,7 @@ import csv
 import re
 from collections import defaultdict
 
-from conftest import REPOSITORY
-
+from helpers import REPOSITORY
 from mme_vla.envs.metadata import DIALS, SESSIONS
 
 ACTORS = ("demonstrator", "oracle")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import MMEPolicy, build_policy
 from mme_vla.testing import check_integration
 from mme_vla.testing.small import open_gates, random_batch, unit_stats

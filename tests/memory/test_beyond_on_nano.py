@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from test_nano import demonstration
 
+from helpers.nano_policies import demonstration
 from mme_vla import UserError, build_policy
 from mme_vla.nano.learning import Decisions, statistics
 from mme_vla.policy.mme import MMEPolicy

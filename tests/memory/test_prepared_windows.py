@@ -1,12 +1,14 @@
 """A full window moves at every decision: what its next one needs is prepared while nobody waits, to the same bit."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
-from rollout_stand_ins import InlineEnvs, quick_policy, roll
-from serving_fakes import Served, acted_directly, course, observation, wait_until
-from test_recurrent import RandomHistory, make, same_memory, window  # noqa: F401  (a fixture)
 
+from helpers.recurrent_memories import MEMORIES, RandomHistory, same_memory, small_memory, window
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
+from helpers.serving_fakes import Served, acted_directly, course, observation, wait_until
 from mme_vla.envs.vector.pool import Job
 from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.joined import JoinedMemory
@@ -15,6 +17,11 @@ from mme_vla.testing.small import moving_frames
 
 STEPS = 6
 """A window of six frames is full after 96."""
+
+
+@pytest.fixture(params=MEMORIES)
+def make(request):
+    return partial(small_memory, request.param)
 
 
 def prepared(memory, history, stream) -> int:
@@ -28,7 +35,7 @@ def prepared(memory, history, stream) -> int:
 
 @torch.no_grad()
 @pytest.mark.parametrize("exec_start", [0, 30])
-def test_a_decision_costs_one_frame_however_long_the_episode(make, exec_start):  # noqa: F811
+def test_a_decision_costs_one_frame_however_long_the_episode(make, exec_start):
     memory = make(max_steps=STEPS)
     history, unprepared = RandomHistory(exec_start + 1, exec_start), memory.start_stream()
     stream = memory.start_stream()
@@ -45,7 +52,7 @@ def test_a_decision_costs_one_frame_however_long_the_episode(make, exec_start): 
 
 @torch.no_grad()
 @pytest.mark.parametrize("pace", [4, 8, 12, 32])
-def test_another_pace_continues_what_it_has(make, pace):  # noqa: F811
+def test_another_pace_continues_what_it_has(make, pace):
     memory = make(max_steps=64)
     history, stream = RandomHistory(1), memory.start_stream()
     for decision in range(24):
@@ -58,7 +65,7 @@ def test_another_pace_continues_what_it_has(make, pace):  # noqa: F811
 
 @torch.no_grad()
 @pytest.mark.parametrize("pace", [8, 12])
-def test_a_full_window_is_prepared_at_the_pace_of_the_decisions(make, pace):  # noqa: F811
+def test_a_full_window_is_prepared_at_the_pace_of_the_decisions(make, pace):
     memory = make(max_steps=STEPS)
     history, stream = RandomHistory(1), memory.start_stream()
     for decision in range(24):
@@ -71,7 +78,7 @@ def test_a_full_window_is_prepared_at_the_pace_of_the_decisions(make, pace):  # 
 
 
 @torch.no_grad()
-def test_what_was_prepared_in_vain_does_no_harm(make):  # noqa: F811
+def test_what_was_prepared_in_vain_does_no_harm(make):
     memory = make(max_steps=STEPS, chunk=2)
     history, stream = RandomHistory(129), memory.start_stream()
     assert not memory.prepare(history, stream), "nothing is known before the first decision"
@@ -86,7 +93,7 @@ def test_what_was_prepared_in_vain_does_no_harm(make):  # noqa: F811
 
 
 @torch.no_grad()
-def test_a_growing_window_needs_nothing_prepared(make):  # noqa: F811
+def test_a_growing_window_needs_nothing_prepared(make):
     memory = make()
     history, stream = RandomHistory(33), memory.start_stream()
     memory.encode([history], [stream])

@@ -1,59 +1,32 @@
 """What recurrent memories promise beyond every memory: the window and the stream are one, and cost what they should."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
+from helpers.recurrent_memories import (
+    D_VISION,
+    GRID,
+    MEMORIES,
+    TOLERANCE,
+    RandomHistory,
+    same_memory,
+    small_memory,
+    window,
+)
 from mme_vla import UserError, build_policy
 from mme_vla.memory.base import jittered, recurrent_frames, stack_history
-from mme_vla.memory.history import History, StorageSpec
-from mme_vla.memory.recurrent import RecurrentMemory
-from mme_vla.memory.rmt import RMT
 from mme_vla.memory.ttt import TTT
 from mme_vla.testing.small import moving_frames, random_batch, small_policy
 from mme_vla.types import HistoryTokens
 from mme_vla.weights.released import from_released, to_released
 
-GRID = 2
-D_VISION = 24
-TOLERANCE = 1e-5
-MEMORIES = {
-    "ttt": lambda **o: TTT(D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, **o}),
-    "rmt": lambda **o: RMT(
-        D_VISION, 16, **{"budget": 12, "hidden": 16, "grid": GRID, "chunk": 4, "attention_dtype": "float32", **o}
-    ),
-}
-
 
 @pytest.fixture(params=MEMORIES)
 def make(request):
-    """Return the constructor of a small memory; every call draws the same weights, far from their tame start."""
-
-    def build(**options) -> RecurrentMemory:
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            memory = MEMORIES[request.param](**options).eval()
-            for parameter in memory.parameters():
-                torch.nn.init.normal_(parameter, std=0.5)
-        return memory
-
-    return build
-
-
-class RandomHistory(History):
-    """An endless episode of random tokens; counts the tokens that are asked for."""
-
-    def __init__(self, length: int, exec_start: int = 0) -> None:
-        super().__init__(StorageSpec(GRID), exec_start)
-        self.length, self.gathered = length, 0
-
-    def __len__(self) -> int:
-        return self.length
-
-    def gather(self, indices: np.ndarray) -> torch.Tensor:
-        self.gathered += len(indices)
-        rows = [np.random.default_rng([int(f), int(p)]).normal(size=D_VISION) for f, p in indices]
-        return torch.from_numpy(np.stack(rows)).float()
+    return partial(small_memory, request.param)
 
 
 class Counting:
@@ -65,14 +38,6 @@ class Counting:
     def __call__(self, *args):
         self.calls += 1
         return self.function(*args)
-
-
-def window(memory: RecurrentMemory, length: int, exec_start: int = 0) -> HistoryTokens:
-    return stack_history([memory.recall(RandomHistory(length, exec_start), length - 1)])
-
-
-def same_memory(a, b) -> bool:
-    return torch.equal(a.mask, b.mask) and torch.allclose(a.tokens[a.mask], b.tokens[b.mask], atol=TOLERANCE)
 
 
 @torch.no_grad()

@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from probe_stand_ins import made_up
-from rollout_scripted_env import ScriptedEnv, make_far_env
-from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
-from test_probe_online import actions
-from test_stress_results import records
 
+from helpers.probe_fakes import actions, made_up
+from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, records, roll
+from helpers.scripted_env import ScriptedEnv, make_far_env
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lerobot_window import ONLY, RECORDED, SETTINGS, VISION, as_batch, inputs, weights, window_policy
 from safetensors.torch import save_file
-from test_pictures_on_demand import both_ways
 
+from helpers.lerobot_window import ONLY, RECORDED, SETTINGS, VISION, as_batch, inputs, weights, window_policy
+from helpers.union_frames import both_ways
 from mme_vla import UserError
 from mme_vla.data.dataset import TrainingDataset, collate
 from mme_vla.data.sources import open_sources

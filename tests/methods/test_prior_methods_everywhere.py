@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from h5_files import write_file
-from prior_vla_runs import TOWERS, losses, run
 from rich.console import Console
-from rollout_scripted_env import ScriptedEnv, make_scripted_env
-from rollout_stand_ins import InlineEnvs, roll
-from serving_fakes import Served, challenge
 
+from helpers.h5_files import write_file
+from helpers.prior_vla_runs import TOWERS, losses, run
+from helpers.rollout_fakes import InlineEnvs, roll
+from helpers.scripted_env import ScriptedEnv, make_scripted_env
+from helpers.serving_fakes import Served, challenge
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert

@@ -3,9 +3,11 @@
 from functools import partial
 
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla.testing.small import BEYOND
+
+pytestmark = pytest.mark.slow
 
 GUESSING = 0.75
 TOWER = {"depth": 1, "image_size": 16, "patch_size": 4, "width": 16, "mlp_dim": 16, "num_heads": 1}

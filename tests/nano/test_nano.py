@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
 from safetensors.torch import load
 
+from helpers import REPOSITORY
+from helpers.nano_policies import demonstration, nano
 from mme_vla import UserError, build_policy
 from mme_vla.backbone.nano_vision import CLASSES, WEIGHTS
 from mme_vla.cli import nano as nano_command
 from mme_vla.cli.nano import check_counts, with_settings
-from mme_vla.data.waypoints import Motions
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import wilson
 from mme_vla.evaluation.store import find_records, read_folders
@@ -31,24 +31,6 @@ SMALL = {
     "vlm": {"width": 16, "mlp_dim": 16}, "action": {"width": 16, "mlp_dim": 16}, "num_heads": 2, "head_dim": 8,
     "vocab_size": 64,
 }  # fmt: skip
-EVERY_EIGHTH = {"budget": 256, "grid": 8, "every": 8}
-
-
-def nano(model: str = "framesamp_modul") -> MMEPolicy:
-    memory = {"memory": EVERY_EIGHTH} if model.startswith("framesamp") else {}
-    words = {"backbone": "nano", "embodiment": "robomme_waypoint_front", "policy": {"augment": False}}
-    return build_policy(model, **words, **memory)
-
-
-def demonstration(frames: tuple[int, ...] = (0, 15, 39, 47, 63, 66, 79, 95, 119, 120, 151, 155)) -> Demonstration:
-    rng = np.random.default_rng(0)
-    pictures = {frame: rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
-    targets = rng.uniform(-0.2, 0.2, (3, 7)).astype(np.float32)
-    motions = Motions(np.array([66, 120, 155]), targets)
-    states = rng.uniform(-1, 1, (180, 8)).astype(np.float32)
-    said = {"simple": ["pick it up"] * 3, "grounded": ["pick it up at <1, 2>"] * 3}
-    goal = "watch the video carefully, then pick up the container hiding the green cube"
-    return Demonstration("VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": pictures}, said)
 
 
 def test_it_keeps_a_backbones_promises() -> None:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from test_nano import demonstration, nano
 
+from helpers.nano_policies import demonstration, nano
 from mme_vla.embodiment.robomme import benchmark_state
 from mme_vla.envs import metadata
 from mme_vla.envs.make import make_env

@@ -1,8 +1,8 @@
 """Demonstrations of choices, for robots that choose among options; and the scenes of the counting row."""
 
 import pytest
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import build_policy
 from mme_vla.config.composition import compose
 from mme_vla.envs.episodes import choose_episodes

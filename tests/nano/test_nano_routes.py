@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla import UserError, build_policy
 from mme_vla.config.composition import compose
 from mme_vla.data.waypoints import Motions

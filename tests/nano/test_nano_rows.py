@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_nano import demonstration
 
+from helpers.nano_policies import demonstration
 from mme_vla import UserError, build_policy
 from mme_vla.cli.nano import demonstrate
 from mme_vla.envs.recording.frames import DECISIONS, FrameChoice

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from golden import error, load, params, vision_config
 
+from helpers.golden import error, load, params, vision_config
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.memory.encoder import position_features

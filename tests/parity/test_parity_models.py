@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-import golden
 import pytest
 import torch
 
+from helpers import golden
 from mme_vla.memory.rmt import RMT
 
 MODELS = ["pi05_baseline", "symbolic-grounded-subgoal"] + [

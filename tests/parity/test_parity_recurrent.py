@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 import torch
-from golden import error, load, params
 
+from helpers.golden import error, load, params
 from mme_vla.memory.base import recurrent_frames
 from mme_vla.memory.rmt import RMTLayer
 from mme_vla.memory.ttt import TTTLayer

@@ -5,8 +5,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from golden import error, load, params, vision_config
 
+from helpers.golden import error, load, params, vision_config
 from mme_vla.backbone import flow
 from mme_vla.backbone.attention import additive_mask, attend
 from mme_vla.backbone.blocks import Span, attention_mask, token_positions

@@ -15,9 +15,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from browser import Browser
-from play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
 
+from helpers.browser import Browser
+from helpers.play_fakes import BLOCKS, MOTION, VIDEO, a_session, an_episode
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
 from mme_vla.play import web
@@ -158,9 +158,12 @@ def test_an_address_that_cannot_be_had_is_refused():
         listen("127.0.0.1", 99999)
 
 
+@pytest.mark.slow
 def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
     script = (
-        "import logging; from test_play_page import *; from mme_vla.play.web import serve\n"
+        "import logging; from pathlib import Path; from helpers.play_fakes import a_session, an_episode\n"
+        "from mme_vla.play.desk import Desk; from mme_vla.play.run import Identity, PlayRun\n"
+        "from mme_vla.play.web import serve\n"
         "logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
         "session = a_session()\n"
         "who = Identity('human', 'anna', 0, 1300, {})\n"
@@ -204,6 +207,7 @@ def test_an_episode_that_cannot_be_set_up_is_said_and_can_be_tried_again(tmp_pat
 # In a browser -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
     with served(tmp_path / "run") as page, Browser(tmp_path / "profile") as browser:
         browser.open(f"http://127.0.0.1:{page.port}/")
@@ -251,6 +255,7 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
     assert (first.outcome, second.outcome, second.error) == ("success", "error", "no path")
 
 
+@pytest.mark.slow
 def test_the_keys_work_with_the_focus_on_the_slider_or_the_speed(tmp_path):
     with served(tmp_path / "run") as page, Browser(tmp_path / "profile") as browser:
         pressed = "document.querySelector('.option[data-label=\"{}\"]').getAttribute('aria-pressed') === 'true'"
@@ -302,6 +307,7 @@ def test_the_state_survives_a_session_that_goes_while_it_is_read(tmp_path):
             desk.close()
 
 
+@pytest.mark.slow
 def test_the_page_says_when_the_server_is_gone(tmp_path):
     with Browser(tmp_path / "profile") as browser:
         with served(tmp_path / "run") as page:

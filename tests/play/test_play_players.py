@@ -3,11 +3,11 @@
 import json
 from types import SimpleNamespace
 
-import forked
 import numpy as np
 import pytest
-from play_fakes import BLOCKS, MOTION, VIDEO, a_session
 
+from helpers import commands
+from helpers.play_fakes import BLOCKS, MOTION, VIDEO, a_session
 from mme_vla.errors import UserError
 from mme_vla.evaluation.store import read_records
 from mme_vla.play import GeminiPlayer, OraclePlayer, QwenPlayer, build_player
@@ -205,10 +205,11 @@ def test_the_oracle_needs_this_librarys_tasks():
         OraclePlayer().choose(session)
 
 
+@pytest.mark.slow
 def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
     words = ["task=[VideoUnmask,VideoUnmaskSwap]", "episodes=[0]", "player=oracle", f"output={tmp_path / 'run'}"]
-    done = forked.run("mme_vla.play", *words)
+    done = commands.run("mme_vla.play", *words)
     assert done.returncode == 0, done.stderr
     first, second = read_records(tmp_path / "run" / "episodes.jsonl")
     assert (first.outcome, second.outcome) == ("success", "success")
@@ -218,6 +219,7 @@ def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     assert "Human (paper)" in done.stdout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -229,7 +231,7 @@ def test_the_oracle_solves_episodes_without_rendering(tmp_path):
     ],
 )
 def test_what_cannot_work_is_said_before_anything_begins(words, message, tmp_path):
-    done = forked.run("mme_vla.play", *words, f"output={tmp_path / 'run'}")
+    done = commands.run("mme_vla.play", *words, f"output={tmp_path / 'run'}")
     assert done.returncode == 2
     assert message in done.stderr
     assert "Traceback" not in done.stderr

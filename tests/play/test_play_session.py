@@ -6,8 +6,8 @@ from itertools import count
 
 import numpy as np
 import pytest
-from play_fakes import BLOCKS, MOTION, VIDEO, BlocksEnv, a_session, an_episode
 
+from helpers.play_fakes import BLOCKS, MOTION, VIDEO, BlocksEnv, a_session, an_episode
 from mme_vla.cli.play import _by_itself, line, print_summary
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.errors import UserError

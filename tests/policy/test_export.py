@@ -4,8 +4,8 @@ import re
 
 import pytest
 import torch
-from conftest import REPOSITORY
 
+from helpers import REPOSITORY
 from mme_vla.testing.small import random_batch
 
 

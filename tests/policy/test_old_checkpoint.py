@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import REPOSITORY
-from data.before_the_rooms.make import actions
 from omegaconf import OmegaConf
 from rich.console import Console
 
+from data.before_the_rooms.make import actions
+from helpers import REPOSITORY
 from mme_vla import MMEPolicy
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.cli.train import main

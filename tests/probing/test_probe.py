@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from probe_stand_ins import made_up, probed, reader
-from rollout_stand_ins import quick_policy
 
+from helpers.probe_fakes import made_up, probed, reader
+from helpers.rollout_fakes import quick_policy
 from mme_vla.errors import UserError
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.probing.channels import channel_of

@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from probe_stand_ins import made_up
-from rollout_stand_ins import quick_policy
 
+from helpers.probe_fakes import made_up
+from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory

@@ -4,30 +4,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from probe_stand_ins import made_up
-from rollout_scripted_env import make_far_env
-from rollout_stand_ins import FACTS, InlineEnvs, quick_policy, roll
 
-from mme_vla.envs.vector.pool import Job
+from helpers.probe_fakes import JOBS, actions, made_up
+from helpers.rollout_fakes import FACTS, quick_policy
+from helpers.scripted_env import make_far_env
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing.arms import read_arm
 from mme_vla.probing.lines import LINES
 from mme_vla.probing.offline import OfflineSettings
 from mme_vla.probing.online import named
-from mme_vla.probing.probed import ProbedPolicy
 from mme_vla.probing.report import Findings, table_of
 from mme_vla.probing.run import Probe, ProbePlan, probed_folder, run_probe
-
-JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
-
-
-def actions(policy: MMEPolicy, word: str, **settings: object) -> list[np.ndarray]:
-    probe = ProbedPolicy(policy, read_arm(word), made_up(), None).eval()
-    envs = InlineEnvs(base=make_far_env)
-    roll(probe, JOBS, envs, **settings)
-    return [np.stack(envs.made[job].actions) for job in JOBS]
 
 
 @pytest.mark.parametrize("name", ["framesamp_modul", "tokendrop_expert", "ttt_context"])

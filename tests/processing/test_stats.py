@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from h5_files import Recorded, write_file
 
+from helpers.h5_files import Recorded, write_file
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes

@@ -5,9 +5,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import forked
 import numpy as np
 import pytest
+
+from helpers import commands
 
 vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness")
 from vla_eval.api import serve_background  # noqa: E402
@@ -162,8 +163,9 @@ def test_a_robot_that_moves_by_waypoints_is_refused() -> None:
         MMEVLAModelServer(small_policy("pi05", embodiment="robomme_waypoint"))
 
 
+@pytest.mark.slow
 def test_the_command_shows_the_harnesss_words() -> None:
-    done = forked.run("mme_vla", "harness", "--help")
+    done = commands.run("mme_vla", "harness", "--help")
     assert done.returncode == 0, done.stderr
     assert "--args.checkpoint" in done.stdout and "--args.flow_steps" in done.stdout
 

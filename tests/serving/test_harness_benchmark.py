@@ -5,7 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plugin_packages import plugin
+
+from helpers.plugins import plugin
 
 vla_eval = pytest.importorskip("vla_eval", reason="the harness is not installed: uv sync --inexact --extra harness")
 pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")

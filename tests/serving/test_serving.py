@@ -9,7 +9,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from serving_fakes import (
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from helpers.serving_fakes import (
     Served,
     acted_directly,
     challenge,
@@ -19,9 +22,6 @@ from serving_fakes import (
     states,
     wait_until,
 )
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-
 from mme_vla.errors import UserError
 from mme_vla.serving import Client, Limits, PolicyServer, ServeSettings, pack, unpack
 

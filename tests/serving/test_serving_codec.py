@@ -5,8 +5,8 @@ import tracemalloc
 import msgpack
 import numpy as np
 import pytest
-from serving_fakes import GOAL, challenge, observation, states
 
+from helpers.serving_fakes import GOAL, challenge, observation, states
 from mme_vla.errors import UserError
 from mme_vla.serving import pack, unpack
 from mme_vla.serving.codec import check_size

@@ -8,11 +8,11 @@ import re
 import socket
 from types import SimpleNamespace
 
-import forked
 import numpy as np
 import pytest
-from serving_fakes import Served, acted_directly, challenge, course, serving_policy, wait_until
 
+from helpers import commands
+from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, serving_policy, wait_until
 from mme_vla.cli.loading import load_policy
 from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
@@ -33,15 +33,6 @@ def policy():
 def served(policy):
     with Served(policy) as server:
         yield server
-
-
-def ask(served: Served, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, str, bytes]:
-    connection = http.client.HTTPConnection(*served.address, timeout=60)
-    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-    answer = connection.getresponse()
-    found = answer.status, answer.headers["Content-Type"], answer.read()
-    connection.close()
-    return found
 
 
 def by_http(served: Served, parts: list, **headers: str) -> list[np.ndarray]:
@@ -167,31 +158,34 @@ def test_garbage_on_the_wire_is_answered_and_harms_nobody(served, sent):
     assert ask(served, "GET", "/healthz")[0] == 200
 
 
+@pytest.mark.slow
 def test_the_command_serves_and_stops_when_told(tmp_path):
     words = ("mme_vla.serve", "model=framesamp_modul", "backbone=tiny", "port=0")
-    server = forked.Command(*words, env={"OMP_NUM_THREADS": "1", "MME_VLA_API_KEY": "secret"})
+    server = commands.start(*words, env={"OMP_NUM_THREADS": "1", "MME_VLA_API_KEY": "secret"})
     try:
-        wait_until(lambda: "ready at ws://127.0.0.1:" in server.errors or not server.process.is_alive(), 120)
-        lines = server.errors
+        lines = ""
+        while "ready at ws://127.0.0.1:" not in lines and (line := server.stderr.readline()):
+            lines += line
         assert "UNTRAINED" in lines
         assert "secret" not in lines
         port = int(lines.split("ready at ws://127.0.0.1:")[1].split()[0])
         with Client(f"ws://127.0.0.1:{port}", api_key="secret") as client:
             assert client.metadata["model"] == "framesamp_modul"
             assert client.infer(challenge(*course()[0], first=True))["actions"].shape == (16, 8)
-            server.process.terminate()
-            done = server.finish(30)
+            server.terminate()
+            done = commands.finish(server, 30)
         assert done.returncode == 0
-        assert "stopped · 0 clients · 1 inferences" in done.stderr.removeprefix(lines)
+        assert "stopped · 0 clients · 1 inferences" in done.stderr
     finally:
-        server.process.kill()
+        server.kill()
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_needs():
     for words, said in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
         with pytest.raises(UserError, match=said):
             load_policy(compose("serve", words), "serve", LOGGER)
-    done = forked.run("mme_vla.serve", "checkpoint=x", "model=pi05")
+    done = commands.run("mme_vla.serve", "checkpoint=x", "model=pi05")
     assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
 
 

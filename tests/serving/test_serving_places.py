@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from serving_fakes import Served, acted_directly, challenge, course, observation, serving_policy, states
-from test_serving_http import ask
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, observation, serving_policy, states
 from mme_vla.errors import UserError
 from mme_vla.serving import Limits, ServeSettings, connections, pack, unpack
 

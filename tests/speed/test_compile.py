@@ -15,6 +15,8 @@ from mme_vla.testing.small import random_batch, small_policy
 from mme_vla.training.validation import Validation
 from mme_vla.types import Batch
 
+pytestmark = pytest.mark.slow
+
 MOST_GRAPHS = 6
 SHORT_TOWER = {"backbone.vision.depth": 1}
 """The tower is one graph of all its layers, and takes as long to trace as they are many."""

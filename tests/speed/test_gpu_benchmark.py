@@ -2,15 +2,14 @@
 
 import importlib.util
 import json
-import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import REPOSITORY
-from forked import Command
+
+from helpers import REPOSITORY
 
 SMALL = ["--backbone", "tiny", "--device", "cpu", "--rounds", "1", "--batch", "2", "--eager"]
 
@@ -44,13 +43,6 @@ def test_it_runs_on_a_cpu_and_says_what_it_could_not_measure(
     assert "MFU not measured" in printed and "NaN sweep: none" in printed
 
 
-def test_recurrent_memories_compute_more_than_their_model_needs(gpu: Any) -> None:
-    sample_flops = sys.modules["gpu_setup"].sample_flops
-    needed, computed = sample_flops("rmt_context", "tiny")
-    assert 0 < needed < computed
-    assert len(set(sample_flops("pi05", "tiny"))) == 1
-
-
 def test_what_misses_a_goal_is_told(gpu: Any) -> None:
     ways = {"eager": {"p50_ms": 90.0}, "graph": {"p50_ms": 14.0}}
     row = {"training": {"finite": True, "mfu": 0.51}, "chunk": ways}
@@ -59,28 +51,3 @@ def test_what_misses_a_goal_is_told(gpu: Any) -> None:
     bad = {"training": {"finite": False, "mfu": 0.4}, "chunk": {"eager": {"p50_ms": 16.0}}}
     told = " ".join(gpu.judge({**good, "nan": ["sdpa at 576 keys"], "models": {"pi05": bad}}))
     assert all(word in told for word in ("576", "no number", "MFU 40%", "16.0 ms"))
-
-
-def test_lerobots_own_network_stands_beside_ours(gpu: Any) -> None:
-    pytest.importorskip("lerobot.policies.pi05.modeling_pi05", reason="LeRobot's PI05 is not installed")
-    from gpu_lerobot import lerobot_row
-    from gpu_setup import Setup
-
-    row = lerobot_row(Setup("tiny", 1, 1, gpu.torch.device("cpu"), False, "auto"))
-    assert row["training"]["samples_per_s"] > 0 and row["chunk"]["eager"]["p50_ms"] > 0
-
-
-def test_many_processes_add_a_line_for_each_way_to_share(tmp_path: Path) -> None:
-    report = tmp_path / "gpu.json"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    words = ["benchmarks/gpu.py", *SMALL, "--models", "tokendrop_expert", "--output", str(report)]
-    rendezvous = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port), "WORLD_SIZE": "2"}
-    started = [Command(*words, env={**rendezvous, "RANK": str(r), "LOCAL_RANK": str(r)}) for r in range(2)]
-    first, second = (command.finish(120) for command in started)
-    assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
-    found = json.loads(report.read_text())["processes"]["2"]
-    assert found.keys() == {"tokendrop_expert, ddp", "tokendrop_expert, fsdp"}
-    assert all(row["finite"] and row["samples_per_s"] > 0 for row in found.values())
-    assert first.stdout.count("2 processes: update") == 2 and not second.stdout

@@ -1,7 +1,6 @@
-"""Nothing in an update or a chunk waits for the device: shown on the meta device, and on a GPU that does nothing.
+"""No operation of an update or a chunk waits for the device.
 
-On the meta device every operation runs without numbers, so that one that needs a number, or a tensor of the CPU, stands
-out. The GPU that does nothing (`../shared/noop_gpu`, where it is at hand) counts what PyTorch's CUDA build really asks.
+On the meta device operations have no numbers, so that one that needs a number, or a tensor of the CPU, is found.
 """
 
 from collections.abc import Sequence
@@ -9,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from noop_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
+from helpers.mock_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
@@ -75,45 +74,3 @@ def test_what_waits_is_found() -> None:
         x + torch.tensor([1.0, 2.0]).to("meta")
         x.new_tensor([1.0, 2.0])
     assert len(work.found) >= 2
-
-
-COUNTING = """
-import ctypes, warnings
-warnings.filterwarnings("ignore")
-import torch
-from mme_vla.testing.small import random_batch, small_policy
-torch.backends.cudnn.enabled = False
-driver = ctypes.CDLL(None)
-names = ("n_sync", "n_h2d", "n_d2h", "n_graphlaunch", "n_launch")
-count = lambda: [ctypes.c_long.in_dll(driver, name).value for name in names]
-for model in ("framesamp_modul", "rmt_context"):
-    policy = small_policy(model).cuda()
-    batch = random_batch(policy, 2).to("cuda")
-    draws = {k: v.cuda() for k, v in policy.train().loss_draws(2, torch.Generator()).items()}
-    draws["changes"] = policy.picture_draws(2, torch.Generator())["changes"].cuda()
-    noise = draws["noise"]
-    def update():
-        policy(batch, draws)[0].backward()
-    def chunk():
-        policy.sample_actions(batch, noise, memory=memory)
-    def counted(work):
-        work(); torch.cuda.synchronize(); before = count(); work()
-        return [b - a for a, b in zip(before, count())]
-    print(model, "update", *counted(update))
-    with torch.no_grad():
-        memory = policy.eval().encode_memory(batch.history)
-    policy.compile_sampling()
-    print(model, "chunk", *counted(chunk))
-"""
-
-
-@needs_noop_gpu
-def test_a_gpu_that_does_nothing_counts_no_wait_and_one_launch_a_chunk(noop_gpu: NoopGpu) -> None:  # noqa: F811
-    told = noop_gpu.run("-c", COUNTING)
-    lines = [line.split() for line in told.splitlines()]
-    assert [line[:2] for line in lines] == [
-        [m, w] for m in ("framesamp_modul", "rmt_context") for w in ("update", "chunk")
-    ]
-    for model, what, waits, to_gpu, from_gpu, graphs, launches in lines:
-        assert (waits, to_gpu, from_gpu) == ("0", "0", "0"), (model, what)
-        assert (graphs, launches) == ("1", "0") if what == "chunk" else int(launches) > 100, (model, what)

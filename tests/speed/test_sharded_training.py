@@ -4,12 +4,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import forked
 import pytest
-import sharded_runs
 import torch
-from sharded_runs import RUNS, trainer
 
+from helpers import commands, sharded_runs
+from helpers.sharded_runs import RUNS, trainer
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
@@ -38,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Beside them one that did all 8.
     """
     folder = tmp_path_factory.mktemp("shared")
-    done = forked.run(str(Path(sharded_runs.__file__)), str(folder), env={"OMP_NUM_THREADS": "1"}, timeout=500)
+    done = commands.run("helpers.sharded_runs", str(folder), env={"OMP_NUM_THREADS": "1"}, timeout=500)
     ended = answer(folder, "ended") if done.returncode == 0 else {}
     codes = [(1, -9) if "die" in what else (0,) * processes for processes, what in RUNS]
     assert [tuple(code) for code in ended.values()] == codes, (done.stdout + done.stderr)[-3000:]
@@ -46,6 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_two_then_one_then_three_processes_learn_what_one_learns(folder: Path) -> None:
     assert len(losses(folder / "run")) == 8
     assert losses(folder / "run") == pytest.approx(losses(folder / "whole"), rel=CLOSE)
@@ -55,6 +55,7 @@ def test_two_then_one_then_three_processes_learn_what_one_learns(folder: Path) -
     assert held_out[0] == pytest.approx(held_out[1], rel=CLOSE)
 
 
+@pytest.mark.slow
 def test_the_averages_are_what_is_validated_and_saved(folder: Path) -> None:
     shared, alone = answer(folder, "resume"), answer(folder, "whole")
     assert shared == pytest.approx(alone, rel=CLOSE)
@@ -65,10 +66,12 @@ def test_the_averages_are_what_is_validated_and_saved(folder: Path) -> None:
         assert (parts[name] - tensor).abs().float().mean() < 1e-6, name
 
 
+@pytest.mark.slow
 def test_each_process_holds_its_part_alone(folder: Path) -> None:
     assert answer(folder, "train")["held"] == pytest.approx(1 / 2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_stop_signal_to_one_process_saves_what_all_hold(folder: Path) -> None:
     assert answer(folder, "stop") == {"finished": False, "signal": 15}
     checkpoint = resolve_checkpoint(folder / "stopped")
@@ -77,6 +80,7 @@ def test_a_stop_signal_to_one_process_saves_what_all_hold(folder: Path) -> None:
     assert not list(checkpoint.parent.glob(".*"))
 
 
+@pytest.mark.slow
 def test_a_killed_process_ends_the_others(folder: Path) -> None:
     """Of the fixture's two the second killed itself; the first then ended with an error, which it compared."""
     assert answer(folder, "policies")
@@ -84,6 +88,7 @@ def test_a_killed_process_ends_the_others(folder: Path) -> None:
     assert not checkpoints_in(folder / "killed" / "checkpoints")
 
 
+@pytest.mark.slow
 def test_every_kind_of_policy_learns_and_answers_the_same_shared(folder: Path) -> None:
     found = answer(folder, "policies")
     assert set(sharded_runs.MODELS) <= set(found)
@@ -93,6 +98,7 @@ def test_every_kind_of_policy_learns_and_answers_the_same_shared(folder: Path) -
         assert one["again"] == one["shared"][2], name
 
 
+@pytest.mark.slow
 def test_an_incomplete_checkpoint_is_refused(folder: Path, tmp_path: Path) -> None:
     import shutil
 

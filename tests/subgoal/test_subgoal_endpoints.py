@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chat_server import Answer, chat_server, failure, says
 from omegaconf import OmegaConf
-from rollout_stand_ins import quick_policy
 
+from helpers.chat_server import Answer, chat_server, failure, says
+from helpers.rollout_fakes import quick_policy
 from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.config.composition import compose
 from mme_vla.policy.mme import MMEPolicy

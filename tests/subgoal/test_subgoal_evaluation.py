@@ -4,12 +4,12 @@ import json
 import threading
 from pathlib import Path
 
-import forked
 import numpy as np
 import pytest
 from PIL import Image
-from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
+from helpers import commands
+from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_subgoals
 from mme_vla.envs.vector.pool import Job
@@ -253,6 +253,7 @@ def test_a_folder_left_by_another_process_does_not_stop_a_trace(
 TINY_VLM = ["subgoal=qwenvl", "subgoal.model=tiny", "subgoal.device=cpu", "subgoal.max_new_tokens=8"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["subgoal=oracle"], TINY_VLM], ids=["oracle", "qwenvl"])
 def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str], tmp_path: Path) -> None:
     pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
@@ -264,7 +265,7 @@ def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str
     except UserError as error:
         pytest.skip(str(error))
     tasks = ["model=groundsg", "backbone=tiny", "tasks=[PickXtimes,ButtonUnmask]", "episodes=1", "max_steps=24"]
-    done = forked.run("mme_vla.evaluate", *tasks, *words, "video=all", "workers=2", f"output={tmp_path}")
+    done = commands.run("mme_vla.evaluate", *tasks, *words, "video=all", "workers=2", f"output={tmp_path}")
     assert done.returncode == 0, done.stderr
     records = read_records(tmp_path / "episodes.jsonl")
     assert sorted(record.task for record in records) == ["ButtonUnmask", "PickXtimes"]

@@ -7,8 +7,8 @@ import threading
 import time
 
 import pytest
-from subgoal_fakes import ApiError, Client, frames, kinds, play, predictor_of, response, says, started
 
+from helpers.subgoal_fakes import ApiError, Client, frames, kinds, play, predictor_of, response, says, started
 from mme_vla.errors import UserError
 from mme_vla.subgoal import Gemini
 from mme_vla.subgoal.base import Usage

@@ -5,9 +5,9 @@ import sys
 import time
 
 import pytest
-from conftest import REPOSITORY
-from subgoal_fakes import frames, kinds, play, predictor_of, says, started
 
+from helpers import REPOSITORY
+from helpers.subgoal_fakes import frames, kinds, play, predictor_of, says, started
 from mme_vla.errors import UserError
 from mme_vla.subgoal.models.api import side_by_side
 
@@ -66,6 +66,7 @@ def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
     assert kinds(last[2]["parts"]) == kinds(last[4]["parts"]) == ["video/mp4", "text"]
 
 
+@pytest.mark.slow
 def test_an_interrupt_does_not_wait_for_answers_under_way():
     code = """
 import signal, threading, time

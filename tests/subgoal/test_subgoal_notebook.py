@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chat_server import Answer, ChatServer, chat_server, failure, says
 
+from helpers.chat_server import Answer, ChatServer, chat_server, failure, says
 from mme_vla.errors import UserError
 from mme_vla.subgoal import NotebookPredictor, build_predictor
 from mme_vla.subgoal.notebook import MONITOR, Count, Identity, Notebook, Route, read_notes

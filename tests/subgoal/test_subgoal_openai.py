@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chat_server import ChatServer, chat_server, failure, says
 from PIL import Image
 
+from helpers.chat_server import ChatServer, chat_server, failure, says
 from mme_vla.errors import UserError
 from mme_vla.play import OpenAIPlayer
 from mme_vla.subgoal import OpenAI, build_predictor

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from rollout_stand_ins import FACTS, JOBS, quick_policy
 
+from helpers.rollout_fakes import FACTS, JOBS, quick_policy
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.evaluation.records import EpisodeRecord

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 import torch
-from conftest import REPOSITORY
 from safetensors.torch import save_file
 
+from helpers import REPOSITORY
 from mme_vla import MMEPolicy, UserError, load_weights
 from mme_vla.cli.weights import convert
 from mme_vla.config.composition import compose

@@ -31,6 +31,7 @@ def test_nothing_to_do_says_nothing(capsys, total: int) -> None:
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 def test_the_memory_of_a_run_is_its_own_and_not_that_of_the_process_it_was_started_by() -> None:
     held = np.ones(60_000_000)  # 460 MiB, which a child's getrusage would begin with
     code = "from mme_vla.training.logging import resident_gib; print(resident_gib())"

@@ -3,15 +3,16 @@
 import io
 import json
 import signal
+import subprocess
 import time
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
-import forked
 import pytest
 import torch
 
+from helpers import commands
 from mme_vla import MMEPolicy, UserError
 from mme_vla.cli.train import main
 from mme_vla.config.composition import compose
@@ -26,13 +27,13 @@ SMALL = [
 ]  # fmt: skip
 
 
-def start(cache: Path, *overrides: str) -> forked.Command:
+def start(cache: Path, *overrides: str) -> "subprocess.Popen[str]":
     words = ["mme_vla.train", *SMALL, f"data.cache.root={cache}", *overrides]
-    return forked.Command(*words, cwd=cache, env={"OMP_NUM_THREADS": str(torch.get_num_threads())})
+    return commands.start(*words, cwd=cache, env={"OMP_NUM_THREADS": str(torch.get_num_threads())})
 
 
-def finish(command: forked.Command) -> str:
-    done = command.finish()
+def finish(process: "subprocess.Popen[str]") -> str:
+    done = commands.finish(process)
     assert done.returncode == 0, done.stderr[-3000:]
     return done.stdout
 
@@ -52,17 +53,18 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     killed = start(base, "output=killed", "train.steps=500")
     deadline = time.monotonic() + 200
     while not any(line["step"] > SAVE_EVERY + 1 for line in read_metrics(base / "killed")):
-        assert killed.process.is_alive(), killed.finish().stderr[-3000:]
+        assert killed.poll() is None, commands.finish(killed).stderr[-3000:]
         assert time.monotonic() < deadline
         time.sleep(0.02)
-    killed.process.kill()
-    assert killed.finish().returncode == -signal.SIGKILL
+    killed.kill()
+    assert commands.finish(killed).returncode == -signal.SIGKILL
     printed = io.StringIO()
     with redirect_stdout(printed):  # in this process, which has imported everything: the same numbers, sooner
         main(compose("train", [*SMALL, f"data.cache.root={base}", f"output={base / 'whole'}"]))
     return base, printed.getvalue()
 
 
+@pytest.mark.slow
 def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> None:
     whole, killed = runs[0] / "whole", runs[0] / "killed"
     # The killed run may have come further than one checkpoint: continue from the first.
@@ -76,6 +78,7 @@ def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> No
     assert ours["open_loop"] == theirs["open_loop"]
 
 
+@pytest.mark.slow
 def test_a_finished_run_holds_everything(runs: tuple[Path, str]) -> None:
     folder, printed = runs[0] / "whole", runs[1]
     checkpoint = folder / "checkpoints" / f"step_{STEPS:06d}"
@@ -90,6 +93,7 @@ def test_a_finished_run_holds_everything(runs: tuple[Path, str]) -> None:
     assert MMEPolicy.from_pretrained(checkpoint).require_processor().stats is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [

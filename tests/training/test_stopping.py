@@ -5,11 +5,11 @@ import signal
 from collections.abc import Iterator
 from pathlib import Path
 
-import forked
 import pytest
 import torch
-from test_training import loggers, policy, trainer
 
+from helpers import commands
+from helpers.trainings import loggers, policy, trainer
 from mme_vla.policy.run_folders import resolve_checkpoint
 from mme_vla.training.logging import ProgressLine, Window, read_metrics
 from mme_vla.training.stopping import stop_requests
@@ -44,11 +44,12 @@ def test_a_stop_signal_saves_and_leaves(tmp_path: Path) -> None:
     assert signal.getsignal(signal.SIGTERM) == handler
 
 
+@pytest.mark.slow
 def test_all_processes_stop_after_the_same_update_when_one_is_asked(tmp_path: Path) -> None:
     (tmp_path / "asked.py").write_text(ASKED_ONCE)
     words = (str(tmp_path / "asked.py"), str(tmp_path / "meeting"))
-    started = [forked.Command(*words, str(rank)) for rank in range(2)]
-    assert [command.finish(100).stdout.strip() for command in started] == ["stopped after 3"] * 2
+    started = [commands.start(*words, str(rank)) for rank in range(2)]
+    assert [commands.finish(process, 100).stdout.strip() for process in started] == ["stopped after 3"] * 2
 
 
 @pytest.fixture

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lerobot_pi05 import reduce_sizes
 from safetensors.torch import save_file
 
+from helpers.lerobot_pi05 import reduce_sizes
 from mme_vla.cli.weights import convert
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy

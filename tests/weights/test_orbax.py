@@ -6,10 +6,10 @@ import os
 import shutil
 from pathlib import Path
 
-import golden
 import pytest
 import torch
 
+from helpers import golden
 from mme_vla import UserError
 from mme_vla.testing.small import small_policy
 from mme_vla.weights import detect_format, load_weights, open_source, read_stats

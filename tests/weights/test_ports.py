@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 import torch
-from lerobot_pi05 import reduce_sizes
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from helpers.lerobot_pi05 import reduce_sizes
 from mme_vla import UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.policy.mme import MMEPolicy

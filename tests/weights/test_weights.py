@@ -6,11 +6,11 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import forked
 import pytest
 import torch
 from safetensors.torch import save_file
 
+from helpers import commands
 from mme_vla import MMEPolicy, UserError, build_policy
 from mme_vla.cli.weights import convert
 from mme_vla.testing.small import PERCEPTUAL, random_batch, small_policy, unit_stats
@@ -155,9 +155,10 @@ def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
         convert(tmp_path / "ours", tmp_path / "x", ["model=framesamp_expert"])
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
     command = ["mme_vla", "weights", str(bases["lerobot"]), str(tmp_path / "new")]
-    done = forked.run(*command, "backbone=tiny", "--dry-run")
+    done = commands.run(*command, "backbone=tiny", "--dry-run")
     assert done.returncode == 0, done.stderr
     assert re.search(
         r"q_proj\.weight +\S+ +backbone\.transformer\.layers\.\*\.experts\.action\.qkv\.weight", done.stdout
@@ -166,7 +167,7 @@ def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path
     assert re.search(r"tied.*\n.*\n.*lm_head\.weight +\S+embed_tokens\.weight", done.stdout)
     assert "derived: recomputed constants: none" in done.stdout
     assert list(tmp_path.iterdir()) == []
-    wrong = forked.run(*command, "backbone=tinny")
+    wrong = commands.run(*command, "backbone=tinny")
     assert wrong.returncode == 2
     assert "tiny" in wrong.stderr
     assert "Traceback" not in wrong.stderr

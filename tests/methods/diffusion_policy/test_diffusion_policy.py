@@ -14,9 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 pytest.importorskip("diffusers")
 
 from rich.console import Console
-from rollout_stand_ins import JOBS, InlineEnvs, roll
-from serving_fakes import Served, acted_directly, challenge, course
 
+from helpers.rollout_fakes import JOBS, InlineEnvs, roll
+from helpers.serving_fakes import Served, acted_directly, challenge, course
 from mme_vla import MMEPolicy, Policy, UserError, build_policy, load_weights
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.cli.train import train

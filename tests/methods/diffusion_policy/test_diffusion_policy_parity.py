@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from baselines import baselines_folder, relative_error, rule_weight
 from torch import Tensor
+
+from helpers.baselines import baselines_folder, relative_error, rule_weight
 
 pytest.importorskip("diffusers")
 

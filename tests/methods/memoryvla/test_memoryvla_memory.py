@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 from omegaconf import OmegaConf
-from prior_vla_runs import losses, run
 from rich.console import Console
-from rollout_scripted_env import make_scripted_env
-from rollout_stand_ins import InlineEnvs, roll
-from serving_fakes import Served, challenge
-from test_memoryvla_policy import reached
 
+from helpers.memoryvla_golden import reached
+from helpers.prior_vla_runs import losses, run
+from helpers.rollout_fakes import InlineEnvs, roll
+from helpers.scripted_env import make_scripted_env
+from helpers.serving_fakes import Served, challenge
 from mme_vla import UserError, build_policy
 from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from baselines import baselines_folder
-from golden import error
-from memoryvla_golden import about, arrays, bank, core, golden_name
 from torch import Tensor
 
+from helpers.baselines import baselines_folder
+from helpers.golden import error
+from helpers.memoryvla_golden import about, arrays, bank, core, golden_name
 from mme_vla.memory.extensions.bank import BankState, MemoryBank, groups_of, runs_of
 from mme_vla.methods.memoryvla.action_head import Schedule
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, cognition_token

@@ -2,13 +2,13 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from prior_vla_runs import losses, run
 
+from helpers.memoryvla_golden import reached
+from helpers.prior_vla_runs import losses, run
 from mme_vla import UserError, build_policy
 from mme_vla.data.dataset import GroupDataset
 from mme_vla.data.sources import open_sources
@@ -16,21 +16,8 @@ from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.methods.memoryvla.processor import GroupBatch
 from mme_vla.policy.base import Policy
 from mme_vla.policy.tensor_files import load_tensors
-from mme_vla.testing.small import unit_stats
 
 SMALL = {"vision": {"image_size": 28}}
-
-
-def reached(**options: Any) -> MemoryVlaPolicy:
-    """A small policy in which everything that is read reaches the chunk."""
-    policy = build_policy("memoryvla", **options)
-    assert isinstance(policy, MemoryVlaPolicy)
-    policy.require_processor().stats = unit_stats(policy.embodiment)
-    generator = torch.Generator().manual_seed(0)
-    for name, parameter in policy.core.named_parameters():  # what begins at zero would hide what does not arrive
-        if name.endswith(("head.output.weight", "in_proj_weight")):
-            torch.nn.init.normal_(parameter, std=0.3, generator=generator)
-    return policy
 
 
 def tiny() -> MemoryVlaPolicy:

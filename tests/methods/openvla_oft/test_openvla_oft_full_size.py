@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 import torch
-from baselines import baselines_folder
-from openvla_golden import WRAPPER
 
+from helpers.baselines import baselines_folder
+from helpers.openvla_golden import WRAPPER
 from mme_vla.methods.openvla_oft.model import OpenVlaBackbone
 from mme_vla.methods.openvla_oft.weights import HEAD, STATE, VLA, openvla_name
 from mme_vla.policy.build import build_policy

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from baselines import baselines_folder, rule_weight
-from golden import error
-from openvla_golden import batch, case, fused, golden_name, policy
 from torch import Tensor
 
+from helpers.baselines import baselines_folder, rule_weight
+from helpers.golden import error
+from helpers.openvla_golden import batch, case, fused, golden_name, policy
 from mme_vla.backbone.attention import additive_mask
 from mme_vla.methods.openvla_oft.config import FusedVisionConfig, LlamaConfig, TowerConfig
 from mme_vla.methods.openvla_oft.model import OpenVlaBackbone, TokenSequence, absolute_error

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from baselines import baselines_folder
-from golden import error
-from openvla_golden import case
 from torch import Tensor
 
+from helpers.baselines import baselines_folder
+from helpers.golden import error
+from helpers.openvla_golden import case
 from mme_vla import UserError
 from mme_vla.methods.openvla_oft import processor as pictures
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles

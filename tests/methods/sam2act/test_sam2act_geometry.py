@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
-from sam2act_golden import load, meta, relative_error
 
+from helpers.sam2act_golden import load, meta, relative_error
 from mme_vla.methods.sam2act import geometry, render
 from mme_vla.methods.sam2act.geometry import Cube, shift_and_rotate, unproject, zoom, zoom_back
 

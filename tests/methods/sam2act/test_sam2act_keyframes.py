@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from h5_files import pose_at, write_file
 
+from helpers.h5_files import pose_at, write_file
 from mme_vla.data import keyframes
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource

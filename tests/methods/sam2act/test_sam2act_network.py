@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from sam2act_golden import drawn, drawn_weight, load, meta, relative_error
 from torch import Tensor, nn
 
+from helpers.sam2act_golden import drawn, drawn_weight, load, meta, relative_error
 from mme_vla.methods.sam2act.config import EncoderSizes, SAM2ActSizes
 from mme_vla.methods.sam2act.geometry import VIEWS, PointFinder, heatmap_loss
 from mme_vla.methods.sam2act.image_encoder import LoraProjection

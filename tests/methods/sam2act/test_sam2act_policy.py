@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from h5_files import write_file
 from omegaconf import OmegaConf
 
+from helpers.h5_files import write_file
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert

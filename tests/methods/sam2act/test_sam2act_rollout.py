@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from rollout_scripted_env import ScriptedEnv
-from rollout_stand_ins import InlineEnvs, roll
 
+from helpers.rollout_fakes import InlineEnvs, roll
+from helpers.scripted_env import ScriptedEnv
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.environment import ChunkEnv
