@@ -21,7 +21,7 @@ import pytest
 import shared_compositions
 from forked_workers import Collected
 
-from mme_vla.envs.vector import processes
+from mme_vla.envs.vector import worker
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 
@@ -30,7 +30,7 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 # What commands import besides: `forked.py` runs them in the same way as workers.
-processes.PRELOADED += [
+worker.PRELOADED += [
     "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.training.loop", "composed_before",
 ]  # fmt: skip
 
@@ -81,7 +81,7 @@ def pytest_xdist_setupnodes(config: pytest.Config, specs: Sequence[Any]) -> None
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
     """Before a test worker starts: tell it where that process listens."""
-    processes.simulating_processes()
+    worker.simulating_processes()
     forkserver.ensure_running()
     node.workerinput["forkserver"] = forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
 

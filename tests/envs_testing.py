@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 from sapien.physx import PhysxArticulationLinkComponent, PhysxCollisionShapeBox
 
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from conftest import REPOSITORY
 
-from mme_vla.envs.vector import processes
+from mme_vla.envs.vector import worker
 
 
 class Command:
@@ -37,8 +37,8 @@ class Command:
         self._folder = tempfile.TemporaryDirectory()
         self._printed = [Path(self._folder.name, name) for name in ("out", "err")]
         arguments = (words, cwd, hidden, *self._printed)
-        self.process = processes.simulating_processes().Process(
-            target=processes.begin, args=({**os.environ, **(env or {})}, _be, *arguments)
+        self.process = worker.simulating_processes().Process(
+            target=worker.begin, args=({**os.environ, **(env or {})}, _be, *arguments)
         )
         self.process.start()
 

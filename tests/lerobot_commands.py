@@ -14,7 +14,7 @@ from typing import Any
 
 from plugin_packages import PLUGINS
 
-from mme_vla.envs.vector import processes
+from mme_vla.envs.vector import worker
 
 TRAIN, EVAL, VIZ = (f"lerobot.scripts.lerobot_{name}" for name in ("train", "eval", "dataset_viz"))
 
@@ -49,9 +49,9 @@ class LeRobot:
 def lerobot(folder: Path) -> Iterator[LeRobot]:
     """LeRobot's commands, on the CPU, with this folder for what Hugging Face's libraries keep."""
     environment = os.environ | {"ACCELERATE_USE_CPU": "true"}
-    context = processes.simulating_processes()
+    context = worker.simulating_processes()
     ours, theirs = context.Pipe()
-    process = context.Process(target=processes.begin, args=(environment, _serve, theirs, folder))
+    process = context.Process(target=worker.begin, args=(environment, _serve, theirs, folder))
     process.start()
     theirs.close()
     with ours:

@@ -4,14 +4,17 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, read_variant
+from mme_vla.envs.observations import Include
 from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.registry import TASKS
 
 if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.official import OfficialEnv
+
 
 ENVS = ("mme_vla", "official")
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
@@ -66,8 +69,6 @@ def make_env(
     check_names(task, env, action_space, difficulty, seed)
     check_sessions(split, sessions)
     if env == "official":
-        from mme_vla.envs.official import make_official_env
-
         if seed is not None or recovery is not None or not render or reward != "none":
             raise UserError(
                 'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, '
@@ -166,3 +167,95 @@ def _make_library_env(
 
     built = make_task(task, render=render, obs_mode=obs_mode, **scene)
     return RoboMMEEnv(built, space, max_steps, include, render, reward)
+
+
+_BUILDER = "robomme.env_record_wrapper"
+_ENVIRONMENTS = "robomme.robomme_env"
+_INSTALL_HINT = (
+    "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark "
+    "in an environment of its own, since it needs numpy < 2 and gymnasium 0.29; or use env='mme_vla', which needs none."
+)
+
+
+class OfficialEnv:
+    """One official episode; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
+
+    Args:
+        env: what the official builder made.
+        max_steps: control steps after which the status becomes `timeout`.
+        include: what observations and infos hold beyond the standard keys.
+    """
+
+    def __init__(self, env: Any, max_steps: int, include: Include) -> None:
+        self._env: Any = env
+        self.max_steps = max_steps
+        self.include = include
+        self._newest: np.ndarray | None = None
+        self._started = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+        """Begin the episode; `seed` and `options` have no effect."""
+        observation, info = self._open().reset()
+        self._started = True
+        self._keep_newest(observation)
+        return observation, _flat(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Perform one action."""
+        env = self._open()
+        if not self._started:
+            raise UserError("step() before reset(): call reset() first.")
+        observation, reward, terminated, truncated, info = env.step(action)
+        self._keep_newest(observation)
+        return observation, reward, terminated, truncated, _flat(info)
+
+    def render(self) -> np.ndarray | None:
+        """The newest front image [256, 256, 3], or None before the first reset."""
+        self._open()
+        return self._newest
+
+    def close(self) -> None:
+        """Free the simulator; closing twice is harmless."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _open(self) -> Any:
+        if self._env is None:
+            raise UserError("The environment is closed; make a new one.")
+        return self._env
+
+    def _keep_newest(self, observation: Any) -> None:
+        if observation and observation.get("front_rgb_list"):
+            self._newest = np.asarray(observation["front_rgb_list"][-1])
+
+
+def make_official_env(
+    task: str, split: str, episode: int, action_space: str, max_steps: int, options: dict[str, Any]
+) -> OfficialEnv:
+    """Make an episode of the official package."""
+    include = Include.from_options(options)
+    if find_spec("robomme") is None:
+        raise UserError(_INSTALL_HINT)
+    if hasattr(import_module("robomme"), "STANDS_IN"):
+        raise UserError(
+            "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those "
+            "of env='mme_vla'. Uninstall it and install the official one, or leave out env='official'."
+        )
+    import_module(_ENVIRONMENTS)  # registers the tasks
+    builder = import_module(_BUILDER).BenchmarkEnvBuilder(
+        env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps
+    )
+    count = builder.get_episode_num()
+    if not 0 <= episode < count:
+        raise UserError(f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
+    flags = {name: True for name, yes in include.options.items() if yes}
+    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags), max_steps, include)
+
+
+def _flat(info: dict[str, Any]) -> dict[str, Any]:
+    """The info as one plain dict whose `task_goal` is a list."""
+    goal = info.get("task_goal")
+    return {**info, "task_goal": [goal]} if isinstance(goal, str) else dict(info)

@@ -3,22 +3,45 @@
 A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
 """
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Container, Mapping, Sequence
+from dataclasses import dataclass, field, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from mme_vla.embodiment.robomme import ARM_JOINTS, SIDE
+from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, SIDE
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
+    import gymnasium
     import sapien
 
     from mme_vla.envs.task import Task
+
+
+NOTHING: Container[int] = frozenset()
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """What of an episode is drawn; all else is simulated without a look.
+
+    frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on, those of the
+        conditioning video first. A `range` may reach beyond the episode's end.
+    now: the cameras that show, whatever its number, the newest frame of each call of `reset` and `step`.
+    grounded: whether texts with pixels are wanted, for which the front camera looks where a sub-task begins.
+    """
+
+    frames: Mapping[str, Container[int]] = field(default_factory=dict)
+    now: tuple[str, ...] = CAMERAS
+    grounded: bool = True
+
+    def cameras(self, frame: int, newest: bool) -> tuple[str, ...]:
+        """The cameras that show a frame of this number."""
+        known = dict.fromkeys((*CAMERAS, *self.frames, *self.now))  # some environments have more than the benchmark
+        return tuple(c for c in known if frame in self.frames.get(c, NOTHING) or (newest and c in self.now))
+
 
 FOCAL_LENGTH = SIDE / 2  # pixels: the side is seen under 90 degrees
 INTRINSIC = np.array([[FOCAL_LENGTH, 0, SIDE / 2], [0, FOCAL_LENGTH, SIDE / 2], [0, 0, 1]], np.float32)
@@ -76,6 +99,8 @@ class AngleTrack:
 
     def follow(self, quaternion: np.ndarray) -> np.ndarray:
         """Angles [3] float64 of the next frame, from its quaternion [4] (w, x, y, z)."""
+        from scipy.spatial.transform import Rotation
+
         q = np.asarray(quaternion, np.float64)
         q = q / np.linalg.norm(q)
         if self._quaternion is not None and q @ self._quaternion < 0:
@@ -129,7 +154,7 @@ class Observer:
             "gripper_state": np.zeros(2) if self.task.stick else qpos[-2:].astype(np.float32),
         }
         if self.include.maniskill_obs:
-            frame["maniskill_obs"] = type(self.task).get_obs(self.task, info)
+            frame["maniskill_obs"] = self.task.simulator_obs(info)
             self._taken |= set(SENSORS)
         elif self.render:
             self._render_cameras(cameras)
@@ -223,8 +248,10 @@ def frame_keys(include: Include, render: bool) -> list[str]:
     return [*keys, *(["maniskill_obs"] if include.maniskill_obs else [])]
 
 
-def observation_space(keys: Sequence[str]) -> gymnasium.spaces.Dict:
+def observation_space(keys: Sequence[str]) -> "gymnasium.spaces.Dict":
     """Lists of frames, as Gymnasium describes them; the raw simulator observation is left out."""
+    import gymnasium
+
     image = gymnasium.spaces.Box(0, 255, (SIDE, SIDE, 3), np.uint8)
     depth = gymnasium.spaces.Box(-(2**15), 2**15 - 1, (SIDE, SIDE, 1), np.int16)
     boxes: dict[str, gymnasium.Space] = {

@@ -22,13 +22,12 @@ import sapien
 from scipy.spatial.transform import Rotation
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, POSE, SIDE
-from mme_vla.envs.choices import nearest_to_pixel
 from mme_vla.envs.grounding import project
 from mme_vla.envs.robot.control import GRIPPER_STEPS
 from mme_vla.errors import UserError, did_you_mean
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
     from mme_vla.envs.task import Task
 
 
@@ -145,8 +144,9 @@ class MultiChoice(ActionSpace):
         point = action.get("point")
         if point is None or len(point) == 0:
             raise UserError(f"Choice {label!r} ({choice.action}) needs a point: the pixel [y, x] of the object meant.")
-        pixel = _numbers(point, 2, "a pixel's row and column").tolist()
-        choice.run(control.demonstrator, nearest_to_pixel(pixel, choice.candidates(), project))
+        pixel = _numbers(point, 2, "a pixel's row and column")
+        nearest = min(choice.candidates(), key=lambda thing: float(np.linalg.norm(project(thing.position) - pixel)))
+        choice.run(control.demonstrator, nearest)
 
 
 SPACES: dict[str, ActionSpace] = {

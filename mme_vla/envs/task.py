@@ -9,11 +9,10 @@ from typing import Any, ClassVar
 
 import torch
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, build_cue, show_cue
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.motions import Cue, build_cue, show_cue
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.stage import Stage
-from mme_vla.envs.subtasks import Progress, SubTask
+from mme_vla.envs.subtasks import Choice, Progress, SubTask
 from mme_vla.errors import UserError, did_you_mean
 
 DIFFICULTIES = ("easy", "medium", "hard")
@@ -79,9 +78,9 @@ class Task(Stage):
         self.recovery = recovery
         self.recording = False
         """A demonstrator is recording: `dropped` is judged as it was when the official data were recorded."""
-        self.observe: Callable[[dict[str, Any]], None] | None = None
-        """Called in every step when the moment has come to observe: after the evaluation, whose info it gets, and
-        before `after_step`."""
+        self.on_frame: Callable[[dict[str, Any]], None] | None = None
+        """Called once a step with the info of the evaluation, after the physics and before `after_step`. While it is
+        set, the simulator makes no observation of its own."""
         self.failed_pick: int | None = None
         """Index, among the picks of the execution, of the one that a recovery demonstration fails first."""
         super().__init__(*args, seed=seed, **kwargs)
@@ -174,9 +173,14 @@ class Task(Stage):
         return result
 
     def get_obs(self, info: dict | None = None, unflattened: bool = False) -> Any:
-        if self.observe is not None and info is not None:
-            self.observe(info)
-        return super().get_obs(info, unflattened)
+        if self.on_frame is None or info is None:
+            return super().get_obs(info, unflattened)
+        self.on_frame(info)
+        return {}
+
+    def simulator_obs(self, info: dict[str, Any]) -> Any:
+        """The present observation in ManiSkill's own format."""
+        return super().get_obs(info)
 
     def _before_control_step(self) -> None:
         self.before_physics(self.steps_done)

@@ -255,9 +255,9 @@ def _options(env: "Task", chooser: "ActionSpace") -> tuple[Option, ...]:
 
 def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     """The motions of a demonstration, or its choices, if it succeeds."""
+    from mme_vla.envs.observations import RenderRequest
     from mme_vla.envs.recording.frames import choices_of, motions_of
     from mme_vla.envs.recording.recorder import Recorder
-    from mme_vla.envs.render_request import RenderRequest
 
     steps: list[RecordedStep] = []
 
@@ -274,7 +274,7 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
 def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
     """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.render_request import RenderRequest
+    from mme_vla.envs.observations import RenderRequest
 
     env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
     env.render_request = RenderRequest(now=())

@@ -9,8 +9,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from envs_unmask import lift, make, names, push_down, released, same_twice, skip_place, texts, turn, under, wait
 
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.button_unmask_swap import ButtonUnmaskSwap
 
 

@@ -13,9 +13,9 @@ from envs_cubes import steps_of_demonstration
 from envs_unmask import make, same_twice, texts, wait
 
 from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Peg
-from mme_vla.envs.scene.objects.shapes import at
+from mme_vla.envs.scene.articulated import Peg
+from mme_vla.envs.scene.objects import at
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.envs.tasks.insert_peg import InsertPeg
 

@@ -9,8 +9,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from envs_cubes import COLOURS, Hand, least_distance, read_button, read_cube, steps_of_demonstration
 from envs_unmask import make, push_down, released, texts, wait
 
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.pick_highlight import PickHighlight
 
 

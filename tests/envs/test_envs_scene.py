@@ -17,10 +17,10 @@ from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
 from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.robot.robots import description
+from mme_vla.envs.scene.articulated import build_button, build_peg
 from mme_vla.envs.scene.objects import (
     build_aperture_box,
     build_board,
-    build_button,
     build_container,
     build_cube,
     build_disc,
@@ -28,7 +28,6 @@ from mme_vla.envs.scene.objects import (
     build_highlight,
     build_moving_cube,
     build_obstacle,
-    build_peg,
     build_sphere,
 )
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes

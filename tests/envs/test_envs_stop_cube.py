@@ -10,8 +10,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from envs_cubes import Flags, read_button, steps_of_demonstration
 from envs_unmask import make, push_down, texts, wait
 
-from mme_vla.envs.robot.stick_skills import Demonstrator
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.stop_cube import StopCube
 

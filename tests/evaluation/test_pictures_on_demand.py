@@ -9,7 +9,7 @@ from rollout_scripted_env import VIDEO, ScriptedEnv, make_scripted_env
 from rollout_stand_ins import InlineEnvs, quick_policy, roll
 
 from mme_vla import UserError
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.settings import RolloutSettings

@@ -22,7 +22,7 @@ from typing import Any
 
 import sitecustomize
 
-from mme_vla.envs.vector import processes
+from mme_vla.envs.vector import worker
 
 SLOW = (
     "torch", "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.policy.mme",
@@ -50,7 +50,7 @@ def hide(modules: list[str]) -> None:
 def have_simulator(hidden: list[str]) -> None:
     """Import it, where all but its own extra is hidden, and be forked: simulating processes are, in turn, from that."""
     hide(hidden)
-    for module in processes.PRELOADED:
+    for module in worker.PRELOADED:
         importlib.import_module(module)
     resource_tracker.ensure_running()
     server: Any = forkserver._forkserver

@@ -9,7 +9,7 @@ import numpy as np
 from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_motions, known_poses, row_of
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError
 from mme_vla.registry import MEMORIES
 

@@ -9,11 +9,10 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.envs.grounding import Grounding, project
-from mme_vla.envs.observations import AngleTrack, Include, Observer
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import AngleTrack, Include, Observer, RenderRequest
 from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.robot.gripper_skills import DOWNWARD_Q
-from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
 if TYPE_CHECKING:
@@ -144,13 +143,13 @@ class Recorder:
         self._displayed = task.progress.displayed
         self._result = Recording(success=False, steps=0)
         self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
-        task.observe = self._observe
+        task.on_frame = self._on_frame
         try:
             self._result.success = demonstrate(task, self._demonstrator)
         except (PlanningError, TooLongError) as error:
             self._result.error = str(error) or type(error).__name__
         finally:
-            task.observe = None
+            task.on_frame = None
         return self._result
 
     def _step(self, action: np.ndarray) -> None:
@@ -170,7 +169,7 @@ class Recorder:
             angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
         self._waypoint = np.concatenate([pose.p, angles, [gripper]]).astype(np.float64)
 
-    def _observe(self, evaluated: dict[str, Any]) -> None:
+    def _on_frame(self, evaluated: dict[str, Any]) -> None:
         self._observer.follow()
         progress = self._task.progress
         # The text was set before the evaluation moved the pointer: it follows one step later.

@@ -9,8 +9,8 @@ from sapien import physx
 from scipy.spatial.transform import Rotation
 
 from mme_vla.envs.robot.control import CLOSE, OPEN, RobotControl
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Button
+from mme_vla.envs.scene.articulated import Button
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import Thing
 
 DOWN = np.array([0.0, 0.0, -1.0])

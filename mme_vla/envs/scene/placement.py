@@ -11,14 +11,59 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import torch
 from mani_skill.utils.geometry.trimesh_utils import get_component_mesh
 from sapien import physx
+from torch import Tensor
 from trimesh import Trimesh
 
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
-from mme_vla.envs.scene.objects import BUTTON_BASE, Board, Button, Disc, H
+from mme_vla.envs.scene.articulated import BUTTON_BASE, Button
+from mme_vla.envs.scene.objects import Board, Disc, H
 from mme_vla.envs.scene.things import Thing
+
+
+class Draws:
+    """One generator, with the few kinds of draws that scenes are made of.
+
+    Args:
+        seed: the episode's seed.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._generator = torch.Generator().manual_seed(seed)
+
+    def uniform(self) -> float:
+        """One number in [0, 1)."""
+        return torch.rand(1, generator=self._generator).item()
+
+    def uniforms(self, n: int) -> Tensor:
+        """`n` numbers in [0, 1) drawn in one call, float32 [n]; not the same stream as `n` single draws."""
+        return torch.rand(n, generator=self._generator)
+
+    def between(self, low: float, high: float) -> float:
+        """One number in [low, high), as torch's in-place `uniform_` draws it."""
+        return torch.empty(1).uniform_(low, high, generator=self._generator).item()
+
+    def integer(self, low: int, high: int) -> int:
+        """One integer in low … high - 1."""
+        return int(torch.randint(low, high, (1,), generator=self._generator).item())
+
+    def permutation(self, n: int) -> list[int]:
+        """The numbers 0 … n - 1 in random order."""
+        return torch.randperm(n, generator=self._generator).tolist()
+
+    def coin(self) -> bool:
+        """True in half of the cases: one uniform below 0.5."""
+        return self.uniform() < 0.5
+
+    def state(self) -> Tensor:
+        """Where the stream stands, for `restore`."""
+        return self._generator.get_state()
+
+    def restore(self, state: Tensor) -> None:
+        """Go back to where the stream stood when `state` was taken."""
+        self._generator.set_state(state)
+
 
 TRIALS = 256
 CONTAINER_HALF = 0.0275
@@ -270,8 +315,3 @@ def shifted_anchors(draws: Draws, count: int) -> list[Point]:
     line = [(-0.05 + b[0], -0.15), (-0.05 + b[1], 0.15), (-0.05 + b[2], 0.0)]
     square = [(0.0, -0.1 + left), (0.0, 0.1 + left), (0.1, 0.1 + right), (0.1, -0.1 + right)]
     return square if count == len(square) else line if on_line else triangle
-
-
-def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
-    """One swap after another, the first at step `start`; each initiator's partner is who is nearest then."""
-    return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]

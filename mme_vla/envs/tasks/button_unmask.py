@@ -1,13 +1,10 @@
 """ButtonUnmask (Permanence): press a button while containers cover three cubes; pick up the right container."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Cover
-from mme_vla.envs.scene.objects import build_button
-from mme_vla.envs.scene.placement import draw_button
-from mme_vla.envs.scene.predicates import pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cover, Cue, under
+from mme_vla.envs.scene.placement import Draws, draw_button
+from mme_vla.envs.scene.things import pressed
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (

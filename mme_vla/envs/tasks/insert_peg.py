@@ -8,25 +8,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
 from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.robot.peg_skills import PegEnd
+from mme_vla.envs.robot.demonstrator import PegEnd
 from mme_vla.envs.robot.robots import ROBOT_BASE
-from mme_vla.envs.scene.cues import Cue, on_table
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Highlight, Mark, build_mark
-from mme_vla.envs.scene.objects import build_aperture_box, build_highlight, build_peg
-from mme_vla.envs.scene.objects.shapes import at
-from mme_vla.envs.scene.objects.solids import APERTURE_COLOUR, APERTURE_Z
-from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, reset_reached
-from mme_vla.envs.scene.things import Thing
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.articulated import build_peg
+from mme_vla.envs.scene.motions import Cue, Highlight, Mark, build_mark, on_table
+from mme_vla.envs.scene.objects import APERTURE_COLOUR, APERTURE_Z, at, build_aperture_box, build_highlight
+from mme_vla.envs.scene.placement import Draws, SceneError
+from mme_vla.envs.scene.things import StaticFor, Thing, any_picked_up, reset_reached
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 PEGS, PEG_LENGTH, PEG_RADIUS = 3, 0.05, 0.01
 FROM_BOX, FROM_PEG = 0.06, 0.075

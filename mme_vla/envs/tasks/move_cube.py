@@ -6,18 +6,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import PEG_COLOUR, H, build_cube, build_disc, build_peg
-from mme_vla.envs.scene.objects.shapes import at
-from mme_vla.envs.scene.placement import Region, SceneError, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.articulated import PEG_COLOUR, build_peg
+from mme_vla.envs.scene.objects import H, at, build_cube, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
+from mme_vla.envs.scene.things import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
 MANNER_TEXTS = {

@@ -5,20 +5,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.scene.objects import Disc, build_disc
-from mme_vla.envs.scene.placement import SceneError
-from mme_vla.envs.scene.predicates import over
-from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.placement import Draws, SceneError
+from mme_vla.envs.scene.things import distance_xy, over
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stick import back_to_start
+from mme_vla.envs.tasks.families.video import back_to_start
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 GRID = {"easy": 3, "medium": 4, "hard": 5}
 PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}

@@ -1,13 +1,11 @@
 """PickHighlight (Reference): some cubes are briefly underlaid with white; press the button, then pick up just those."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Highlight
-from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_highlight
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
-from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
-from mme_vla.envs.subtasks import SubTask, ordinal
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, Highlight, under
+from mme_vla.envs.scene.objects import Cube, H, build_cube, build_highlight
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.things import any_picked_up, dropped, picked_up, pressed
+from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 

@@ -1,12 +1,11 @@
 """PickXtimes (Counting): put the cube of one colour on the target a number of times, then press the button."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, row, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube, build_disc
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import any_picked_up, dropped_onto, picked_up, pressed
-from mme_vla.envs.subtasks import SubTask, number, ordinal
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, row, tally
+from mme_vla.envs.scene.objects import Cube, H, build_cube, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.scene.things import any_picked_up, dropped_onto, picked_up, pressed
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 

@@ -6,21 +6,18 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.robot.stick_skills import arc
-from mme_vla.envs.scene.cues import Cue, Place, on_table
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Mark, Trace, build_mark
+from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
 from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
-from mme_vla.envs.scene.predicates import over
-from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.scene.things import distance_xy, over
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stick import back_to_start
+from mme_vla.envs.tasks.families.video import back_to_start
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}

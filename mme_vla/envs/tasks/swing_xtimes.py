@@ -1,14 +1,11 @@
 """SwingXtimes (Counting): swing a cube between two targets a number of times, put it down, press the button."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import TALLY_SPACING, Cue, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Mark, build_mark
-from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up, pressed
-from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import SubTask, number, ordinal
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
+from mme_vla.envs.scene.objects import Cube, Disc, H, build_cube, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.scene.things import any_picked_up, distance_xy, dropped, picked_up, pressed
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 

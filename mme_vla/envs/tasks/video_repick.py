@@ -2,27 +2,25 @@
 
 from typing import TYPE_CHECKING
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, row, tally, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import SWAP_STEPS, Swap
-from mme_vla.envs.scene.objects import Cube, H, build_button, build_cube
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import SWAP_STEPS, Cue, Swap, row, sequential_swaps, tally, under
+from mme_vla.envs.scene.objects import Cube, H, build_cube
 from mme_vla.envs.scene.placement import (
     ANCHOR_HALF,
+    Draws,
     Region,
     SceneError,
     draw_button,
     draw_cube,
     rotated_anchors,
-    sequential_swaps,
 )
-from mme_vla.envs.scene.predicates import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
-from mme_vla.envs.subtasks import NO_RECORD, SubTask, number, ordinal
+from mme_vla.envs.scene.things import StaticFor, any_picked_up, dropped, picked_up, pressed, reset_reached
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 SWAPS = {"easy": (1, 2), "medium": (2, 3), "hard": (0, 0)}
 ROUNDS = 5  # of the three colours, in hard episodes

@@ -1,11 +1,9 @@
 """VideoUnmask (Permanence): cubes lie open in the video, containers then cover them; pick up the right container."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import COVER_STEPS, Cover
-from mme_vla.envs.scene.predicates import StaticFor
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.motions import COVER_STEPS, Cover, Cue, under
+from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.scene.things import StaticFor
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (

@@ -1,13 +1,16 @@
 """VideoUnmaskSwap (Permanence): in the video containers cover three cubes and change places; pick up the right one."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import rotated_anchors
-from mme_vla.envs.scene.predicates import StaticFor
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.scene.placement import Draws, rotated_anchors
+from mme_vla.envs.scene.things import StaticFor
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.containers import container_choices, container_picks, hiding_goal
-from mme_vla.envs.tasks.families.unmask_swap import CONTAINERS, UnmaskSwap
+from mme_vla.envs.tasks.families.containers import (
+    CONTAINERS,
+    UnmaskSwap,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 
 
 @register_task

@@ -25,7 +25,7 @@ from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs import metadata
 from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
-from mme_vla.envs.vector.processes import begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.utils.processes import signals_deferred
 

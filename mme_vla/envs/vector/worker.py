@@ -1,9 +1,11 @@
 """One worker process of a `VecEnv`: builds environments, steps them, and hands frames over through shared memory."""
 
+import gc
+import multiprocessing
 import os
 import pickle
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -161,3 +163,32 @@ def end(process: Any) -> None:
         process.kill()
         process.join()
     process.close()
+
+
+PRELOADED = ["mme_vla.envs.task"]
+"""Modules that simulating processes have imported before they begin; settled when the first of them is started."""
+
+
+def simulating_processes() -> Any:
+    """The context of `multiprocessing` in which processes that simulate are started.
+
+    They are forked from one process that has imported the simulator and done nothing else: it holds no GPU and no
+    renderer. These imports take 5 s of CPU time, which every worker would spend otherwise, and every one that replaces
+    a lost worker. The environment variables it passes on are as old as itself, so `begin` renews them.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(PRELOADED)
+    return context
+
+
+def settings() -> dict[str, str]:
+    """The environment variables that a process is to begin with."""
+    return dict(os.environ)
+
+
+def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: Any) -> Any:
+    """First in a process: take the environment variables of the one that asked for it, then do its work."""
+    gc.freeze()  # what a collection does not walk through stays shared between the processes
+    os.environ.clear()
+    os.environ.update(variables)
+    return work(*arguments)

@@ -6,7 +6,7 @@ import numpy as np
 import sapien
 from transforms3d.euler import euler2quat
 
-from mme_vla.envs.scene.objects.shapes import RGB, XY, Shapes, at
+from mme_vla.envs.scene.objects import RGB, XY, Shapes, at
 from mme_vla.envs.scene.things import Thing, pose_of
 
 if TYPE_CHECKING:

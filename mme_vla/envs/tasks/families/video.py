@@ -5,13 +5,12 @@ from typing import TYPE_CHECKING, ClassVar
 
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, under
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Swap
-from mme_vla.envs.scene.objects import Cube, Disc, H, build_button, build_cube, build_disc
-from mme_vla.envs.scene.placement import Avoid, Region, SceneError, draw_button, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import (
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, Swap, under
+from mme_vla.envs.scene.objects import Cube, Disc, H, build_cube, build_disc
+from mme_vla.envs.scene.placement import Avoid, Draws, Region, SceneError, draw_button, draw_cube, draw_disc
+from mme_vla.envs.scene.stage import RESET_QPOS
+from mme_vla.envs.scene.things import (
     StaticFor,
     any_picked_up,
     dropped,
@@ -20,11 +19,30 @@ from mme_vla.envs.scene.predicates import (
     pressed,
     reset_reached,
 )
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
+
+
+def back_to_start(env: Task, steps: int = 30) -> list[SubTask]:
+    """From the video to the execution: the arm goes home, then to where its first approach ended."""
+    return [
+        SubTask(
+            NO_RECORD,
+            done=lambda: env.after_video and reset_reached(env, RESET_QPOS),
+            run=lambda demo: demo.hard_reset(steps),
+            video=True,
+        ),
+        SubTask(
+            NO_RECORD,
+            done=lambda: env.stored_qpos is not None and reset_reached(env, env.stored_qpos),
+            run=lambda demo: demo.hard_reset(qpos=env.stored_qpos),
+            video=True,
+        ),
+    ]
+
 
 CUBES = {"easy": 1, "medium": 3, "hard": 3}
 TARGET_RADIUS = 0.04
