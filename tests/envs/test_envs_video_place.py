@@ -12,7 +12,7 @@ from envs_unmask import make, texts, wait
 
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.tasks.families.video import VideoPlace
+from mme_vla.envs.tasks.families.video_place import VideoPlace
 from mme_vla.envs.tasks.video_place_button import VideoPlaceButton
 from mme_vla.envs.tasks.video_place_order import VideoPlaceOrder
 

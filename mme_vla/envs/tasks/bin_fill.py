@@ -14,6 +14,7 @@ from mme_vla.envs.scene.things import ON_TARGET, any_picked_up, distance_xy, dro
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import press
 
 # Both bounds belong to the range.
 AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
@@ -123,16 +124,7 @@ class BinFill(Task):
             for i in range(self.goal[colour])
             for step in (self._pick(i, self.cubes[colour][i]), self._drop())
         ]
-        press = SubTask(
-            "press the button",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <>",
-            targets=[self.button],
-            choice="c",
-            operation="how many",
-        )
-        return [*steps, press]
+        return [*steps, press(self.button, "press the button", "c", operation="how many")]
 
     def _pick(self, i: int, cube: Cube) -> SubTask:
         return SubTask(

@@ -15,10 +15,11 @@ from mme_vla.envs.scene.articulated import build_peg
 from mme_vla.envs.scene.motions import Cue, Highlight, Mark, build_mark, on_table
 from mme_vla.envs.scene.objects import APERTURE_COLOUR, APERTURE_Z, at, build_aperture_box, build_highlight
 from mme_vla.envs.scene.placement import Draws, SceneError
-from mme_vla.envs.scene.things import StaticFor, Thing, any_picked_up, reset_reached
+from mme_vla.envs.scene.things import StaticFor, Thing, any_picked_up
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import end_video
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -127,12 +128,7 @@ class InsertPeg(Task):
 
     def subtasks(self) -> list[SubTask]:
         between = [
-            SubTask(
-                NO_RECORD,
-                done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
-                run=lambda demo: demo.hard_reset(),
-                video=True,
-            ),
+            end_video(self),
             SubTask(NO_RECORD, StaticFor(self, HOLD_STEPS), lambda demo: demo.hold(HOLD_STEPS), video=True),
         ]
         return [*self._both(video=True), *between, *self._both(video=False)]

@@ -12,7 +12,7 @@ from mme_vla.envs.scene.things import distance_xy, over
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.video import back_to_start
+from mme_vla.envs.tasks.families.stages import end_stick_video
 
 if TYPE_CHECKING:
     from mme_vla.envs.robot.demonstrator import Demonstrator
@@ -90,7 +90,7 @@ class PatternLock(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *back_to_start(self), *self._moves(video=False)]
+        return [approach, *self._moves(video=True), *end_stick_video(self), *self._moves(video=False)]
 
     def _moves(self, video: bool) -> list[SubTask]:
         return [self._move(a, b, video) for a, b in zip(self.path, self.path[1:], strict=False)]
