@@ -45,7 +45,7 @@ _CLOSED = "The environment is closed; make a new one."
 
 @dataclass(frozen=True)
 class EpisodeState:
-    """The state of an episode as its scene and its actions: replaying them restores it, to the last bit on one CPU type.
+    """The state of an episode as its scene and its actions: a replay restores it, to the last bit on one CPU type.
 
     Positions and velocities are not enough: contacts, the solver's last solution and the script's variables belong to
     the state as well. A replay without images takes about two milliseconds a control step. Can be pickled.

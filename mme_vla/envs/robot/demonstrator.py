@@ -1,4 +1,4 @@
-"""What a cube or a peg is shown to suffer: pushing, hooking, grasping by one end, inserting."""
+"""The demonstrator: primitives for the gripper, for cubes and pegs, and for the stick, in one class."""
 
 from typing import Literal
 
@@ -44,10 +44,8 @@ class PegPrimitives(RobotControl):
         """Draw a cube to a goal with a peg that is held by its tail, then let go.
 
         Args:
-            cube: what is moved.
-            goal: where to.
             side: +1 if the gripper passes the cube on the right of the way (the peg reaches to the left), -1 for the
-                other; by default the one that the cube's place asks for.
+                other; by default by the sides of cube and goal.
         """
         if side is None:
             side = 1 if cube.position[1] > goal.position[1] else -1
@@ -67,7 +65,6 @@ class PegPrimitives(RobotControl):
         """Grasp a peg by one of its ends and lift it.
 
         Args:
-            peg: the peg.
             end: `peg.head` or `peg.tail`, or its name.
             flip: hold the hand the other way round.
         """
@@ -86,7 +83,6 @@ class PegPrimitives(RobotControl):
         `insert_peg_fully` makes up for that.
 
         Args:
-            peg: the peg.
             grasped_end: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
@@ -97,13 +93,13 @@ class PegPrimitives(RobotControl):
         flip = head_first != (side > 0)
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
-            # The peg may slip: how it is held is looked at before every motion.
+            # The peg may slip, so the grip is read before every motion.
             grip = free.pose.inv() * self.env.tcp_pose
             inserted = box.pose * grip
             if flip:
-                # The tool is turned where it is, which puts the peg's other end into the box ...
+                # The tool is turned in place, which puts the peg's other end into the box ...
                 inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
-                # ... and only in this case is that synthetic for.
+                # ... and only in this case is that compensated.
                 along += grip.p[0] if head_first and along < 0 else 0.0
             return inserted * sapien.Pose([along, 0, -raised])
 
@@ -118,11 +114,7 @@ class PegPrimitives(RobotControl):
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
-            peg: the peg.
-            grasped_end: the end that is held; the other one goes in.
-            side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
-            box: its hole runs along its x axis, which points to the left.
-            begun: the peg is in the hole already, and only has to continue.
+            begun: the peg is in the hole already; the other arguments are those of `insert_peg`.
         """
         head_first = grasped_end in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
@@ -188,8 +180,7 @@ class StickPrimitives(RobotControl):
         """Move the tip over a target, in a straight line and then once more to be exact.
 
         Args:
-            target: where to.
-            store: remember the joint angles reached, as the place where the execution starts.
+            store: keep the joint angles reached as the start of the execution.
         """
         pose = self.at([*target.position[:2], STICK_Z])
         self.move_to(pose)
@@ -239,9 +230,6 @@ def arc(start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "cou
     t = np.linspace(0, 1, ARC_SAMPLES)[:, None]
     points = (1 - t) ** 2 * a + 2 * t * (1 - t) * control + t**2 * b
     return np.column_stack([points, np.full(ARC_SAMPLES, STICK_Z)])
-
-
-__all__ = ["Demonstrator", "PlanningError"]
 
 
 class Demonstrator(GripperPrimitives, PegPrimitives, StickPrimitives):

@@ -1,4 +1,4 @@
-"""What the gripper is shown to do: pick, place, put down, drop, press, hover."""
+"""Primitives of the gripper: pick, place, put down, drop, press, hover; and the orientations they need."""
 
 from collections.abc import Sequence
 
@@ -69,7 +69,7 @@ def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
     Args:
         mode: `z` closes too high, `xy` beside the object.
         distance: metres, along each axis that is missed.
-        seed: the episode's; draws the direction of `xy`.
+        seed: of the episode; decides the direction of `xy`.
     """
     if mode == "z":
         return np.array([0.0, 0.0, distance])
@@ -107,7 +107,6 @@ class GripperPrimitives(RobotControl):
         """Put what is held on a target, and withdraw.
 
         Args:
-            target: where to.
             z: height of the tool at the release, metres; by default the target's own.
         """
         q = self.env.tcp_pose.q
@@ -140,7 +139,6 @@ class GripperPrimitives(RobotControl):
         """Press a button with closed fingers and let it go.
 
         Args:
-            button: which one.
             hold: first move above it; without, the tool is there already.
             close: close the fingers first; without, they are closed already and time is short.
         """

@@ -34,7 +34,6 @@ def plan_screw(
     target_pose: sapien.Pose,
     velocity_limit: float = 0.9,
     acceleration_limit: float = 0.9,
-    dt: float = CONTROL_STEP,
 ) -> np.ndarray | None:
     """Move the tool to a pose along one screw: rotation about, and translation along, a single axis.
 
@@ -45,9 +44,7 @@ def plan_screw(
         arm: the kinematic model.
         qpos: present joint angles, [7] or longer.
         target_pose: of the tool centre point in the world.
-        velocity_limit: of every joint, radians per second.
-        acceleration_limit: of every joint, radians per second squared.
-        dt: seconds between two rows.
+        velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
     Returns:
         Joint targets [n, 7], the first being the present angles; None where a joint limit is in the way, the motion
@@ -80,7 +77,7 @@ def plan_screw(
         path.append(joints)
         if len(path) > MOST_STEPS:
             return None
-    return time_optimal(np.array(path), velocity_limit, acceleration_limit, dt)
+    return time_optimal(np.array(path), velocity_limit, acceleration_limit)
 
 
 def plan_free(
@@ -89,41 +86,31 @@ def plan_free(
     target_pose: sapien.Pose,
     velocity_limit: float = 0.9,
     acceleration_limit: float = 0.9,
-    dt: float = CONTROL_STEP,
     seed: int = 0,
 ) -> np.ndarray | None:
-    """Move the tool to a pose along whatever joint path sampling finds (RRT*); the fallback of `plan_screw`.
+    """Move the tool to a pose along a joint path found by sampling (RRT*); the fallback of `plan_screw`.
 
     Args:
-        arm: the kinematic model.
-        qpos: present joint angles, [7] or longer.
-        target_pose: of the tool centre point in the world.
-        velocity_limit: of every joint, radians per second.
-        acceleration_limit: of every joint, radians per second squared.
-        dt: seconds between two rows.
-        seed: of the samples.
+        seed: of the samples; the others as in `plan_screw`.
 
     Returns:
-        Joint targets [n, 7], the first being the present angles; None where the pose is out of reach or no path was
-        found.
+        Joint targets [n, 7], the first being the present angles; None where the pose is out of reach or no path exists.
     """
     start = np.asarray(qpos, np.float64)[:ARM_JOINTS]
     goal = arm.ik(target_pose, start)
     path = None if goal is None else sample_path(arm, start, goal, seed)
-    return None if path is None else time_optimal(path, velocity_limit, acceleration_limit, dt)
+    return None if path is None else time_optimal(path, velocity_limit, acceleration_limit)
 
 
-def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: float, dt: float) -> np.ndarray | None:
+def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: float) -> np.ndarray | None:
     """The fastest passage through joint waypoints, sampled.
 
     A cubic spline through the waypoints, which are spaced evenly in its parameter, is given constant accelerations
-    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / dt) instants from start to end.
+    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / `CONTROL_STEP`) instants from start to end.
 
     Args:
         path: joint waypoints [k, 7], k at least 2.
-        velocity_limit: of every joint, radians per second.
-        acceleration_limit: of every joint, radians per second squared.
-        dt: seconds.
+        velocity_limit, acceleration_limit: of every joint, rad/s and rad/s².
 
     Returns:
         Joint targets [n, 7], or None where no passage within the limits exists.
@@ -137,7 +124,7 @@ def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: fl
     passage = algorithm.TOPPRA(limits, spline, parametrizer="ParametrizeConstAccel").compute_trajectory()
     if passage is None:
         return None
-    return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / dt))))
+    return np.asarray(passage(np.linspace(0, passage.duration, int(passage.duration / CONTROL_STEP))))
 
 
 def twist_of(transform: np.ndarray) -> np.ndarray | None:
@@ -172,11 +159,9 @@ COLUMN_RADIUS, COLUMN_HEIGHT = 0.15, 0.45
 
 
 class Obstacles:
-    """Tells whether the arm is clear of the table and of itself.
+    """Whether the arm is clear of the table and of the robot's own column.
 
-    Args:
-        arm: the kinematic model.
-        ends: configurations [7] that are allowed whatever they touch: start and goal.
+    The tool may go as low as in `ends`, the start and goal configurations [7].
     """
 
     def __init__(self, arm: Arm, ends: list[np.ndarray]) -> None:
@@ -199,16 +184,14 @@ class Obstacles:
 def sample_path(arm: Arm, start: np.ndarray, goal: np.ndarray, seed: int) -> np.ndarray | None:
     """Joint waypoints [k, 7] from start to goal: the straight line if it is free, else what RRT* finds.
 
-    Karaman and Frazzoli 2011: a random tree whose nodes hang on the cheapest free neighbour and are hung up again
-    where a newer node offers a shorter way.
+    Karaman and Frazzoli 2011: each node of a random tree is connected to the cheapest free neighbour, and
+    reconnected where a newer node offers a shorter way.
 
     Args:
-        arm: the kinematic model.
-        start: joint angles [7]. goal: likewise.
-        seed: of the samples.
+        start, goal: joint angles [7]. seed: of the samples.
 
     Returns:
-        The path, or None when the rounds are used up.
+        The path, or None after `ROUNDS` samples.
     """
     obstacles = Obstacles(arm, [start, goal])
     if obstacles.clear_between(start, goal):

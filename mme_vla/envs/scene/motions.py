@@ -110,7 +110,7 @@ class Swap:
 
 
 def sequential_swaps(initiators: Sequence[Thing], group: Sequence[Thing], start: int) -> list[Swap]:
-    """One swap after another, the first at step `start`; the partner is the nearest object at the beginning of a swap."""
+    """One swap after another, the first at step `start`; the partner is the nearest object when a swap begins."""
     return [Swap(thing, group, start + i * SWAP_STEPS) for i, thing in enumerate(initiators)]
 
 

@@ -1,4 +1,8 @@
-"""Objects without joints: cubes, targets, containers, the board with a hole, the box with an aperture, obstacles."""
+"""Objects without joints, and how each is built; without a renderer they have no visual shapes.
+
+`env` is the task whose scene an object goes into, `name` is unique in it, `xy` is the centre on the table. Lengths are
+in metres, angles in radians, colours RGB in 0 … 1.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -136,14 +140,7 @@ APERTURE_COLOUR: RGB = tuple((np.array([0xFF, 0xD2, 0x89]) / 255) ** 2.2)
 
 
 class Cube(Thing):
-    """A cube of one colour.
-
-    Args:
-        name: unique in the scene.
-        entity: its actor.
-        colour: name of the colour, or RGB in 0 … 1.
-        half_size: half its edge, metres.
-    """
+    """A cube of one colour, which is a name or RGB; `half_size` is half its edge."""
 
     def __init__(self, name: str, entity: Any, colour: str | RGB, half_size: float = H) -> None:
         super().__init__(name, entity)
@@ -151,13 +148,7 @@ class Cube(Thing):
 
 
 class Disc(Thing):
-    """A flat round target; its axis is the actor's x axis.
-
-    Args:
-        name: unique in the scene.
-        entity: its actor.
-        radius: metres.
-    """
+    """A flat round target; its axis is the actor's x axis."""
 
     def __init__(self, name: str, entity: Any, radius: float) -> None:
         super().__init__(name, entity)
@@ -202,15 +193,9 @@ def build_disc(
     xy: XY,
     z: float | None = None,
 ) -> Disc:
-    """A target: five rings, of one of `TARGET_COLOURS` and white by turns, that nothing can touch.
+    """A target without collision: five rings, alternately of a colour of `TARGET_COLOURS` and white.
 
     Args:
-        env: whose scene it goes into.
-        name: unique in the scene.
-        radius: metres.
-        thickness: metres.
-        colour: key of `TARGET_COLOURS`.
-        xy: centre on the table.
         z: height of the centre; by default the thickness.
     """
     pose = sapien.Pose([float(xy[0]), float(xy[1]), thickness if z is None else z], UPRIGHT)
@@ -221,16 +206,7 @@ def build_disc(
 def build_highlight(
     env: "Stage", name: str, radius: float, half_length: float, colour: RGB = WHITE, rings: bool = False
 ) -> Disc:
-    """A disc that marks something for a while; it waits below the table.
-
-    Args:
-        env: whose scene it goes into.
-        name: unique in the scene.
-        radius: metres.
-        half_length: half its thickness, metres.
-        colour: RGB in 0 … 1.
-        rings: alternate with white like a target.
-    """
+    """A disc that marks something for a while; it waits below the table. With `rings` it looks like a target."""
     shapes = Shapes(env)
     shapes = shapes.rings(radius, half_length, colour) if rings else shapes.cylinder(radius, half_length, colour)
     return Disc(name, shapes.build(name, sapien.Pose(BELOW_TABLE, UPRIGHT), kinematic=True), radius)
@@ -282,13 +258,7 @@ def build_aperture_box(
     """A box with a square hole along its x axis, standing on the table.
 
     Args:
-        env: whose scene it goes into.
-        xy: centre on the table.
-        yaw: radians.
-        inner: half the width of the hole, metres.
-        outer: half the width of the box, metres.
-        half_depth: half its length along the hole, metres.
-        name: unique in the scene.
+        inner: half the width of the hole. outer: half the width of the box. half_depth: half its length along the hole.
     """
     wall = (outer - inner) / 2
     shapes = Shapes(env)

@@ -1,8 +1,9 @@
-"""Random places on the table: draws are tried until an object keeps clear of those that are there already.
+"""Random numbers of a scene, and random places on the table that keep clear of the objects there.
 
-The tests are the official benchmark's, with their peculiarities, so that the same seed gives the same scene: an
-obstacle is the shadow of the first two axes of its bounding box, whichever these are, and what counts as the gap
-depends on what is placed.
+The same seed samples the same layout as the official benchmark. All layout randomness comes from CPU torch generators
+seeded with the episode's seed; the order of the samples is part of the benchmark's definition. So are the tests for a
+free place: an obstacle is the shadow of the first two axes of its bounding box, whichever these are, and what counts as
+the gap depends on what is placed.
 """
 
 import math
@@ -23,11 +24,7 @@ from mme_vla.envs.scene.things import Thing
 
 
 class Draws:
-    """One generator, with the few kinds of draws that scenes are made of.
-
-    Args:
-        seed: the episode's seed.
-    """
+    """One generator, with the few kinds of samples that scenes need."""
 
     def __init__(self, seed: int) -> None:
         self._generator = torch.Generator().manual_seed(seed)
@@ -79,12 +76,7 @@ class SceneError(RuntimeError):
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle on the table along its axes.
-
-    Args:
-        centre: metres.
-        half: half its width; one number, or one per axis.
-    """
+    """A rectangle along the table's axes; `half` is half its width, one number or one per axis; metres."""
 
     centre: tuple[float, float]
     half: float | tuple[float, float]
@@ -101,10 +93,7 @@ class Region:
 class Box2D:
     """A rectangle on the table in any direction; an axis of length zero makes it a line.
 
-    Args:
-        centre: [2], metres.
-        axes: [2, 2], one direction a row.
-        half: half its width along each axis [2], metres.
+    centre: [2]. axes: [2, 2], one direction a row. half: half its width along each axis [2]; metres.
     """
 
     centre: np.ndarray
@@ -174,7 +163,7 @@ def _bounds(thing: Thing) -> Box2D | None:
 
 @lru_cache(maxsize=256)
 def _smallest_box(vertices: bytes, faces: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """Its place [4, 4] and widths [3]; an object is asked for again by each that is placed after it."""
+    """Pose [4, 4] and widths [3]; cached, since an object is an obstacle for all that are placed after it."""
     mesh = Trimesh(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3), process=False)
     box = mesh.bounding_box_oriented.primitive
     return np.array(box.transform), np.array(box.extents)
@@ -198,7 +187,6 @@ def draw_cube(
     """Draw the place and the turn of a cube; targets are no obstacles.
 
     Args:
-        draws: the scene's random numbers.
         region: the cube keeps inside it, as if it were not turned.
         avoid: what it keeps clear of.
         gap: metres.
@@ -224,7 +212,6 @@ def draw_disc(
     """Draw the centre of a target [2]; None when 256 trials have failed.
 
     Args:
-        draws: the scene's random numbers.
         region: the target lies wholly inside it.
         radius: metres.
         avoid: what it keeps clear of; other targets are circles.
@@ -246,7 +233,6 @@ def draw_container(
     """Draw the place of a container and then its turn, 0 … 90°; the gap to other objects counts twice.
 
     Args:
-        draws: the scene's random numbers.
         region: the container lies inside it.
         avoid: what it keeps clear of.
         gap: metres.
