@@ -12,7 +12,7 @@ PLACES = ((-0.1, 0.15), (-0.1, -0.15))  # about where they stand, metres from th
 
 @register("task", "TwoButtons")
 class TwoButtons(Task):
-    """Which button comes first is drawn from the seed, and said in the goal."""
+    """The seed decides which button comes first; the goal names it."""
 
     def build(self, draws: Draws) -> None:
         spots = [draw_button(draws, place, (0.1, 0.1)) for place in PLACES]

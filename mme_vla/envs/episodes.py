@@ -44,7 +44,7 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     if isinstance(episodes, int) and not isinstance(episodes, bool):
         if not 1 <= episodes <= count:
             alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
-            raise UserError(f"episodes={episodes} asks for the first {episodes}; {what} has {count}.{alone}")
+            raise UserError(f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}")
         return list(range(episodes))
     ranges = spans(episodes, "episodes", GRAMMAR)
     for span in ranges:

@@ -315,8 +315,8 @@ class RoboMMEEnv(gymnasium.Env):
     def _step_control(self, action: np.ndarray) -> None:
         task, run = self.task, self._require_run()
         run.count += not run.in_video
-        # A frame has the text of the sub-task in which its step was made, not of the one its evaluation leads to. In the
-        # video it has the text of the demonstrated sub-task where one of the two has none.
+        # A frame has the text of the sub-task in which its step was made, not of the next one. In the video it has the
+        # text of the demonstrated sub-task where one of the two has none.
         run.displayed, demonstrated = task.progress.displayed, task.progress.demonstrated
         if run.in_video and NO_RECORD in (run.displayed.text, demonstrated.text):
             run.displayed = demonstrated

@@ -54,8 +54,7 @@ def make_env(
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
             share for each sub-task of the execution as it is done, 1 in all.
         env: `mme_vla`, or `official` for the installed package `robomme`.
-        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` asks for; an
-            environment alone has no memory to show them to.
+        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
             `include_available_multi_choices`, `include_maniskill_obs`.
@@ -86,14 +85,14 @@ def make_env(
 
 
 def check_sessions(split: str, sessions: int) -> None:
-    """Refuse a split with sessions before each episode where nobody shows them."""
+    """Refuse a split with sessions before each episode unless the caller shows them."""
     variant = read_variant(split)
     required = 0 if variant is None else variant.sessions
     if required != sessions:
         raise UserError(
             f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
-            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; whoever shows them "
-            "otherwise says so: make_env(…, sessions=2)."
+            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
+            "callers declare them: make_env(…, sessions=2)."
         )
 
 

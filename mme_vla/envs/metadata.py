@@ -45,7 +45,7 @@ DIALS: dict[str, tuple[str, ...]] = {
 """Dial → the tasks that have it.
 
 count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps more between
-what is shown and the execution. path: discs more on the way. distractors: more objects that are not asked for.
+what is shown and the execution. path: discs more on the way. distractors: more objects that are not targets.
 """
 SESSIONS = "sessions"
 """The dial that turns no scene: so many unrelated episodes come before one's own, in the same memory. All tasks have
@@ -106,7 +106,7 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
 FURTHER, FURTHER_EPISODES = "further", 100
-"""Episodes that continue where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
+"""Episodes that continue where the test split's rule ends, for tests on new scenes; no split either."""
 _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
 """Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""

@@ -1,4 +1,4 @@
-"""What a policy sees of a task: robot state and camera images of one frame, and only what was asked for.
+"""The frames of a task: robot state and the requested camera images.
 
 A frame is a dict with one value per observation key; the interface hands out lists of them, as the benchmark does.
 """
@@ -25,12 +25,12 @@ NOTHING: Container[int] = frozenset()
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What of an episode is drawn; all else is simulated without a look.
+    """The frames of an episode that are rendered: a control step costs milliseconds, an image of it some fifty.
 
     frames: camera (`front`, `wrist`) → numbers of the frames it shows, counted from the reset on, those of the
         conditioning video first. A `range` may reach beyond the episode's end.
     now: the cameras that show, whatever its number, the newest frame of each call of `reset` and `step`.
-    grounded: whether texts with pixels are wanted, for which the front camera looks where a sub-task begins.
+    grounded: whether texts need pixels, for which the front camera renders where a sub-task begins.
     """
 
     frames: Mapping[str, Container[int]] = field(default_factory=dict)
@@ -141,7 +141,7 @@ class Observer:
         self._eef = np.concatenate([pose.p, self._angles.follow(pose.q)]).astype(np.float64)
 
     def frame(self, info: dict[str, Any], cameras: Collection[str] = tuple(SENSORS)) -> dict[str, Any]:
-        """The present moment; `info` is what the task has just evaluated.
+        """The present frame; `info` is what the task has just evaluated.
 
         Args:
             cameras: those that take an image; the others' are None.
@@ -158,11 +158,11 @@ class Observer:
             self._taken |= set(SENSORS)
         elif self.render:
             self._render_cameras(cameras)
-        for name, camera in SENSORS.items():
+        for name in SENSORS:
             if self.render:
                 depth = getattr(self.include, f"{name}_depth")
                 is_rendered = name in cameras
-                images = self._read(camera, rgb=True, depth=depth) if is_rendered else {}
+                images = read_images(self.task, name, rgb=True, depth=depth) if is_rendered else {}
                 frame[f"{name}_rgb"] = images.get("rgb")
                 if depth:
                     frame[f"{name}_depth"] = images["depth"].astype(np.int16) if is_rendered else None
@@ -174,31 +174,35 @@ class Observer:
         """Object ids [256, 256] of the present front image, which is taken if the frame has none."""
         if "front" not in self._taken:
             self._render_cameras(["front"])
-        return self._read(SENSORS["front"], segmentation=True)["segmentation"][..., 0]
+        return read_images(self.task, "front", segmentation=True)["segmentation"][..., 0]
 
     def extrinsic(self, name: str) -> np.ndarray:
         """World to camera in OpenCV's axes, float32 [3, 4], of `front` or `wrist`."""
-        return front_extrinsic() if name == "front" else extrinsic_of(self._wrist_pose())
-
-    def _wrist_pose(self) -> "sapien.Pose":
-        return self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose
+        if name == "front":
+            return front_extrinsic()
+        return extrinsic_of(self.task.agent.robot.links_map["camera_link"]._objs[0].entity_pose)
 
     def _render_cameras(self, cameras: Collection[str]) -> None:
         cameras = [name for name in cameras if name in SENSORS]
-        if not cameras:
-            return
-        scene = self.task.scene
-        scene.update_render(update_sensors=True, update_human_render_cameras=False)
-        for name in cameras:
-            scene.sensors[SENSORS[name]].capture()
+        capture(self.task, cameras)
         self._taken |= set(cameras)
 
-    def _read(
-        self, camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
-    ) -> dict[str, np.ndarray]:
-        sensor = self.task.scene.sensors[camera]
-        images = sensor.get_obs(rgb=rgb, depth=depth, position=False, segmentation=segmentation)
-        return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
+
+def capture(task: "Task", cameras: Collection[str]) -> None:
+    """Render the scene by these cameras of `SENSORS`."""
+    if cameras:
+        task.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+    for name in cameras:
+        task.scene.sensors[SENSORS[name]].capture()
+
+
+def read_images(
+    task: "Task", camera: str, rgb: bool = False, depth: bool = False, segmentation: bool = False
+) -> dict[str, np.ndarray]:
+    """What a camera last captured: `rgb`, `depth` and `segmentation`, each [256, 256, channels]."""
+    sensor = task.scene.sensors[SENSORS[camera]]
+    images = sensor.get_obs(rgb=rgb, depth=depth, position=False, segmentation=segmentation)
+    return {name: np.ascontiguousarray(image[0].cpu().numpy()) for name, image in images.items()}
 
 
 def extrinsic_of(pose: "sapien.Pose") -> np.ndarray:

@@ -134,7 +134,7 @@ class MultiChoice(ActionSpace):
         label = action["choice"].strip().lower()
         choices = {choice.label: choice for choice in control.task.choices()}
         if label not in choices:
-            # The benchmark answers an unknown letter with no step at all; say so instead of leaving it a riddle.
+            # As in the benchmark, an unknown letter makes no step.
             warnings.warn(f"Unknown choice {action['choice']!r}: no step. {did_you_mean(label, choices)}", stacklevel=2)
             return
         choice = choices[label]

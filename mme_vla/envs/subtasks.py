@@ -33,12 +33,12 @@ NO_RECORD = "NO RECORD"
 """Text of the stretches that belong to no sub-task: their frames are neither stored nor shown."""
 COMPLETED = "All tasks completed"
 OPERATIONS = ("which", "where", "how many", "order", "how")
-"""What a sub-task can ask of memory."""
+"""What a sub-task can require of memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class SubTask:
-    """One step of an episode: what is said, when it is done, when it has failed, and how it is demonstrated."""
+    """One step of an episode: its text, when it is done, when it has failed, and how it is demonstrated."""
 
     text: str
     """Without coordinates."""
@@ -49,7 +49,7 @@ class SubTask:
     """With a `<>` for each target's pixel; empty: the same as `text`."""
     failed: Callable[[], bool] | None = None
     targets: Sequence["Thing"] = ()
-    """The objects whose pixels fill the `<>`, in order; several may stand for one place if there is one `<>`."""
+    """The objects whose pixels fill the `<>`, in order; a single `<>` takes all of them together."""
     choice: str = ""
     """Letter of the multi-choice option that does this; empty where there is none."""
     video: bool = False
@@ -57,7 +57,7 @@ class SubTask:
     pick: bool = False
     """A grasp from the table: what a recovery demonstration may fail once."""
     operation: str | Callable[[], str] = ""
-    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. Asked at the moment of the failure."""
+    """Of `OPERATIONS`, what is mistaken where this fails; empty for a motion. A function is called at the failure."""
 
     @property
     def grounded_text(self) -> str:
@@ -162,7 +162,7 @@ class ProcessScore:
     done, of: sub-tasks of the execution that are done, and how many there are.
     broke: `wrong`, where the environment saw the wrong thing done; `stuck`, where the time ran out; empty on success.
     operation: what the wrong thing was a mistake of: one of `OPERATIONS`, or a motion (a slip, or another object than
-        the goal names). Of who is stuck nobody can tell whether they forgot or failed; then it is empty.
+        the goal names). Empty for `stuck`, whose cause is unknown.
     subtask: the text of the one that was not done.
     """
 

@@ -26,7 +26,7 @@ def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["Sub
     """Perform the sub-tasks of a task that has just been reset, evaluating before and after each one.
 
     The demonstrator's view of where the episode stands, `env.progress.planned`, moves at these evaluations only. In a
-    recovery demonstration the drawn pick of the execution fails once first.
+    recovery demonstration the sampled pick of the execution fails once first.
 
     Args:
         env: the task; while this runs, `env.recording` is set.
@@ -111,8 +111,8 @@ class Recorder:
     Args:
         task: created with the observation mode `none`.
         render: take images; without them frames hold states, actions and plain texts only.
-        drawing: which stored steps are drawn, counted from 0, by which cameras; `obs` of the others has no images.
-            By default all. Where a text needs a pixel, the front camera looks all the same.
+        render_request: which stored steps, counted from 0, are rendered by which cameras; by default all. Where a text
+            needs a pixel, the front camera renders in any case.
         on_step: takes each stored step; by default they are collected in `Recording.frames`.
     """
 

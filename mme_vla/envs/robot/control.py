@@ -55,7 +55,7 @@ class RobotControl:
         self.left = 0
         """Steps that are known to follow the present one: those left of a motion or a grip, and `and_then`."""
         self.and_then = 0
-        """Steps that follow the motion under way, where who asked for it knows of any."""
+        """Steps that the caller will add to the motion under way."""
         self._step = step
         self._on_waypoint = on_waypoint
 

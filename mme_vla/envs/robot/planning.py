@@ -106,7 +106,7 @@ def time_optimal(path: np.ndarray, velocity_limit: float, acceleration_limit: fl
     """The fastest passage through joint waypoints, sampled.
 
     A cubic spline through the waypoints, which are spaced evenly in its parameter, is given constant accelerations
-    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / `CONTROL_STEP`) instants from start to end.
+    between grid points (TOPP-RA, Pham and Pham 2018) and sampled at floor(duration / `CONTROL_STEP`) times.
 
     Args:
         path: joint waypoints [k, 7], k at least 2.
@@ -152,7 +152,7 @@ REACH = 0.5
 """Longest edge that the tree grows, radians."""
 GOAL_BIAS = 0.2
 ROUNDS = 1500
-"""Samples drawn in one attempt; a number, not a time, so that the same seed gives the same path."""
+"""Samples in one attempt; a number, not a time, so that the same seed gives the same path."""
 WRIST_CLEARANCE = 0.03
 COLUMN_RADIUS, COLUMN_HEIGHT = 0.15, 0.45
 """The robot's base and shoulder as a cylinder that the hand keeps out of, metres."""

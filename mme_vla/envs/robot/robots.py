@@ -1,7 +1,7 @@
 """The two robots of the benchmark: a Panda with a gripper and a Panda with a stick, both with a camera on the hand.
 
 The stock simulator describes both; here the wrist camera gets the benchmark's size, and the stick robot, which has no
-camera in stock, gets the mount of the gripper robot. Robots are also described without anything to look at, so that
+camera in stock, gets the mount of the gripper robot. Robots are also described without visual shapes, so that
 physics can run where there is no renderer, and the wrist camera's own body with no more detail than shows.
 """
 

@@ -201,7 +201,7 @@ class Trace:
             dot.move_to(sapien.Pose(BELOW_TABLE))
 
     def update(self, k: int) -> None:
-        """Draw the dot of step `k`; it takes the place of the one drawn 40 steps before."""
+        """Place the dot of step `k`; it replaces that of 40 steps before."""
         x, y, z = self._env.tcp_pose.p
         place = (x, y, self.HEIGHT) if z < self.BELOW else BELOW_TABLE
         self._dots[k % self.STEPS].move_to(sapien.Pose(place))
@@ -213,7 +213,7 @@ CUE_RADIUS, CUE_HALF_LENGTH = 0.06, 0.001
 CUE_HEIGHT = 0.0015  # metres above the table: above it, and below what lies on it
 CUE_COLOURS: dict[str, RGB] = {**COLOURS, "white": WHITE, "yellow": (1.0, 0.8, 0.0)}
 TALLY_X, TALLY_RADIUS, TALLY_SPACING = 0.34, 0.015, 0.045
-"""Of the row of a tally: nearer to the front camera than anything that is drawn or moved; metres."""
+"""Of the row of a tally: nearer to the front camera than any other object; metres."""
 
 
 @dataclass(frozen=True)

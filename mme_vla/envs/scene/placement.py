@@ -34,11 +34,11 @@ class Draws:
         return torch.rand(1, generator=self._generator).item()
 
     def uniforms(self, n: int) -> Tensor:
-        """`n` numbers in [0, 1) drawn in one call, float32 [n]; not the same stream as `n` single draws."""
+        """`n` numbers in [0, 1) in one call, float32 [n]; not the same stream as `n` single samples."""
         return torch.rand(n, generator=self._generator)
 
     def between(self, low: float, high: float) -> float:
-        """One number in [low, high), as torch's in-place `uniform_` draws it."""
+        """One number in [low, high), as torch's in-place `uniform_` gives it."""
         return torch.empty(1).uniform_(low, high, generator=self._generator).item()
 
     def integer(self, low: int, high: int) -> int:
@@ -82,7 +82,7 @@ class Region:
     half: float | tuple[float, float]
 
     def place(self, draws: Draws, margin: float) -> np.ndarray:
-        """Draw a point that keeps `margin` from the edges [2]; x is drawn first."""
+        """Sample a point that keeps `margin` from the edges [2]; x comes first."""
         half = self.half if isinstance(self.half, tuple) else (self.half, self.half)
         low = [c - h + margin for c, h in zip(self.centre, half, strict=True)]
         high = [c + h - margin for c, h in zip(self.centre, half, strict=True)]
@@ -184,13 +184,13 @@ def board_boxes(board: Board) -> list[Box2D]:
 def draw_cube(
     draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005, yaw: bool = True, half: float = H
 ) -> tuple[np.ndarray, float] | None:
-    """Draw the place and the turn of a cube; targets are no obstacles.
+    """Sample the position and the yaw of a cube; targets are no obstacles.
 
     Args:
         region: the cube keeps inside it, as if it were not turned.
         avoid: what it keeps clear of.
         gap: metres.
-        yaw: draw a turn too; otherwise the cube stands along the axes.
+        yaw: sample a yaw too; otherwise the cube is aligned with the axes.
         half: half its edge, metres.
 
     Returns:
@@ -209,7 +209,7 @@ def draw_cube(
 def draw_disc(
     draws: Draws, region: Region, radius: float, avoid: Sequence[Avoid] = (), gap: float = 0.005
 ) -> np.ndarray | None:
-    """Draw the centre of a target [2]; None when 256 trials have failed.
+    """Sample the centre of a target [2]; None when 256 trials have failed.
 
     Args:
         region: the target lies wholly inside it.
@@ -230,7 +230,7 @@ def draw_disc(
 def draw_container(
     draws: Draws, region: Region, avoid: Sequence[Avoid] = (), gap: float = 0.005
 ) -> tuple[np.ndarray, float] | None:
-    """Draw the place of a container and then its turn, 0 … 90°; the gap to other objects counts twice.
+    """Sample the position of a container and then its yaw, 0 … 90°; the gap to other objects counts twice.
 
     Args:
         region: the container lies inside it.
@@ -251,7 +251,7 @@ def draw_container(
 def draw_button(
     draws: Draws, centre: tuple[float, float], range: tuple[float, float] = (0.1, 0.4)
 ) -> tuple[float, float]:
-    """Draw the centre of a button in a rectangle of the given widths, metres."""
+    """Sample the centre of a button in a rectangle of these widths, metres."""
     x, y = (draws.uniforms(2) - 0.5).tolist()
     return centre[0] + x * range[0], centre[1] + y * range[1]
 
@@ -282,7 +282,7 @@ SHIFT = 0.1
 
 def rotated_anchors(draws: Draws, count: int) -> list[Point]:
     """Three anchors in a triangle or on a line, or four in a square, rotated about the table's middle."""
-    on_line = draws.integer(0, 2)  # drawn for four anchors, too
+    on_line = draws.integer(0, 2)  # sampled for four anchors, too
     angle = draws.uniform() * ANGLE_RANGE
     triangle = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]
     line = [(0.0, -0.15), (0.0, 0.15), (0.0, 0.0)]

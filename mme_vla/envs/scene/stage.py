@@ -36,7 +36,7 @@ class Stage(BaseEnv):
     spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
     """From where, and to where, the camera for people looks; no policy sees its images."""
 
-    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the cameras' settings that were asked for
+    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the requested camera settings
 
     def __init__(
         self,

@@ -120,7 +120,7 @@ def any_picked_up(env: "Task", things: Iterable[Thing]) -> bool:
 
 
 def container_picked_up(container: Thing) -> bool:
-    """A container is lifted high, whoever holds it."""
+    """A container is lifted high."""
     return container.position[2] > CONTAINER_PICKED_UP_Z
 
 
@@ -137,7 +137,7 @@ def dropped(env: "Task", thing: Thing) -> bool:
 
 
 def dropped_onto(env: "Task", thing: Thing, target: Thing) -> bool:
-    """The object was let continue the target."""
+    """The object was released on the target."""
     return distance_xy(thing.position, target.position) <= ON_TARGET and dropped(env, thing)
 
 

@@ -33,8 +33,8 @@ INSERTED = 0.05
 DISPLAY_STEPS = 20  # how long the box shows an insertion
 HOLD_STEPS = 100
 OPEN_FROM_BOX, OPEN_FROM_PEG = 0.18, 0.13
-"""How far from the box and from other pegs the hand has room around a peg, metres."""
-SIDEWAYS = -0.4  # cosine between the way from a near box and the way a peg may be drawn: a little past sideways
+"""Free distance that the hand needs around a peg: to the box, to other pegs; metres."""
+SIDEWAYS = -0.4  # cosine between the way from a near box and the way a peg may be pulled: a little past sideways
 WORKSPACE = (0.4, 0.72)  # nearest and farthest from the robot's base that a peg is moved to, metres
 FLUNG = 0.05  # from its place in one step, metres
 MARK = (0.015, 0.055)  # radius and half length of the disc on the box
@@ -42,7 +42,7 @@ MARK = (0.015, 0.055)  # radius and half length of the disc on the box
 
 @register_task
 class InsertPeg(Task):
-    """The first peg is the one; places are drawn per episode and the difficulty changes nothing."""
+    """The first peg is the target; positions are sampled per episode, and the difficulty has no effect."""
 
     shared_draws = True
 
@@ -211,7 +211,7 @@ class InsertPeg(Task):
         angles, lengths = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.arange(0.04, 0.4, 0.02)
         ways = [length * np.array([np.cos(angle), np.sin(angle)]) for length in lengths for angle in angles]
         away = middle - self.box.position[:2]
-        # A peg beside the box is not drawn through it; one that is only far away may come nearer.
+        # A peg beside the box is not pulled through it; one that is only far away may come nearer.
         beside = np.linalg.norm(away) < OPEN_FROM_BOX
         most = SIDEWAYS * np.linalg.norm(away)
         open_ways = (w for w in ways if (not beside or w @ away >= most * np.linalg.norm(w)) and is_open(middle + w))

@@ -31,7 +31,7 @@ class PickXtimes(Task):
     def build(self, draws: Draws) -> None:
         self.button = self.add(build_button(self, draw_button(draws, (-0.2, 0.0))))
         colours = [COLOURS[i] for i in draws.permutation(3)][: CUBES[self.difficulty]]
-        draws.integer(0, 3)  # drawn, and not used, in the official scene
+        draws.integer(0, 3)  # part of the official stream, without effect
         self.cubes: list[Cube] = []
         for colour in colours:
             self.cubes.append(add_cube(self, draws, f"cube_{colour}", colour, TABLE, [self.button, *self.cubes]))

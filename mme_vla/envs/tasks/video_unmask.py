@@ -14,7 +14,7 @@ from mme_vla.envs.tasks.families.containers import (
 )
 from mme_vla.envs.tasks.families.stages import wait
 
-CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # asked for; in hard episodes as many as fit
+CONTAINERS = {"easy": 3, "medium": 5, "hard": 15}  # in hard episodes as many as fit
 PICKS = {"easy": 1, "medium": 1, "hard": 2}
 
 

@@ -151,7 +151,7 @@ class VecEnv:
         return bool(self._lost) or any(worker.running for worker in self._workers)
 
     def start_next(self, worker: int) -> Job | None:
-        """Let a worker begin the next episode that nobody has begun; None when there is none left."""
+        """Let a worker begin the next episode; None when there is none left."""
         self._idle(worker)
         if not self.jobs:
             return None
@@ -207,7 +207,7 @@ class VecEnv:
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
-                # A worker that waits to hand over a piece takes this for the answer, and then finds the pipe closed.
+                # A worker that waits to send a piece takes this for the acknowledgement, then the pipe is closed.
                 state.connection.close()
             except OSError:
                 pass  # it is gone already

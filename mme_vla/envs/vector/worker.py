@@ -20,7 +20,7 @@ FRAMES_PER_BLOCK = 8
 BLOCK_BYTES = FRAMES_PER_BLOCK * 2 * 256 * 256 * 3
 """Shared memory of one worker: long videos are handed over in pieces of this size."""
 
-# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any answer. RESULT: the
+# Messages from a worker. PIECE: the arrays described lie in the block, and the worker waits for any reply. RESULT: the
 # outcome of a command. FAILURE: the command raised. LOST: it raised, and the process is of no further use.
 PIECE, RESULT, FAILURE, LOST = "piece", "result", "failure", "lost"
 # Commands to a worker.
@@ -187,7 +187,7 @@ def settings() -> dict[str, str]:
 
 
 def begin(variables: Mapping[str, str], work: Callable[..., Any], *arguments: Any) -> Any:
-    """First in a process: take the environment variables of the one that asked for it, then do its work."""
+    """Take the environment variables of the process that started this one, then do its work."""
     gc.freeze()  # what a collection does not walk through stays shared between the processes
     os.environ.clear()
     os.environ.update(variables)

@@ -67,7 +67,7 @@ class VideoPlace(Task):
 
     @abstractmethod
     def draw_script(self, draws: Draws) -> None:
-        """Draw what the video shows and what is asked for."""
+        """Sample what the video shows and where the cube belongs."""
 
     @abstractmethod
     def visits(self) -> list[SubTask]:
