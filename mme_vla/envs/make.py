@@ -47,8 +47,8 @@ def make_env(
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
-        recovery: `z` or `xy`: draw what recovery demonstrations draw in addition, as train episodes 0-5 were recorded
-            (it changes the order of BinFill's colours); by default nothing, as in the official evaluation.
+        recovery: `z` or `xy`: sample as recovery demonstrations do, which train episodes 0-5 are (it changes the order of
+            BinFill's colours); by default nothing, as in the official evaluation.
         max_steps: control steps until the status becomes `timeout`.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
@@ -152,10 +152,8 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
 def _make_library_env(
     task: str, space: str, max_steps: int, render: bool, reward: str, options: dict[str, Any], **scene: Any
 ) -> "RoboMMEEnv":
-    from mme_vla.envs.observations import Include
-
     if space == "multi_choice":
-        # Who chooses a pixel needs the front camera to know what it shows.
+        # A policy that chooses a pixel needs the front camera's matrices.
         options = options | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
     include = Include.from_options(options)
     obs_mode = "none"
@@ -168,16 +166,10 @@ def _make_library_env(
     return RoboMMEEnv(built, space, max_steps, include, render, reward)
 
 
-_BUILDER = "robomme.env_record_wrapper"
-_ENVIRONMENTS = "robomme.robomme_env"
-_INSTALL_HINT = (
-    "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark "
-    "in an environment of its own, since it needs numpy < 2 and gymnasium 0.29; or use env='mme_vla', which needs none."
-)
-
-
 class OfficialEnv:
-    """One official episode; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
+    """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
+
+    The package needs a patched simulator, numpy < 2 and gymnasium 0.29, therefore an environment of its own.
 
     Args:
         env: what the official builder made.
@@ -237,14 +229,17 @@ def make_official_env(
     """Make an episode of the official package."""
     include = Include.from_options(options)
     if find_spec("robomme") is None:
-        raise UserError(_INSTALL_HINT)
+        raise UserError(
+            "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
+            "environment of its own: it needs numpy < 2 and gymnasium 0.29. Or use env='mme_vla', which needs none."
+        )
     if hasattr(import_module("robomme"), "STANDS_IN"):
         raise UserError(
             "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those "
             "of env='mme_vla'. Uninstall it and install the official one, or leave out env='official'."
         )
-    import_module(_ENVIRONMENTS)  # registers the tasks
-    builder = import_module(_BUILDER).BenchmarkEnvBuilder(
+    import_module("robomme.robomme_env")  # registers the tasks
+    builder = import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder(
         env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps
     )
     count = builder.get_episode_num()

@@ -50,9 +50,12 @@ class ActionSpace:
 
     name: ClassVar[str]
 
+    width: ClassVar[int] = len(POSE)
+    """Numbers of an action besides the gripper's."""
+
     def space(self, stick: bool) -> gymnasium.Space:
         """The Gymnasium space of actions."""
-        raise NotImplementedError
+        return gymnasium.spaces.Box(-np.inf, np.inf, (self.width + (not stick),), np.float32)
 
     def act(self, control: Control, action: Any) -> None:
         """Do the control steps of one action.
@@ -69,13 +72,11 @@ class JointAngle(ActionSpace):
     """Absolute joint targets; the stick takes the first seven of at least seven numbers."""
 
     name = "joint_angle"
-
-    def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(ARM_JOINTS + (not stick))
+    width = ARM_JOINTS
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
-        width = ARM_JOINTS + (not stick)
+        width = self.width + (not stick)
         numbers = _numbers(action, width, "seven joint angles and the gripper", longer=stick)
         control.step(numbers[:width])
 
@@ -84,9 +85,6 @@ class EndEffectorPose(ActionSpace):
     """An absolute pose of the tool, reached in one control step from inverse kinematics at the present joints."""
 
     name = "ee_pose"
-
-    def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(len(POSE) + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
@@ -101,9 +99,6 @@ class Waypoint(ActionSpace):
     """An absolute pose of the tool, reached by a planned motion; then the gripper closes at -1 or opens at +1."""
 
     name = "waypoint"
-
-    def space(self, stick: bool) -> gymnasium.Space:
-        return _unbounded(len(POSE) + (not stick))
 
     def act(self, control: Control, action: Any) -> None:
         stick = control.task.stick
@@ -159,10 +154,6 @@ def action_space(name: str) -> ActionSpace:
     if name not in SPACES:
         raise UserError(f"Unknown action space {name!r}. {did_you_mean(str(name), SPACES)}")
     return SPACES[name]
-
-
-def _unbounded(size: int) -> gymnasium.spaces.Box:
-    return gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
 
 def _numbers(action: Any, size: int, meaning: str, longer: bool = False) -> np.ndarray:

@@ -64,7 +64,6 @@ def record_scenes(folder: Path, task: str, seed: int, difficulty: str, count: in
     path = folder / f"{task}-{difficulty}-{seed}.npz"
     if not path.is_file():
         images, labels = draw_scene(task, seed, difficulty, count, size)
-        folder.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as draft, draft.open("wb") as file:
             np.savez_compressed(file, pictures=images, labels=labels)
     return path

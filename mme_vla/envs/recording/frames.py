@@ -31,8 +31,8 @@ class FrameChoice:
         where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
         among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
         episode's first stored frame.
-    memory: a section of a memory; the front camera also shows what this memory may read at those frames, and so does the
-        other where the memory gives a backbone past views.
+    memory: a section of a memory; the front camera also shows what this memory may read at those frames, and so does
+        the other where the memory gives a backbone past views.
     every: stride over the decisions, for a policy that executes several motions of a chunk.
     """
 
