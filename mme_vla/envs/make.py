@@ -47,7 +47,7 @@ def make_env(
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
-        recovery: `z` or `xy`: sample as recovery demonstrations do, which train episodes 0-5 are (it changes the order of
+        recovery: `z` or `xy`: sample as recovery demonstrations do, such as train episodes 0-5 (it changes the order of
             BinFill's colours); by default nothing, as in the official evaluation.
         max_steps: control steps until the status becomes `timeout`.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.

@@ -73,9 +73,8 @@ def keep_renderer(device: "sapien.Device") -> None:
     """Keep the engine that renders on a device until the process ends; further calls have no effect.
 
     ManiSkill makes a render system for each scene, and all of them share SAPIEN's engine. Its shaders and pipelines are
-    compiled for the first image, which takes half a second on a CPU, and are freed with the last render system. One more
-    render system keeps them; scenes stay separate, and images the same. It also keeps a single Vulkan device open, of
-    which NVIDIA's driver supports some thirty.
+    compiled for the first image, which takes half a second on a CPU, and are freed with the last render system. An
+    additional render system keeps them, and a single Vulkan device, of which NVIDIA's driver supports some thirty.
     """
     import sapien
 

@@ -1,4 +1,4 @@
-"""One demonstration as data: every stored step of an episode, with the fields of the official files."""
+"""Demonstrates a task and records every stored step, with the fields of the official files."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -23,18 +23,13 @@ if TYPE_CHECKING:
 
 
 def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
-    """Perform the sub-tasks of a task that has just been reset, evaluating before and after each one.
+    """Perform the sub-tasks of a task that has just been reset, with `env.recording` set; whether it succeeded.
 
-    The demonstrator's view of where the episode stands, `env.progress.planned`, moves at these evaluations only. In a
+    The task is evaluated before and after each sub-task; `env.progress.planned` moves at these evaluations only. In a
     recovery demonstration the sampled pick of the execution fails once first.
 
     Args:
-        env: the task; while this runs, `env.recording` is set.
-        demonstrator: of the same task. Its steps are where frames are taken, its waypoints where they are noted.
-        subtasks: what to perform; by default all of the task's.
-
-    Returns:
-        Whether the task succeeded.
+        subtasks: by default all of the task's.
 
     Raises:
         PlanningError: a motion could not be planned.
@@ -58,7 +53,7 @@ def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["Sub
 
 
 def _ended(env: "Task") -> bool:
-    """Evaluate once, as a recorder does between sub-tasks; whether the episode is over."""
+    """Evaluate once; whether the episode is over."""
     env.evaluate()
     env.progress.planned = env.progress.index
     return env.progress.succeeded or env.progress.failed
@@ -77,10 +72,7 @@ class TooLongError(RuntimeError):
 
 @dataclass(frozen=True)
 class RecordedStep:
-    """One stored time step; the observation was taken after the action.
-
-    obs: keys of the official files' `obs`. action: likewise. info: likewise.
-    """
+    """One stored time step with the keys of the official files; the observation was made after the action."""
 
     obs: dict[str, Any]
     action: dict[str, Any]
@@ -89,7 +81,7 @@ class RecordedStep:
 
 @dataclass
 class Recording:
-    """What became of one demonstration."""
+    """The result of one demonstration."""
 
     success: bool
     steps: int
@@ -98,15 +90,13 @@ class Recording:
     video: int = 0
     """Stored steps of the conditioning video."""
     error: str | None = None
-    """Why the demonstration broke off, if it did."""
+    """Why the demonstration ended early, if it did."""
     frames: list[RecordedStep] = field(default_factory=list)
     """Empty where a callback took the steps."""
 
 
 class Recorder:
-    """Demonstrates a task and takes down every step that is worth storing.
-
-    Steps during which the demonstrator is at a sub-task without words (`NO_RECORD`) are not stored.
+    """Demonstrates a task and records its steps, except those of sub-tasks without a text (`NO_RECORD`).
 
     Args:
         task: created with the observation mode `none`.
@@ -162,7 +152,7 @@ class Recorder:
     def _note_waypoint(self, pose: "sapien.Pose", gripper: float) -> None:
         self._enter_phase()
         angles = AngleTrack().follow(pose.q)
-        # Straight down is a half turn either way: which one would be a matter of rounding.
+        # Straight down is half a turn either way, which rounding would decide.
         if np.array_equal(pose.q, DOWNWARD_Q):  # as over buttons
             angles[0] = -np.pi
         else:
@@ -187,7 +177,7 @@ class Recorder:
             self._on_step(step)
 
     def _enter_phase(self) -> None:
-        """Forget the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
+        """Drop the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
         video = self._task.progress.demonstrated.video
         if self._in_video is not None and video != self._in_video:
             self._waypoint = None

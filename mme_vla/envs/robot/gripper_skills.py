@@ -24,14 +24,7 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
     """Orientation of the tool for grasping an object from above.
 
     The fingers close along the shorter of the two horizontal axes of the object's smallest bounding box; where these
-    are equal, along the one nearer to how the fingers stand now.
-
-    Args:
-        thing: an actor with collision shapes.
-        closing: the direction the fingers close along now, [3].
-
-    Returns:
-        Quaternion [4], wxyz.
+    are equal, along the one nearer to `closing`, their present direction [3]. Returns a quaternion [4], wxyz.
     """
     body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
     box = get_component_mesh(body).bounding_box_oriented.primitive
@@ -64,12 +57,9 @@ def wxyz(rotation: Rotation) -> np.ndarray:
 
 
 def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
-    """Where a grasp that is to fail goes instead, relative to the right place [3].
+    """Offset [3] of a grasp that is to fail, `distance` metres along each axis that is missed.
 
-    Args:
-        mode: `z` closes too high, `xy` beside the object.
-        distance: metres, along each axis that is missed.
-        seed: of the episode; decides the direction of `xy`.
+    `z` closes too high, `xy` beside the object, in a direction that the seed decides.
     """
     if mode == "z":
         return np.array([0.0, 0.0, distance])
@@ -165,7 +155,7 @@ class GripperPrimitives(RobotControl):
         initial_height = thing.position[2]
         self._grasp_at(grasp, thing, above)
         if self.env.second_tries and thing.position[2] - initial_height < LIFTED:
-            # A finger was in something's way: once more, across the other sides.
+            # A finger was blocked: once more, across the other sides.
             self.open()
             grasp = self._grasp_pose(thing, depth)
             self._grasp_at(sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi / 2)), thing, above)

@@ -1,4 +1,4 @@
-"""The stage of a task: robot, table, cameras and the clock, before there is anything to do."""
+"""The stage of a task: robot, table, cameras and the step counter."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -22,13 +22,7 @@ FIELD_OF_VIEW = np.pi / 2
 
 
 class Stage(BaseEnv):
-    """A robot at a table under two cameras. What stands on the table, and why, is the script's: `Task`.
-
-    Args:
-        seed: fixes the scene and the script; the `seed` of `reset` has no effect.
-        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
-        does.
-    """
+    """A robot at a table under two cameras; `Task` adds the objects and the script."""
 
     SUPPORTED_REWARD_MODES = ("none", "dense")
     stick: ClassVar[bool] = False
@@ -78,10 +72,10 @@ class Stage(BaseEnv):
             keep_renderer(self._render_device)
 
     def _clear(self) -> None:
-        """Give up the scene. What it holds points back to it, so this circle is cut here.
+        """Release the scene by cutting its reference cycle.
 
-        ManiSkill has all garbage of the process collected instead, before and after every episode: 0.4 s of the 0.5 s
-        that an episode without images takes to begin and end.
+        ManiSkill collects all garbage instead, which is 0.4 s of the 0.5 s that an episode without images
+        takes to begin and end.
         """
         self._close_viewer()
         if self.scene is not None:
@@ -112,7 +106,7 @@ class Stage(BaseEnv):
         self.reset_in_progress = self.after_video = False
         self.stored_qpos = None
 
-    # The clock ----------------------------------------------------------------------------------------------------
+    # Steps --------------------------------------------------------------------------------------------------------
 
     @property
     def steps_done(self) -> int:

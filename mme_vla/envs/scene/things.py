@@ -1,4 +1,4 @@
-"""What stands on the table, as the tasks see it: an entity with a name, a place, and a place to go back to."""
+"""Objects of a scene as the tasks use them, and the predicates on them. Thresholds are the benchmark's."""
 
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
