@@ -3,7 +3,7 @@
 from mme_vla import Task, register
 from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.placement import Draws, draw_button
-from mme_vla.envs.scene.things import pressed
+from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import Choice, SubTask
 
 NAMES = ("left", "right")

@@ -76,8 +76,6 @@ class Task(Stage):
         """Dials that are turned, and how far."""
         self.difficulty = difficulty or DIFFICULTIES[seed % 3]
         self.recovery = recovery
-        self.recording = False
-        """A demonstrator is recording: `dropped` is evaluated as it was when the official data were recorded."""
         self.on_frame: Callable[[dict[str, Any]], None] | None = None
         """Called once a step with the info of the evaluation, after the physics and before `after_step`. While it is
         set, the simulator makes no observation of its own."""

@@ -16,7 +16,6 @@ from mme_vla.envs.scene.things import AWAY, Thing, distance_xy
 
 if TYPE_CHECKING:
     from mme_vla.envs.scene.stage import Stage
-    from mme_vla.envs.task import Task
 
 
 UNCOVERED_STEPS = 32
@@ -154,7 +153,7 @@ class Highlight:
             self._disc.move_to(sapien.Pose(BELOW_TABLE, self._disc.pose.q))
 
 
-def build_mark(env: "Task", name: str, radius: float, half_length: float) -> Disc:
+def build_mark(env: "Stage", name: str, radius: float, half_length: float) -> Disc:
     """Red rings that cover a target's own, for `Mark`; metres."""
     return build_highlight(env, name, radius, half_length, COLOURS["red"], rings=True)
 
@@ -191,7 +190,7 @@ class Trace:
 
     STEPS, RADIUS, HEIGHT, BELOW = 40, 0.005, 0.01, 0.1
 
-    def __init__(self, env: "Task") -> None:
+    def __init__(self, env: "Stage") -> None:
         self._env = env
         self._dots = [build_sphere(env, f"trace_{i}", self.RADIUS) for i in range(self.STEPS)]
 

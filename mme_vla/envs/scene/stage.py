@@ -43,6 +43,8 @@ class Stage(BaseEnv):
     ) -> None:
         self.seed = seed
         self.second_tries = second_tries
+        self.recording = False
+        """A demonstrator is recording: `dropped` is evaluated as it was when the official data were recorded."""
         self.reset_in_progress = False
         """The arm is being driven back between the conditioning video and the execution."""
         self.after_video = False

@@ -10,7 +10,8 @@ from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Appear, Cue, row, tally
 from mme_vla.envs.scene.objects import Cube, H, build_board, build_cube
 from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube
-from mme_vla.envs.scene.things import ON_TARGET, any_picked_up, distance_xy, dropped, pressed, released_and_away
+from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

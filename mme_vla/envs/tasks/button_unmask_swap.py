@@ -2,7 +2,7 @@
 
 from mme_vla.envs.scene.articulated import Button, build_button
 from mme_vla.envs.scene.placement import Draws, draw_button, shifted_anchors
-from mme_vla.envs.scene.things import pressed
+from mme_vla.envs.scene.predicates import pressed
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
 from mme_vla.envs.tasks.families.containers import (

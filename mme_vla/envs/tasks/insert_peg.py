@@ -15,7 +15,8 @@ from mme_vla.envs.scene.articulated import build_peg
 from mme_vla.envs.scene.motions import Cue, Highlight, Mark, build_mark, on_table
 from mme_vla.envs.scene.objects import APERTURE_COLOUR, APERTURE_Z, at, build_aperture_box, build_highlight
 from mme_vla.envs.scene.placement import Draws, SceneError
-from mme_vla.envs.scene.things import StaticFor, Thing, any_picked_up
+from mme_vla.envs.scene.predicates import StaticFor, any_picked_up
+from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

@@ -9,7 +9,7 @@ import sapien
 from mme_vla.envs.scene.articulated import PEG_COLOUR, build_peg
 from mme_vla.envs.scene.objects import H, at, build_cube, build_disc
 from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
-from mme_vla.envs.scene.things import dropped_onto, gripper_open, picked_up, pushed_onto
+from mme_vla.envs.scene.predicates import dropped_onto, gripper_open, picked_up, pushed_onto
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

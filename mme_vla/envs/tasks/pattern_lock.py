@@ -8,7 +8,8 @@ import numpy as np
 from mme_vla.envs.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.scene.objects import Disc, build_disc
 from mme_vla.envs.scene.placement import Draws, SceneError
-from mme_vla.envs.scene.things import distance_xy, over
+from mme_vla.envs.scene.predicates import over
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

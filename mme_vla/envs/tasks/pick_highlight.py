@@ -4,7 +4,7 @@ from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, Highlight, under
 from mme_vla.envs.scene.objects import Cube, H, build_highlight
 from mme_vla.envs.scene.placement import Draws, Region, draw_button
-from mme_vla.envs.scene.things import any_picked_up, dropped, picked_up
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, picked_up
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

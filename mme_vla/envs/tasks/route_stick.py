@@ -10,7 +10,8 @@ from mme_vla.envs.robot.demonstrator import arc
 from mme_vla.envs.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
 from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
 from mme_vla.envs.scene.placement import Draws
-from mme_vla.envs.scene.things import distance_xy, over
+from mme_vla.envs.scene.predicates import over
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

@@ -10,7 +10,8 @@ from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, row, smoothstep, tally
 from mme_vla.envs.scene.objects import build_disc, build_moving_cube
 from mme_vla.envs.scene.placement import Draws, draw_button
-from mme_vla.envs.scene.things import distance_xy, hovering, pressed
+from mme_vla.envs.scene.predicates import hovering, pressed
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

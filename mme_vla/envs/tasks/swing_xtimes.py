@@ -4,7 +4,8 @@ from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import TALLY_SPACING, Cue, Mark, build_mark, tally
 from mme_vla.envs.scene.objects import Cube, Disc, H, build_disc
 from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_disc
-from mme_vla.envs.scene.things import any_picked_up, distance_xy, dropped, pressed
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, pressed
+from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

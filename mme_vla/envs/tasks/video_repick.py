@@ -12,7 +12,7 @@ from mme_vla.envs.scene.placement import (
     draw_button,
     rotated_anchors,
 )
-from mme_vla.envs.scene.things import any_picked_up, dropped, pressed
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, pressed
 from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task

@@ -13,7 +13,7 @@ from mme_vla.envs.scene.placement import (
     SceneError,
     draw_container,
 )
-from mme_vla.envs.scene.things import container_picked_up, container_put_down
+from mme_vla.envs.scene.predicates import container_picked_up, container_put_down
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 from mme_vla.envs.scene.articulated import Button
 from mme_vla.envs.scene.objects import Cube, H, build_cube
 from mme_vla.envs.scene.placement import Avoid, Draws, Region, SceneError, draw_cube
+from mme_vla.envs.scene.predicates import StaticFor, picked_up, pressed, reset_reached
 from mme_vla.envs.scene.stage import RESET_QPOS
-from mme_vla.envs.scene.things import StaticFor, picked_up, pressed, reset_reached
 from mme_vla.envs.subtasks import NO_RECORD, SubTask
 from mme_vla.envs.task import Task
 

@@ -9,11 +9,7 @@ from mme_vla.envs.scene.articulated import build_button
 from mme_vla.envs.scene.motions import Cue, Swap, under
 from mme_vla.envs.scene.objects import Cube, Disc, H, build_disc
 from mme_vla.envs.scene.placement import Avoid, Draws, Region, SceneError, draw_button, draw_disc
-from mme_vla.envs.scene.things import (
-    any_picked_up,
-    dropped,
-    dropped_onto,
-)
+from mme_vla.envs.scene.predicates import any_picked_up, dropped, dropped_onto
 from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.families.stages import add_cube, end_video, go_home, pick, press, wait
