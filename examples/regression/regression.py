@@ -1,4 +1,4 @@
-"""A backbone of one's own: a small transformer that answers at once, trained on the absolute error."""
+"""A backbone of one's own: a small transformer that predicts the chunk directly, trained on the absolute error."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -38,7 +38,7 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
     """Demonstrate a task and look at it every few steps; also returns whether it succeeded."""
     from mme_vla.envs.observations import Include, Observer
     from mme_vla.envs.recording.recorder import demonstrate
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
     from mme_vla.envs.subtasks import NO_RECORD
 
     observer = Observer(task, Include(), render=True)
@@ -53,11 +53,11 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
 
     task.reset()
     observer.start()
-    task.observe = capture
+    task.on_frame = capture
     try:
         success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
     finally:
-        task.observe = None
+        task.on_frame = None
     return snapshots, success
 
 

@@ -1,5 +1,6 @@
 """`mme-vla record`: demonstrate episodes of the benchmark and keep them as a dataset."""
 
+import gc
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
-from mme_vla.envs.vector.processes import begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.utils.processes import end_with_parent, signals_deferred
@@ -154,8 +155,9 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
         work: importable by name, or a partial of such, where there are several processes.
     """
     if workers == 1 or len(jobs) < 2:
-        import mme_vla.envs.vector.preloaded  # noqa: F401 - scenes are built faster from here on
+        import mme_vla.envs.task  # noqa: F401
 
+        gc.freeze()  # scenes are built faster when no collection walks through the simulator's modules
         yield from map(work, jobs)
         return
     with _pool(workers) as pool:

@@ -124,22 +124,18 @@ def prepared(
     learnt_file, val_file, stats_file = (
         folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
     )
+    options = {"oversample": learning["often"], "noise": learning["noise"], "token_noise": learning["blur"]}
     processor = policy.require_processor()
     if val_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        size = {name: learning[name] for name in ("often", "noise", "blur")}
-        return Decisions.load(learnt_file, **size), Decisions.load(val_file)
+        return Decisions.load(learnt_file, **options), Decisions.load(val_file)
     learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
     processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
     processor.stats.save(stats_file)
-    samples, val_set = (
-        Decisions.of(policy, map(Demonstration.load, learnt), **learning),
-        Decisions.of(
-            policy,
-            map(Demonstration.load, files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]),
-            elsewhere=learning["elsewhere"],
-        ),
-    )
+    distance = learning["elsewhere"]
+    samples = Decisions.of(policy, map(Demonstration.load, learnt), min_distance=distance, **options)
+    held_out = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
+    val_set = Decisions.of(policy, map(Demonstration.load, held_out), min_distance=distance)
     samples.save(learnt_file)
     val_set.save(val_file)
     return samples, val_set

@@ -50,14 +50,14 @@ def _scene(task: str, seed: int, difficulty: str | None, options: dict[str, Any]
 
 def _demonstrated(task: str, seed: int, difficulty: str | None, options: dict[str, Any]) -> dict[str, Any]:
     from mme_vla.envs.recording.recorder import demonstrate
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
     env = _make(task, seed, difficulty, options)
     try:
         env.reset()
         track: list[np.ndarray] = []
         script = env.unwrapped
-        script.observe = lambda info: track.append(script.qpos)
+        script.on_frame = lambda info: track.append(script.qpos)
         done = demonstrate(script, Demonstrator(script, env.step))
         return {
             "goal": script.goals(), "subtasks": len(script.progress.subtasks), "success": bool(done),
