@@ -11,9 +11,9 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_stick import Ear, Flags, Tip, circle, read_route, say
 from helpers.env_unmask import make, texts, wait
-
 from mme_vla.envs.robot.demonstrator import arc
-from mme_vla.envs.scene.placement import Drawsfrom mme_vla.envs.tasks.route_stick import RouteStick
+from mme_vla.envs.scene.placement import Draws
+from mme_vla.envs.tasks.route_stick import RouteStick
 
 MOVES = {"easy": ((2, 3), False), "medium": ((4, 5), False), "hard": ((4, 7), True)}
 """How many, and whether they may turn back."""

@@ -17,18 +17,8 @@ from mme_vla.envs import TASK_NAMES, load_tasks
 from mme_vla.envs.grounding import centroid, project
 from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.robot.robots import description
-from mme_vla.envs.scene.articulated import build_button, build_peg
 from mme_vla.envs.scene.objects import (
-    build_aperture_box,
-    build_board,
-    build_container,
-    build_cube,
     build_disc,
-    build_hidden_cube,
-    build_highlight,
-    build_moving_cube,
-    build_obstacle,
-    build_sphere,
 )
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.errors import UserError

@@ -10,9 +10,6 @@ from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import VIDEO, make_scripted_env
 from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
-from mme_vla.envs.observations import RenderRequest
-from mme_vla.envs.vector.pool import Job
-from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
