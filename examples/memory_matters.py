@@ -120,7 +120,9 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
     history = None
     if policy.memory is not None:
         memory = policy.memory
-        recalled = [memory.recall(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history]
+        recalled = [
+            memory.gather_selection(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history
+        ]
         history = stack_history(recalled)
     return Batch(
         images=processor.images([views, views])[:, :1],  # one camera says it all

@@ -37,7 +37,7 @@ def bind_hook(hook: Hook | None, layer: int) -> Callable[[Tensor], Tensor] | Non
     return hook.layers[layer] if isinstance(hook, LayerHooks) else None if hook is None else partial(hook, layer)
 
 
-Draws = dict[str, Tensor]
+Noise = dict[str, Tensor]
 """Random numbers by name, one row a sample: drawn by the caller, so that batching and sharding cannot change them."""
 
 
@@ -82,7 +82,7 @@ class Backbone(nn.Module):
             tower that looks at past views along with the current ones).
 
     and implements the methods below. Losses and samples are its own affair (a flow, a regression, a diffusion): whoever
-    trains or evaluates hands back the numbers it asked for in `loss_draws` and `sample_draws`.
+    trains or evaluates hands back the numbers it asked for in `training_noise` and `sampling_noise`.
     """
 
     Config: ClassVar[type[Any]]
@@ -108,7 +108,7 @@ class Backbone(nn.Module):
     def __init__(self, config: Any, extra_experts: Mapping[str, Any] | None = None) -> None:
         super().__init__()
 
-    def draw_experts(self, names: Sequence[str]) -> None:
+    def init_experts(self, names: Sequence[str]) -> None:
         """Give fresh weights to what a checkpoint to start from may lack; all others wait for it.
 
         Such are the experts that an integration asked for, and heads of this backbone's own.
@@ -139,7 +139,7 @@ class Backbone(nn.Module):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
         return {}
 
@@ -148,11 +148,11 @@ class Backbone(nn.Module):
 
         Args:
             batch: with `actions`. images: its views [b, v, 3, s, s] in [−1, 1], augmented where they shall be.
-            inject: the memory's way in. draws: as `loss_draws` made them, on the batch's device.
+            inject: the memory's way in. draws: as `training_noise` made them, on the batch's device.
         """
         raise NotImplementedError
 
-    def choose_attention(self, backend: str) -> None:
+    def set_attention_backend(self, backend: str) -> None:
         """Compute attention with another backend than its own choice (`auto`); see `layers.attention.BACKENDS`.
 
         Raises:
@@ -176,7 +176,7 @@ class Backbone(nn.Module):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
         return {}
 
@@ -186,7 +186,7 @@ class Backbone(nn.Module):
         """A normalised chunk [b, h, a], under the caller's autocast.
 
         Args:
-            draws: as `sample_draws` made them, with a batch axis, on the batch's device.
+            draws: as `sampling_noise` made them, with a batch axis, on the batch's device.
             steps: of an iterative head; its own number by default. Heads that answer at once take no notice.
         """
         raise NotImplementedError
@@ -223,17 +223,17 @@ class Backbone(nn.Module):
     """Pattern of linear layers whose weight is read past any adapter that wraps them."""
 
 
-def named_draws(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:
-    """Draws by name; a bare tensor is a flow's `noise`."""
+def named_noise(draws: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> dict[str, Tensor]:
+    """Noise by name; a bare tensor is a flow's `noise`."""
     named = {"noise": draws} if isinstance(draws, Tensor) else dict(draws or {})
     return named | {name: value for name, value in more.items() if value is not None}
 
 
-def stack_draws(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Draws:
-    """Single draws (`sample_draws`) as those of a batch."""
+def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Noise:
+    """Single draws (`sampling_noise`) as those of a batch."""
     return {name: torch.stack([row[name] for row in rows]).to(device) for name in (rows[0] if rows else {})}
 
 
-def map_draws(draws: Mapping[str, Tensor], change: Callable[[Tensor], Any]) -> Draws:
+def map_noise(draws: Mapping[str, Tensor], change: Callable[[Tensor], Any]) -> Noise:
     """Every value through `change`: rows of a batch, another device."""
     return {name: change(value) for name, value in draws.items()}

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone import flow
 from mme_vla.backbone.attention import additive_mask, attend
-from mme_vla.backbone.base import Backbone, Draws, Hook, Inject, Injection
+from mme_vla.backbone.base import Backbone, Noise, Hook, Inject, Injection
 from mme_vla.backbone.blocks import Block
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm
@@ -24,7 +24,7 @@ from mme_vla.backbone.siglip import pool_grid
 from mme_vla.errors import UserError
 from mme_vla.registry import BACKBONES
 from mme_vla.speed.recompute import Recompute
-from mme_vla.speed.rtc import agreeing
+from mme_vla.speed.rtc import rtc_guidance
 from mme_vla.types import Batch
 
 
@@ -206,7 +206,7 @@ class NanoBackbone(Backbone):
             if name != "vision":
                 initialise(module)
 
-    def draw_experts(self, names: Sequence[str]) -> None:
+    def init_experts(self, names: Sequence[str]) -> None:
         """Give the columns of these experts fresh weights."""
         for name in names:
             initialise(self.columns[name])
@@ -260,7 +260,7 @@ class NanoBackbone(Backbone):
             Block("prompt", words, batch.prompt_mask, "vlm"),
         ]
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, r, h, a] and flow times `time` [n, r], r versions a sample."""
         r = self.config.draws
         noise = torch.randn(count, r, self.horizon, self.action_dim, generator=generator)
@@ -280,7 +280,7 @@ class NanoBackbone(Backbone):
     def recompute(self, mode: Recompute) -> None:
         """There is nothing worth recomputing: a layer's activations are a chunk's few tokens."""
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
         return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
 
@@ -297,7 +297,7 @@ class NanoBackbone(Backbone):
             time = times[index].expand(len(x))
             return (x - self._clean(batch, *prepared, x, time, 1)) / time[:, None, None].clamp(min=1 / steps)
 
-        return flow.euler(draws["noise"], steps, agreeing(velocity, batch.overlap, times))
+        return flow.euler(draws["noise"], steps, rtc_guidance(velocity, batch.overlap, times))
 
     def _prepare(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[Tensor, Tensor, Tensor, Injection]:
         """What does not depend on the noise: each layer's keys and values, their mask, what the goal says."""

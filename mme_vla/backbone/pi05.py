@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from mme_vla.backbone import flow
 from mme_vla.backbone.attention import check_backend
-from mme_vla.backbone.base import Backbone, Draws, Inject, Injection
+from mme_vla.backbone.base import Backbone, Noise, Inject, Injection
 from mme_vla.backbone.blocks import Block
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
@@ -17,7 +17,7 @@ from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, float32_linear
 from mme_vla.backbone.siglip import VisionTower, pool_grid
 from mme_vla.registry import BACKBONES
 from mme_vla.speed.recompute import Recompute
-from mme_vla.speed.rtc import agreeing
+from mme_vla.speed.rtc import rtc_guidance
 from mme_vla.speed.sharding import ShardGroup
 from mme_vla.types import Batch, PastViews
 
@@ -77,7 +77,7 @@ class Pi05Backbone(Backbone):
         for module in (self.embedding, self.transformer, self.action_in, self.action_out, self.time_in, self.time_out):
             initialise(module)
 
-    def draw_experts(self, names: Sequence[str]) -> None:
+    def init_experts(self, names: Sequence[str]) -> None:
         """Give these experts fresh weights in every layer."""
         for block in self.transformer.layers:
             for name in names:
@@ -151,7 +151,7 @@ class Pi05Backbone(Backbone):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """`noise` [n, h, a] and flow times `time` [n]."""
         noise = torch.randn(count, self.horizon, self.action_dim, generator=generator)
         return {"noise": noise, "time": flow.sample_time(count, self.config.time_distribution, noise.device, generator)}
@@ -172,7 +172,7 @@ class Pi05Backbone(Backbone):
         hidden, _ = self.transformer(blocks, layout, condition, injection.hook)
         return self.read_velocity(hidden)
 
-    def choose_attention(self, backend: str) -> None:
+    def set_attention_backend(self, backend: str) -> None:
         """See `Backbone`; all of them are for this one."""
         self.transformer.attention = check_backend(backend)
 
@@ -186,7 +186,7 @@ class Pi05Backbone(Backbone):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
         return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
 
@@ -217,7 +217,7 @@ class Pi05Backbone(Backbone):
         if batch.overlap is None:
             return flow.euler(noise, steps, velocity)
         times = flow.euler_times(steps, noise.device)
-        return flow.euler(noise, steps, agreeing(velocity, batch.overlap, times))
+        return flow.euler(noise, steps, rtc_guidance(velocity, batch.overlap, times))
 
     def conditions(self, steps: int) -> Conditioning:
         """Every layer's time modulations at the times of so many steps; kept for the next chunk while `keep_times`."""

@@ -201,7 +201,7 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             if self.memory.reads_motion:
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
-            item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
+            item["history"] = self.memory.gather_selection(history, step.index, rng if self.jitter else None)
             if self.memory.past_view_spec is not None:
                 read = partial(self._images, step.source, step.episode)
                 item["past"] = past_views(self.memory.past_view_spec, step.index, read, self.processor.images)

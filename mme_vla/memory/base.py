@@ -147,7 +147,7 @@ class Memory(nn.Module):
     def compile(self, **options: Any) -> None:
         """Compile in place what many small steps make slow; by default nothing is. `options` are `torch.compile`'s."""
 
-    def choose_products(self, how: str) -> None:
+    def set_matmul_precision(self, how: str) -> None:
         """Set `float32_products`, of members too."""
         for module in self.modules():
             if isinstance(module, Memory):
@@ -161,7 +161,7 @@ class Memory(nn.Module):
         """The length to which a selection of `count` tokens is padded; only left-padded memories may choose it."""
         return self.capacity
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
         """Select, gather and pad: the unbatched tokens of one step ([padded_length, …]), ready to be stacked."""
         indices = self.select(history, step, rng)
         if len(indices) > self.capacity:
@@ -204,7 +204,7 @@ class Memory(nn.Module):
         Args:
             histories: one per episode. streams: what `start_stream` gave each of them; updated in place.
         """
-        return self(stack_history([self.recall(history, len(history) - 1) for history in histories]))
+        return self(stack_history([self.gather_selection(history, len(history) - 1) for history in histories]))
 
     def prepare(self, history: History, stream: Any) -> bool:
         """Do a piece of what the next `encode` of a running episode will need, while nobody waits for it.

@@ -84,11 +84,11 @@ class JoinedMemory(Memory):
         first, *others = (self.memories[i] for i in self._order)
         return first.padded_length(min(count, first.capacity)) + sum(member.capacity for member in others)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
         memories, views = self.memories, self._views(history)
         parts = []
         for place, i in enumerate(self._order):
-            part = memories[i].recall(views[i], step, rng)
+            part = memories[i].gather_selection(views[i], step, rng)
             parts.append(_padded(part, memories[i]) if place else part)
         features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
         return HistoryTokens(features, positions, mask, parts[0].step)

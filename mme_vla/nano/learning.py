@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.backbone.base import stack_draws
+from mme_vla.backbone.base import stack_noise
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory, stack_history
 from mme_vla.memory.history import FrameScores, History, StorageSpec
@@ -177,7 +177,7 @@ def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tens
     rows = val_set.distant.nonzero()[:, 0].tolist()
     batch, generator = val_set.collate(rows), torch.Generator().manual_seed(seed)
     assert batch.actions is not None and batch.state is not None
-    chunk = policy.sample_actions(batch, stack_draws([policy.sample_draws(generator) for _ in rows])).float()
+    chunk = policy.sample_actions(batch, stack_noise([policy.sampling_noise(generator) for _ in rows])).float()
     processor = policy.require_processor()
     predicted = processor.absolute_actions(chunk, batch.state)
     return (predicted - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
@@ -220,7 +220,7 @@ def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, An
             "action_mask": torch.from_numpy(recorded),
         }  # fmt: skip
         if history is not None:
-            item["history"] = policy.require_memory().recall(history, frame)
+            item["history"] = policy.require_memory().gather_selection(history, frame)
         items.append(item)
     return items
 

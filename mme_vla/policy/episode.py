@@ -71,7 +71,7 @@ class Host(Protocol):
 
     def encode_frames(self, frames: np.ndarray) -> Tensor: ...
 
-    def sample_draws(self, generator: torch.Generator) -> dict[str, Tensor]: ...
+    def sampling_noise(self, generator: torch.Generator) -> dict[str, Tensor]: ...
 
 
 class Episode:
@@ -272,10 +272,10 @@ class Episode:
             actions[places], known[places] = executed[: len(places)], True
         return list(self._policy.require_processor().motion(states, actions, known))
 
-    def recall(self) -> HistoryTokens:
+    def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
         history = self.required_history()
-        return self._policy.require_memory().recall(history, len(history) - 1)
+        return self._policy.require_memory().gather_selection(history, len(history) - 1)
 
     def required_history(self) -> OnlineHistory:
         """The history, once there is something in it.
@@ -389,7 +389,7 @@ class Episode:
 
     def draw(self) -> dict[str, Tensor]:
         """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
-        return self._policy.sample_draws(self._generator)
+        return self._policy.sampling_noise(self._generator)
 
     def _prepared_images(
         self, views: Mapping[str, np.ndarray], rendered: Mapping[str, np.ndarray] | None, frame: int

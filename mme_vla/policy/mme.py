@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Backbone, Draws, Inject, map_draws, named_draws, stack_draws
+from mme_vla.backbone.base import Backbone, Noise, Inject, map_noise, named_noise, stack_noise
 from mme_vla.backbone.config import read_backbone, shapes_only
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
@@ -79,9 +79,9 @@ class MMEPolicy(Policy):
         self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
         self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
         self.augment = augment
-        backbone.choose_attention(attention)
+        backbone.set_attention_backend(attention)
         if memory is not None:
-            memory.choose_products(checked_products(float32_products))
+            memory.set_matmul_precision(checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         self.sample_steps = backbone.sample_steps
         self.supports_rtc = backbone.supports_rtc
@@ -113,7 +113,7 @@ class MMEPolicy(Policy):
             backbone = backbone_cls(sizes, experts)
         if not fresh_backbone:
             backbone.to_empty(device=torch.get_default_device())
-            backbone.draw_experts(list(experts))
+            backbone.init_experts(list(experts))
         memory: Memory | None = None
         if config.get("memory"):
             memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
@@ -127,11 +127,11 @@ class MMEPolicy(Policy):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """What the backbone's loss draws: of π0.5 the `noise` [n, h, a] and flow times `time` [n]."""
-        return self.backbone.loss_draws(count, generator)
+        return self.backbone.training_noise(count, generator)
 
-    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """While training with augmentation `changes` [n, …]: what happens to a sample's images."""
         return {"changes": self._draw_changes(count, generator)} if self.training and self.augment else {}
 
@@ -146,7 +146,7 @@ class MMEPolicy(Policy):
 
         Args:
             batch: with `actions`.
-            draws: as `loss_draws` makes them; of a flow also its noise [b, h, a] alone, with the times beside it.
+            draws: as `training_noise` makes them; of a flow also its noise [b, h, a] alone, with the times beside it.
             time: flow times [b], where `draws` is the noise.
             memory: memory tokens encoded beforehand; by default they are made from `batch.history`.
 
@@ -155,12 +155,12 @@ class MMEPolicy(Policy):
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        values = named_draws(draws, time=time)
-        if set(self.loss_draws(0, torch.default_generator)) - set(values):
-            values = self.loss_draws(len(batch.actions), torch.default_generator) | values
+        values = named_noise(draws, time=time)
+        if set(self.training_noise(0, torch.default_generator)) - set(values):
+            values = self.training_noise(len(batch.actions), torch.default_generator) | values
         if "changes" not in values:
-            values = values | self.image_draws(len(batch.actions), torch.default_generator)
-        sampled = map_draws(values, lambda value: value.to(self.device))
+            values = values | self.augmentation_params(len(batch.actions), torch.default_generator)
+        sampled = map_noise(values, lambda value: value.to(self.device))
         batch, views = self._current_views(batch, sampled.pop("changes", None))
         with self.autocast():
             memory = self.encode_memory(self._conditioned_history(batch)) if memory is None else memory
@@ -231,9 +231,9 @@ class MMEPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """What one chunk of the backbone draws: of π0.5 the starting `noise` [h, a]."""
-        return self.backbone.sample_draws(generator)
+        return self.backbone.sampling_noise(generator)
 
     @torch.no_grad()
     def sample_actions(
@@ -247,14 +247,14 @@ class MMEPolicy(Policy):
         """A normalised chunk [b, h, a].
 
         Args:
-            draws: as `sample_draws` makes them, with a batch axis; of a flow also its noise [b, h, a] alone.
+            draws: as `sampling_noise` makes them, with a batch axis; of a flow also its noise [b, h, a] alone.
             steps: Euler steps of a flow; 10 by default, as released.
             generator: where fresh draws come from (on the CPU). memory: memory tokens encoded beforehand.
         """
         if draws is None:
             source = torch.default_generator if generator is None else generator
-            draws = stack_draws([self.sample_draws(source) for _ in range(len(batch.prompt))])
-        sampled = map_draws(named_draws(draws), lambda value: send(value, self.device))
+            draws = stack_noise([self.sampling_noise(source) for _ in range(len(batch.prompt))])
+        sampled = map_noise(named_noise(draws), lambda value: send(value, self.device))
         if memory is None:
             with self.autocast():
                 memory = self.encode_memory(self._conditioned_history(batch))

@@ -77,10 +77,10 @@ def check_tokens(backbone: Backbone, images: torch.Tensor) -> None:
 def check_loss(backbone: Backbone, batch: Batch, images: torch.Tensor) -> None:
     """The loss is one number a step, repeats with the same draws, and does not read padding."""
     inject = _without_names(_table(backbone.observation_blocks(batch, images)))
-    draws = backbone.loss_draws(2, torch.Generator().manual_seed(0))
-    assert all(len(value) == 2 for value in draws.values()), "every value of loss_draws(n) must have n rows."
-    again = backbone.loss_draws(2, torch.Generator().manual_seed(0))
-    assert all(torch.equal(draws[key], again[key]) for key in draws), "loss_draws must follow its generator alone."
+    draws = backbone.training_noise(2, torch.Generator().manual_seed(0))
+    assert all(len(value) == 2 for value in draws.values()), "every value of training_noise(n) must have n rows."
+    again = backbone.training_noise(2, torch.Generator().manual_seed(0))
+    assert all(torch.equal(draws[key], again[key]) for key in draws), "training_noise must follow its generator alone."
     loss = backbone.loss(batch, images, inject, draws)
     assert loss.shape == (2, backbone.horizon), f"loss must be [b, h]; got {tuple(loss.shape)}."
     assert torch.isfinite(loss).all() and (loss > 0).any(), "the loss of random actions must be finite and not zero."
@@ -94,7 +94,7 @@ def check_loss(backbone: Backbone, batch: Batch, images: torch.Tensor) -> None:
 def check_sample(backbone: Backbone, batch: Batch, images: torch.Tensor) -> None:
     """A sample is a chunk, repeats with the same draws, and depends on the observation."""
     inject = _without_names(_table(backbone.observation_blocks(batch, images)))
-    one = backbone.sample_draws(torch.Generator().manual_seed(0))
+    one = backbone.sampling_noise(torch.Generator().manual_seed(0))
     draws = {key: torch.stack([value, value]) for key, value in one.items()}
     chunk = backbone.sample(batch, images, inject, draws)
     shape = (2, backbone.horizon, backbone.action_dim)

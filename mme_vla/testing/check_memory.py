@@ -139,7 +139,7 @@ def _encoded(memory: Memory, history: HistoryTokens) -> MemoryTokens:
 
 
 def _recalled(memory: Memory, history: History, *steps: int) -> HistoryTokens:
-    return stack_history([memory.recall(history, step) for step in steps])
+    return stack_history([memory.gather_selection(history, step) for step in steps])
 
 
 def _valid(tokens: MemoryTokens) -> Tensor:
@@ -190,7 +190,9 @@ def check_streaming(memory: Memory, frames: int) -> None:
         for episode, history in zip((first, second), histories, strict=True):
             episode.extend(history, 16, until)
         streamed = memory.encode(histories, streams)
-        fresh = _encoded(memory, stack_history([memory.recall(history, len(history) - 1) for history in histories]))
+        fresh = _encoded(
+            memory, stack_history([memory.gather_selection(history, len(history) - 1) for history in histories])
+        )
         error = float((_valid(streamed) - _valid(fresh)).abs().max())
         assert error <= TOLERANCE, f"after {until} frames the stream's tokens differ from a fresh look by {error:.2g}."
 

@@ -60,7 +60,7 @@ def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, 
             wanted = frame[online.to_encode(1)]
             tokens = encode(wanted) if len(wanted) else torch.zeros(0, 4, WIDTH)
             online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
-            cached, streamed = memory.recall(history, t), memory.recall(online, t)
+            cached, streamed = memory.gather_selection(history, t), memory.gather_selection(online, t)
             for one, other in zip(cached.tensors(), streamed.tensors(), strict=True):
                 torch.testing.assert_close(one, other, rtol=0, atol=tolerance)
         assert (len(history), history.exec_start) == (len(online), online.exec_start)

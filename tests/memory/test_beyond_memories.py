@@ -48,7 +48,7 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
 def encoded(memory: Any, tokens: torch.Tensor, step: int | None = None, exec_start: int = 0) -> MemoryTokens:
     step = len(tokens) - 1 if step is None else step
     with torch.no_grad():
-        found: MemoryTokens = memory(stack_history([memory.recall(stored(memory, tokens, exec_start), step)]))
+        found: MemoryTokens = memory(stack_history([memory.gather_selection(stored(memory, tokens, exec_start), step)]))
     return found
 
 
@@ -175,7 +175,7 @@ def test_learned_topk_keeps_time_and_tells_the_age_of_what_it_keeps() -> None:
 
 def test_what_is_not_kept_still_reaches_the_loss() -> None:
     memory = LearnedTopK(D, 16, budget=5, pool=6, grid=2)
-    history = stack_history([memory.recall(stored(memory, noise(6, 4, D)), 5)])
+    history = stack_history([memory.gather_selection(stored(memory, noise(6, 4, D)), 5)])
     history = replace(history, features=history.features.requires_grad_())
     kept, _ = memory.keep(memory.scores(history), history.mask)
     memory(history).tokens[:, -1].sum().backward()
@@ -287,7 +287,7 @@ def test_memory_compiles_in_one_piece(policy: MMEPolicy) -> None:
 
 
 def test_in_bfloat16_it_computes_what_it_computes_in_float32(policy: MMEPolicy) -> None:
-    batch, draws = random_batch(policy, valid=64), policy.loss_draws(2, torch.Generator().manual_seed(0))
+    batch, draws = random_batch(policy, valid=64), policy.training_noise(2, torch.Generator().manual_seed(0))
     with torch.no_grad():
         exact = float(policy(batch, draws)[0])
         policy.compute_dtype = torch.bfloat16

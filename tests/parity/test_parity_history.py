@@ -82,7 +82,7 @@ def test_selected_tokens_and_positions(buffer, tokens):
     steps = sorted({int(k.split("/")[1].removeprefix("step")) for k in tensors if k.startswith("out/step")})
     for kind, memory in memories(about).items():
         for step in steps:
-            recalled = memory.recall(history_of(memory, frames, tokens, step), step)
+            recalled = memory.gather_selection(history_of(memory, frames, tokens, step), step)
             key = f"out/step{step}/{kind}"
             assert torch.equal(recalled.mask, tensors[f"{key}/mask"])
             assert error(recalled.features, tensors[f"{key}/image_emb"]) <= TOLERANCE
@@ -108,7 +108,7 @@ def test_recurrent_selection_is_exact(buffer, tokens):
         assert chosen.tolist() == [[f, p] for f in entry["indices"] for p in range(patches)], entry["step"]
         key = f"out/recurrent_step{entry['step']}_exec{entry['exec_start']}"
         if f"{key}/mask" in tensors:
-            recalled = memory.recall(history, entry["step"])
+            recalled = memory.gather_selection(history, entry["step"])
             assert torch.equal(recalled.mask.unflatten(0, (-1, patches)).all(-1), tensors[f"{key}/mask"])
             assert error(recalled.features, tensors[f"{key}/image_emb"].flatten(0, 2)) <= TOLERANCE
             position = position_features(recalled.positions, about["pos_dim"]) * recalled.mask[:, None]

@@ -15,7 +15,7 @@ from mme_vla.types import send
 def test_pictures_are_changed_alike_however_an_update_is_divided() -> None:
     policy = small_policy("pi05").train()
     batch = random_batch(policy, 4)
-    changes = policy.image_draws(4, torch.Generator().manual_seed(3))["changes"]
+    changes = policy.augmentation_params(4, torch.Generator().manual_seed(3))["changes"]
     whole = policy._views(batch, changes)
     pieces = [policy._views(batch.rows(torch.tensor(rows)), changes[rows]) for rows in ([0], [1, 2], [3])]
     assert torch.equal(torch.cat(pieces), whole)

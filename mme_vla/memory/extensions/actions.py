@@ -158,8 +158,8 @@ class ActionMemory(RecurrentMemory):
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return np.zeros(0, np.int64)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(self._motion_rows(history), step, rng)
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        return super().gather_selection(self._motion_rows(history), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         return super().encode([self._motion_rows(history, self.output.weight.device) for history in histories], streams)

@@ -87,8 +87,10 @@ class SpaceTime(Memory):
         frames = frames[frames >= 0]
         return np.stack([frames, np.zeros_like(frames)], 1)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng)
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        return super().gather_selection(
+            MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng
+        )
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         if self.states is None:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, map_draws, stack_draws
+from mme_vla.backbone.base import Noise, map_noise, stack_noise
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.integration.film import PooledIntegration
@@ -115,7 +115,7 @@ class DiffusionPolicy(Policy):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """The `noise` [n, h, a] that is added and the `step` [n] that says how much."""
         step = torch.randint(self.sizes.diffusion_steps, (count,), generator=generator)
         return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
@@ -129,13 +129,13 @@ class DiffusionPolicy(Policy):
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` makes them.
+            batch: with `actions`. draws: as `training_noise` makes them.
             corner: (top, left) of the crop; by default drawn while training and the centre's else.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        values = draws or self.loss_draws(len(batch.actions), torch.default_generator)
-        sampled = map_draws(values, lambda value: value.to(self.device))
+        values = draws or self.training_noise(len(batch.actions), torch.default_generator)
+        sampled = map_noise(values, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history)
         with self.autocast():
             condition = self.condition(batch, memory, corner)
@@ -185,7 +185,7 @@ class DiffusionPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a], and what is `added` [99, h, a] after each step but the last."""
         shape, steps = (self.horizon, self.action_dim), self.sizes.diffusion_steps
         noise = torch.randn(shape, generator=generator)
@@ -202,12 +202,12 @@ class DiffusionPolicy(Policy):
         """A normalised chunk [b, h, a], from the first step of the current frame on.
 
         Args:
-            draws: as `sample_draws` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
+            draws: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
             memory: memory tokens encoded beforehand.
         """
         if draws is None:
-            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.state))])
-        sampled = map_draws(draws, lambda value: value.to(self.device))
+            draws = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))])
+        sampled = map_noise(draws, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():
             condition = self.condition(batch, memory)

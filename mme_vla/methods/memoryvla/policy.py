@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, map_draws, stack_draws
+from mme_vla.backbone.base import Noise, map_noise, stack_noise
 from mme_vla.backbone.config import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
@@ -172,7 +172,7 @@ class MemoryVlaPolicy(Policy):
         """Moments of a training sample: its processor's, else its configuration's."""
         return self.config["processor"]["group_size"] if self.processor is None else self.processor.group_size
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of m moments."""
         shape = (count, self.sizes.repeats, self.group_size)
         return {
@@ -181,7 +181,7 @@ class MemoryVlaPolicy(Policy):
             "drop": torch.rand(shape, generator=generator),
         }
 
-    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """While training with augmentation `changes` [n, m, 6]: what happens to the images of `count` groups."""
         if not (self.training and self.augment):
             return {}
@@ -192,20 +192,20 @@ class MemoryVlaPolicy(Policy):
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` and `picture_draws` make them; fresh ones by default.
+            batch: with `actions`. draws: as `training_noise` and `augmentation_params` make them; fresh ones by default.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
-        values = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
+        values = dict(draws or self.training_noise(len(batch.images), torch.default_generator))
         if "changes" not in values:
-            values |= self.image_draws(len(batch.images), torch.default_generator)
+            values |= self.augmentation_params(len(batch.images), torch.default_generator)
         changes = values.pop("changes", None)
         copies = batch.valid.shape[1]
 
         def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
             return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
 
-        sampled = map_draws(values, lambda value: repeat_batch(value.to(self.device)))
+        sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
         memory = self.encode_memory(batch.histories())
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
@@ -239,7 +239,7 @@ class MemoryVlaPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
         return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
 
@@ -257,7 +257,7 @@ class MemoryVlaPolicy(Policy):
             memory: memory tokens of the last moments, encoded beforehand.
         """
         if draws is None:
-            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.images))])
+            draws = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))])
         if self.memory is not None:
             batch = batch.last()
             memory = self.encode_memory(batch.history) if memory is None else memory

@@ -107,9 +107,9 @@ class OpenVlaBackbone(Backbone):
         self.head = ActionHead(width, config.action_dim)
         self.heads = ("head",) if self.state_token is None else ("state_token", "head")
 
-    def draw_experts(self, names: Sequence[str]) -> None:
+    def init_experts(self, names: Sequence[str]) -> None:
         """Draw the head and the state's token, which OpenVLA itself has nothing of."""
-        super().draw_experts(names)
+        super().init_experts(names)
         for name in self.heads:
             for module in self.get_submodule(name).modules():
                 if isinstance(module, nn.Linear | nn.LayerNorm):
