@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise, stack_noise
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
@@ -17,6 +16,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.saving import Saved
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
+from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -27,8 +27,8 @@ class Policy(Saved):
 
     A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
     `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
-    says: whoever trains only moves it to a device. Random numbers come from outside (`training_noise`, `sampling_noise`), so
-    that training resumes bit for bit, and the noise of an episode does not depend on its batch; only the policy knows
+    says: whoever trains only moves it to a device. Random numbers come from outside (`training_noise`,
+    `sampling_noise`), so that training resumes bit for bit, and the noise of an episode does not depend on its batch; only the policy knows
     what they mean.
     """
 

@@ -7,26 +7,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise, map_noise, stack_noise
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.integration.film import PooledIntegration
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, encode_histories, full_history
 from mme_vla.methods.diffusion_policy import model
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.methods.diffusion_policy.model import DiffusionNetwork
 from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
+from mme_vla.model import masked_mean
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.masking import masked_mean
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, MemoryTokens, Noise, map_noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -234,7 +233,9 @@ class DiffusionPolicy(Policy):
         memory = None
         if self.memory is not None:
             with torch.no_grad(), self.autocast():
-                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+                memory = encode_histories(
+                    self.memory, [e.required_history() for e in episodes], [e.stream for e in episodes]
+                )
         return self.sample_actions(batch, draws, steps, memory)
 
     @torch.no_grad()
@@ -292,7 +293,7 @@ class DiffusionPolicy(Policy):
             state=torch.zeros(1, sizes.window, robot.state.width, device=device),
             text=torch.zeros(1, sizes.text_dim, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(sizes.memory_width, device),
+            history=None if self.memory is None else full_history(self.memory, sizes.memory_width, device),
         )
 
     def warm_up_vision(self) -> None:

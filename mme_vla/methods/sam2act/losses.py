@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Noise
 from mme_vla.methods.sam2act.geometry import ZOOM, Cube, heatmap_loss, shift_and_rotate, to_bins
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import KeyframeBatch, cloud_images, zoomed_images
+from mme_vla.types import Noise
 
 SHIFT, ROTATION = 0.125, math.pi / 4
 """Augmentation as released: shifts to this part of the cube's sides, turns to this angle."""

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Noise, map_noise
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.methods.sam2act.config import SAM2ActSizes
@@ -24,6 +23,7 @@ from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
+from mme_vla.types import Noise, map_noise
 
 if TYPE_CHECKING:
     from mme_vla.policy.episode import Episode
