@@ -1,8 +1,7 @@
 """One running episode: all streaming state lives here, never on the policy."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
@@ -11,7 +10,9 @@ from torch import Tensor
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
 from mme_vla.memory.history import History, OnlineHistory
-from mme_vla.policy.promises import ActionPrefix, checked_prefix
+from mme_vla.policy.action_prefix import ActionPrefix, checked_prefix
+from mme_vla.policy.capabilities import with_vision_memory
+from mme_vla.processing.base import motion_rows
 from mme_vla.processing.images import PastImages
 from mme_vla.processing.normalise import check_reach, finite_array
 from mme_vla.processing.prompt import checked_text
@@ -20,40 +21,6 @@ from mme_vla.types import HistoryTokens, PastViews
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
     from mme_vla.processing.base import PolicyProcessor
-
-
-@dataclass(frozen=True)
-class MemoryEntries:
-    """One store of what was written.
-
-    entries: (time, content) in the order they are read. now: the current moment, on the clock of these times.
-    """
-
-    name: str
-    entries: tuple[tuple[int, Tensor], ...]
-    now: int
-
-
-@runtime_checkable
-class WritableMemory(Protocol):
-    """What such an episode offers; a probe asks for no more."""
-
-    @property
-    def memory_clock(self) -> str | None:
-        """What the times of entries count (`moments`); None where entries have an order alone."""
-        ...
-
-    def writable_memory(self) -> tuple[MemoryEntries, ...]:
-        """All stores."""
-        ...
-
-    def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
-        """This episode with other entries in its stores, for one chunk; it stays as it is itself."""
-        ...
-
-    def resume_from(self, twin: "Episode") -> None:
-        """Go on from a chunk that was chosen for an episode of `as_if_written`, with one's own entries."""
-        ...
 
 
 class Host(Protocol):
@@ -65,11 +32,7 @@ class Host(Protocol):
     @property
     def embodiment(self) -> Embodiment: ...
 
-    def require_memory(self) -> "Memory": ...
-
     def require_processor(self) -> "PolicyProcessor": ...
-
-    def encode_frames(self, frames: np.ndarray) -> Tensor: ...
 
     def sampling_noise(self, generator: torch.Generator) -> dict[str, Tensor]: ...
 
@@ -89,7 +52,7 @@ class Episode:
         self.options: tuple[Option, ...] = ()
         """What can be chosen, for policies that choose; set it before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else memory.start_history(policy.encode_frames)
+        self.history = None if memory is None else memory.start_history(with_vision_memory(policy).encode_frames)
         if self.history is not None and memory is not None and memory.reads_motion:
             self.history.motion = lambda frames: torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
             self.history.state_width = policy.embodiment.state.width
@@ -149,7 +112,8 @@ class Episode:
         check_reach(states, None if processor.stats is None else processor.stats.state, "a state")
         demo, executed = self._checked_course(count, demo, actions)
         # Of the frames that the window has room for, those of the execution; the current one in any case.
-        recent = range(max(count - processor.window, 0) if processor.consecutive else count - 1, count)
+        samples = processor.samples
+        recent = range(max(count - samples.window, 0) if samples.consecutive else count - 1, count)
         new_frames = [
             (self._prepared_images(views, rendered, i), torch.from_numpy(states[i].copy()))
             for i in recent
@@ -242,16 +206,20 @@ class Episode:
         """Append checked frames to the history, and note what was executed."""
         if self.history is not None:
             motion = self._motion(demo, executed, states)
-            self.history.take(frames, self._policy.encode_frames, rendered, len(demo))
+            self.history.take(frames, with_vision_memory(self._policy).encode_frames, rendered, len(demo))
             self._motion_of_frames += motion
             if not self._video_over:
                 self.history.exec_start = self.n_observed_frames + int(demo.sum())
-        longest = self._policy.require_processor().past_actions
+        longest = self._policy.require_processor().prompt_spec.past_actions
         past = np.concatenate([self._executed, executed])
         self._executed = past[max(len(past) - longest, 0) :]
         self._chunk = None if self._chunk is None else self._chunk[int((~demo).sum()) :]
         self._video_over = self._video_over or not bool(demo[-1])
         self.n_observed_frames += len(demo)
+
+    @property
+    def _memory(self) -> "Memory":
+        return with_vision_memory(self._policy).require_memory()
 
     def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
         """Rows of motion of the next frames, for a memory that reads them.
@@ -259,7 +227,7 @@ class Episode:
         Raises:
             UserError: it does, and there are no states, or no statistics.
         """
-        if not self._policy.require_memory().reads_motion:
+        if not self._memory.reads_motion:
             return []
         if states is None:
             raise UserError(
@@ -270,12 +238,12 @@ class Episode:
         if self._robot.action.frames is not None:
             places = np.flatnonzero(~demo)[: len(executed)]
             actions[places], known[places] = executed[: len(places)], True
-        return list(self._policy.require_processor().motion(states, actions, known))
+        return list(motion_rows(self._policy.require_processor(), states, actions, known))
 
     def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
         history = self.required_history()
-        return self._policy.require_memory().gather_selection(history, len(history) - 1)
+        return self._memory.gather_selection(history, len(history) - 1)
 
     def required_history(self) -> OnlineHistory:
         """The history, once there is something in it.
@@ -283,9 +251,9 @@ class Episode:
         Raises:
             UserError: the policy has no memory, or the episode has seen no frame.
         """
-        self._policy.require_memory()
+        if self.history is None:
+            raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
         self._require_observation()
-        assert self.history is not None
         return self.history
 
     @property
@@ -314,7 +282,7 @@ class Episode:
             UserError: no frame was seen yet, or one of these was not drawn.
         """
         self._require_observation()
-        missing = self._policy.require_processor().window - len(self._recent)
+        missing = self._policy.require_processor().samples.window - len(self._recent)
         frames = [self._recent[0]] * missing + self._recent
         return torch.stack([self._require_rendered(images) for images, _ in frames]), torch.stack(
             [state for _, state in frames]
@@ -410,7 +378,7 @@ class Episode:
 
     def _see(self, frames: Sequence[tuple[Tensor | None, Tensor]]) -> None:
         """Take what is new into the window."""
-        self._recent = [*self._recent, *frames][-self._policy.require_processor().window :]
+        self._recent = [*self._recent, *frames][-self._policy.require_processor().samples.window :]
 
     def _require_observation(self) -> None:
         if not self._recent:

@@ -10,22 +10,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Backbone, Noise, Inject, map_noise, named_noise, stack_noise
+from mme_vla.backbone.base import Backbone, Inject, Noise, map_noise, named_noise, stack_noise
 from mme_vla.backbone.config import read_backbone, shapes_only
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import Memory
 from mme_vla.memory.history import PromptConditionedHistory
+from mme_vla.policy.action_prefix import prefix_overlap
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.masking import masked_mean
-from mme_vla.policy.promises import prefix_overlap
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy, masked_mean
 from mme_vla.policy.saving import policy_options
-from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.policy.vision_cache import encode_frames, tower_fingerprint
 from mme_vla.processing.images import full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed.graphs import CapturedSampling
@@ -38,7 +37,7 @@ if TYPE_CHECKING:
 
 
 @POLICIES.register("mme")
-class MMEPolicy(Policy):
+class MMEPolicy(NetworkPolicy):
     """One composition of backbone, memory and integration.
 
     The two independent choices meet here and nowhere else; no method asks which variant it is.
@@ -55,37 +54,25 @@ class MMEPolicy(Policy):
         processor: "PolicyProcessor | None" = None,
         config: Mapping[str, Any] | None = None,
         *,
-        compute_dtype: str = "float32",
-        history_dtype: str = "bfloat16",
-        augment: bool = True,
         attention: str = "auto",
         float32_products: str = "ieee",
+        **options: Any,
     ) -> None:
         """Put the parts together.
 
         Args:
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: what `from_config` was given; saved with the weights.
-            compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
-            history_dtype: dtype of stored vision tokens; bfloat16 as released.
-            augment: augment the current views while training (memory features never are).
             attention: what computes it: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
+            processor, config, options: of `NetworkPolicy`.
         """
-        super().__init__()
+        super().__init__(processor, config, **options)
         self.backbone, self.memory, self.integration = backbone, memory, integration
-        self.processor = processor
-        self.config = dict(config or {})
-        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.augment = augment
         backbone.set_attention_backend(attention)
         if memory is not None:
             memory.set_matmul_precision(checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         self.sample_steps = backbone.sample_steps
         self.supports_rtc = backbone.supports_rtc
-        self.lora_targets, self.heads, self.lora_exclude = backbone.lora_targets, backbone.heads, backbone.lora_exclude
 
     @classmethod
     def from_config(
@@ -119,11 +106,6 @@ class MMEPolicy(Policy):
             memory = build_memory(config["memory"], backbone.vision_width, backbone.grid, integration.memory_width)
         check_integrated(config, integration, memory, backbone_cls.supports)
         return cls(backbone, memory, integration, processor, config, **policy_options(cls, config))
-
-    def autocast(self) -> torch.autocast:
-        """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     # Training
 
@@ -191,12 +173,6 @@ class MMEPolicy(Policy):
 
     def _inject(self, memory: MemoryTokens | None) -> Inject:
         return lambda observation: self.integration.inject(observation, memory)
-
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Memory tokens of a selection, or None for a policy without memory."""
-        if self.memory is None or history is None:
-            return None
-        return self.memory(history)
 
     def _conditioned_history(self, batch: Batch) -> HistoryTokens | None:
         """The batch's selection as the backbone reads it beside the prompt."""
@@ -354,14 +330,9 @@ class MMEPolicy(Policy):
         """Stored tokens [n, d_vision] of one episode, read beside its prompt [l]."""
         return self.backbone.mark(tokens[None], prompt[None], prompt_mask[None])[0]
 
-    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
-        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        return encode_frames(self, frames, self.backbone.pooled_tokens, self.backbone.vision_width, batch_size)
-
-    def vision_fingerprint(self) -> str:
-        """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        image_format = "" if self.processor is None else self.processor.memory_image_format
-        return tower_fingerprint(self.backbone.vision, self.compute_dtype, image_format)
+    @property
+    def memory_tower(self) -> MemoryTower:
+        return MemoryTower(self.backbone.vision, self.backbone.pooled_tokens, self.backbone.vision_width)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""
@@ -384,30 +355,28 @@ class MMEPolicy(Policy):
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         processor = self.require_processor()
-        for name in ("image_size", "action_dim", "horizon"):
-            actual, expected = getattr(processor, name), getattr(self.backbone, name)
-            if actual != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                    "from two checkpoints, or one was changed."
-                )
+        sizes = {
+            name: (getattr(processor, name), getattr(self.backbone, name)) for name in ("image_size", "action_dim")
+        }
+        return {**sizes, "horizon": (processor.embodiment.action.horizon, self.backbone.horizon)}
 
-    def parts(self) -> Mapping[str, str]:
-        """The backbone's parts in its order; memory, integration and the latter's experts are the part `memory`."""
-        parts = {part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items()}
-        experts = f"|{parts['memory']}" if "memory" in parts else ""
-        return {**parts, "memory": rf"memory\.|integration\.{experts}"}
+    @property
+    def finetune_spec(self) -> FineTuneSpec:
+        """The backbone's components in its order; memory, integration and its experts are the component `memory`."""
+        backbone = self.backbone
+        components = {name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()}
+        experts = f"|{components['memory']}" if "memory" in components else ""
+        components["memory"] = rf"memory\.|integration\.{experts}"
+        return FineTuneSpec(components, backbone.lora_targets, backbone.heads, backbone.lora_exclude)
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:
     """The policy, where it is made of backbone, memory and integration."""
     if not isinstance(policy, MMEPolicy):
         raise UserError(
-            f"{what} looks inside a backbone that a memory is integrated with; {policy.config.get('name', 'this')} is "
-            f"a {type(policy).__name__}, which has none."
+            f"{what} requires a policy of backbone, memory and integration; "
+            f"{policy.config.get('name', 'this')} is a {type(policy).__name__}."
         )
     return policy

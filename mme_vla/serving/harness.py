@@ -87,7 +87,7 @@ class MMEVLAModelServer(PredictModelServer):
                 "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
             )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
-        settings.check_robot(robot, self.policy.require_processor().past_actions)
+        settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
         self.sessions: dict[str, Running] = {}
         super().__init__(

@@ -162,7 +162,7 @@ class Session:
 
     @property
     def _reads_past_actions(self) -> bool:
-        return self._engine.policy.require_processor().past_actions > 0
+        return self._engine.policy.require_processor().prompt_spec.past_actions > 0
 
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""

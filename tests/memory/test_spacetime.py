@@ -132,7 +132,7 @@ def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_differenc
     for index in (0, 12):
         step, batch = dataset.step(index), collate([dataset[index]])
         frames = np.arange(step.index + 1)
-        views = {name: source.frames(0, frames, name) for name in processor.cameras}
+        views = {name: source.frames(0, frames, name) for name in processor.embodiment.camera_names}
         states, demo = source.states(0, 0, len(frames)), frames < start
         for piece in (len(frames), 7):
             episode = policy.start_episode(step.goal, seed=1)

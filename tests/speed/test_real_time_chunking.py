@@ -6,7 +6,7 @@ import torch
 
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.speed.rtc import STRONGEST, rtc_guidance, overlap_weights, strength
+from mme_vla.speed.rtc import STRONGEST, overlap_weights, rtc_guidance, strength
 from mme_vla.testing.small import moving_frames, small_policy
 from mme_vla.types import Overlap
 

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from mme_vla.memory.extensions.bank import BankState
 from mme_vla.methods.memoryvla.model import BankStates, MemoryVlaCore
-from mme_vla.policy.episode import Episode, Host, MemoryEntries
+from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.policy.episode import Episode, Host
 
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
 

@@ -14,7 +14,8 @@ from mme_vla.methods.sam2act.geometry import ZOOM, Cube, PointFinder, angles_of_
 from mme_vla.methods.sam2act.memory import BankState
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import SAM2ActProcessor, Shot, cloud_images, zoomed_images
-from mme_vla.policy.episode import Episode, Host, MemoryEntries
+from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.policy.episode import Episode, Host
 
 
 @dataclass(frozen=True)

@@ -221,9 +221,9 @@ class Heads(nn.Module):
         self.rates: Tensor
         self.register_buffer("rates", code_rates(width), persistent=False)
 
-    def compute_rates(self, device: torch.device) -> None:
-        """Give the codes' rates their values, where the module was built on meta."""
-        self.rates = code_rates(2 * len(self.rates)).to(device)
+    def reset_buffers(self) -> None:
+        """Compute the codes' rates, if the module was built on meta."""
+        self.rates = code_rates(2 * len(self.rates)).to(self.norm.weight.device)
 
     def features(self, tokens: Tensor, waypoints: Tensor) -> Tensor:
         """What the heads read [b, f] of tokens [b·3, token, g, g] at waypoints [b, 3] of the closer look's cube."""

@@ -18,9 +18,9 @@ from mme_vla.methods.sam2act.losses import augmentation_draws, augmented, first_
 from mme_vla.methods.sam2act.memory import BankState
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import NAME, KeyframeBatch, SAM2ActProcessor
-from mme_vla.policy.base import Policy
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import policy_options
-from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
@@ -60,19 +60,11 @@ WIDTH = 7
 
 
 @POLICIES.register(NAME)
-class SAM2ActPolicy(Policy):
+class SAM2ActPolicy(NetworkPolicy):
     """SAM2Act+ (RoboMME's fine-tuned model): one waypoint at a time, which the benchmark's planner moves to."""
 
     processor: SAM2ActProcessor | None
     memory = None  # its memory stands inside the network, between transformer and decoder
-    lora_targets = ("to_q", "to_kv")
-    heads = ("heads",)
-    PARTS: Mapping[str, str] = {
-        "vision": r"backbone\.encoder\.vision\.(?!.*\.linear_[ab]_[qv]\.)",
-        "adapters": r"backbone\.encoder\.vision\.",
-        "memory": r"backbone\.memory\.",
-        "action": "",
-    }
 
     def __init__(
         self,
@@ -81,26 +73,16 @@ class SAM2ActPolicy(Policy):
         config: Mapping[str, Any] | None = None,
         *,
         stage: str = "memory",
-        compute_dtype: str = "float32",
-        history_dtype: str = "bfloat16",
-        augment: bool = True,
+        **options: Any,
     ) -> None:
         """Put the parts together.
 
         Args:
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: what `from_config` was given; saved with the weights.
             stage: which of the authors' two stages trains: `first` or `memory`.
-            compute_dtype: as for `MMEPolicy`; the authors train in float16. history_dtype: of no use here.
-            augment: shift and turn clouds while training.
+            processor, config, options: of `NetworkPolicy`. The authors train in float16.
         """
-        super().__init__()
-        self.backbone, self.processor = backbone, processor
-        self.config = dict(config or {})
-        self.stage, self.augment = check_stage(stage), augment
-        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.frozen = rf"backbone\.(?!{STAGES[stage]})"
+        super().__init__(processor, config, **options)
+        self.backbone, self.stage = backbone, check_stage(stage)
         self.horizon, self.action_dim = 1, WIDTH
         # Single keyframes first, then one more than can be remembered.
         self.keyframes = 1 if stage == "first" else backbone.sizes.remembered + 1
@@ -122,14 +104,8 @@ class SAM2ActPolicy(Policy):
             raise UserError("SAM2Act+ needs its own processor: set processor=sam2act_plus.")
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
-    def compute_unsaved(self) -> None:
-        """Give the heads' constants their values, where they were built on meta; nothing else is computed."""
-        heads = self.backbone.fine.heads
-        assert heads is not None
-        heads.compute_rates(self.device)
-
     @property
-    def max_actions(self) -> int | None:  # type: ignore[override]
+    def max_actions(self) -> int | None:
         """Waypoints of an episode, which its clock counts to."""
         return None if self.processor is None else self.processor.waypoints
 
@@ -142,11 +118,6 @@ class SAM2ActPolicy(Policy):
     def cube(self) -> Cube:
         """The part of the world that is looked at: its processor's, else its configuration's."""
         return Cube.of(self.config["processor"]["bounds"]) if self.processor is None else self.processor.cube
-
-    def autocast(self) -> torch.autocast:
-        """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     # Training
 
@@ -250,18 +221,26 @@ class SAM2ActPolicy(Policy):
         assert isinstance(processor, SAM2ActProcessor)
         return processor
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         text, sizes = self.require_processor().text, self.backbone.sizes
-        for name, actual, expected in (("language", text.width, sizes.language), ("words", text.words, sizes.words)):
-            if actual != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                    "from two checkpoints, or one was changed."
-                )
+        return {"language": (text.width, sizes.language), "words": (text.words, sizes.words)}
 
-    # Costs and parts
+    @property
+    def finetune_spec(self) -> FineTuneSpec:
+        """`vision` is SAM2's encoder, of which only the `adapters` are trained."""
+        return FineTuneSpec(
+            components={
+                "vision": r"backbone\.encoder\.vision\.(?!.*\.linear_[ab]_[qv]\.)",
+                "adapters": r"backbone\.encoder\.vision\.",
+                "memory": r"backbone\.memory\.",
+                "action": "",
+            },
+            lora_targets=("to_q", "to_kv"),
+            full_train=("heads",),
+            frozen=rf"backbone\.(?!{STAGES[self.stage]})",
+        )
+
+    # Costs
 
     def full_batch(self, device: torch.device | str = "cpu") -> KeyframeBatch:
         """A batch of one without content, as the stage trains on it."""
@@ -283,7 +262,3 @@ class SAM2ActPolicy(Policy):
         """Run the encoder on the virtual images of nothing."""
         side = self.backbone.encoder.side
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))
-
-    def parts(self) -> Mapping[str, str]:
-        """`vision` is SAM2's encoder, which never learns but for its `adapters`."""
-        return self.PARTS

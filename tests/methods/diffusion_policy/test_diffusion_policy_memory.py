@@ -66,7 +66,7 @@ def test_what_is_remembered_changes_the_answer_and_learns(policy: DiffusionPolic
     assert not torch.allclose(chunks[0], chunks[1])
     policy.zero_grad()
     policy(batch)[0].backward()
-    learnt = [p for name, p in policy.named_parameters() if policy.component_of(name) == "memory"]
+    learnt = [p for name, p in policy.named_parameters() if policy.finetune_spec.component_of(name) == "memory"]
     assert learnt and all(p.grad is not None and p.grad.abs().sum() > 0 for p in learnt)
     policy.zero_grad()
 

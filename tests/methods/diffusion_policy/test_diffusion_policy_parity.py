@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -316,7 +317,7 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
     policy = built({**fitting[0][2], **{key: about[key] for key in ("weight_seed",) if key in about}})
     processor = policy.require_processor()
     processor.stats = NormStats(statistics_of(arrays, "state"), statistics_of(arrays, "action"))
-    processor.consecutive = False  # as that server does
+    processor.samples = replace(processor.samples, consecutive=False)  # as that server does
     processor.text = lambda goal: arrays["in/text_emb"]
     seen: list[Tensor] = []
     condition = policy.condition
