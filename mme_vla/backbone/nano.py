@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from mme_vla.backbone import flow
 from mme_vla.backbone.attention import additive_mask, attend
-from mme_vla.backbone.base import Backbone, Noise, Hook, Inject, Injection
+from mme_vla.backbone.base import Backbone, Hook, Inject, Injection, Noise
 from mme_vla.backbone.blocks import Block
 from mme_vla.backbone.config import ExpertConfig, check_positive
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm

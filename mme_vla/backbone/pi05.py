@@ -9,7 +9,7 @@ from torch.nn import functional
 
 from mme_vla.backbone import flow
 from mme_vla.backbone.attention import check_backend
-from mme_vla.backbone.base import Backbone, Noise, Inject, Injection
+from mme_vla.backbone.base import Backbone, Inject, Injection, Noise
 from mme_vla.backbone.blocks import Block
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout

@@ -126,7 +126,7 @@ class Episode:
             self._past.take(views, count, rendered)
         self._see(new_frames)
 
-    def remember(
+    def add_frames(
         self,
         frames: np.ndarray,
         is_demo: bool | np.ndarray = False,
@@ -135,7 +135,7 @@ class Episode:
     ) -> None:
         """Take frames into memory alone, for a client that sends past frames and the current view apart.
 
-        Followed by `look` at the last of them it is what `observe` does.
+        `add_frames`, then `set_view` at the last of them, is what `observe` does.
 
         Args:
             frames: of the memory camera, [t, H, W, 3] uint8, in order, each once.
@@ -157,7 +157,7 @@ class Episode:
             proprio = None if states is None else finite_array(states, "states")
             self._take(frames, *self._checked_course(len(frames), demo, actions), states=proprio)
 
-    def look(self, views: Mapping[str, np.ndarray], state: np.ndarray) -> None:
+    def set_view(self, views: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Set the current view and state, adding nothing to memory.
 
         Args:
@@ -171,9 +171,9 @@ class Episode:
         state = finite_array(state, "the state")
         width, names = self._robot.state.width, self._robot.camera_names
         if state.shape != (width,):
-            raise UserError(f"look() needs a state of {width} finite numbers, got shape {state.shape}.")
+            raise UserError(f"set_view() needs a state of {width} finite numbers, got shape {state.shape}.")
         if lacking := [name for name in names if name not in views]:
-            raise UserError(f"look() needs an image of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
+            raise UserError(f"set_view() needs an image of {', '.join(lacking)} too; got {', '.join(views) or 'none'}.")
         processor = self._policy.require_processor()
         check_reach(state, None if processor.stats is None else processor.stats.state, "the state")
         images = processor.images([views[name] for name in names])

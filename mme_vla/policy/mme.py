@@ -183,7 +183,7 @@ class MMEPolicy(NetworkPolicy):
 
     def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
         """The random numbers that change the images of `count` training samples, [count, …] on the CPU."""
-        from mme_vla.processing.augment import augmentation_draws
+        from mme_vla.processing.images import augmentation_draws
 
         return augmentation_draws(count, generator)
 
@@ -199,8 +199,7 @@ class MMEPolicy(NetworkPolicy):
 
     def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
         """The current views in [−1, 1], changed where random numbers say how (`_draw_changes`)."""
-        from mme_vla.processing.augment import augment_views
-        from mme_vla.processing.images import to_unit_range
+        from mme_vla.processing.images import augment_views, to_unit_range
 
         images = to_unit_range(batch.images)
         return images if changes is None else augment_views(images, self.embodiment.augmentations, changes)

@@ -102,7 +102,7 @@ class ProbedEpisode(Episode):
     def acted(self, chunk: np.ndarray) -> None:
         self.inner.acted(chunk)
 
-    def remember(
+    def add_frames(
         self,
         frames: np.ndarray,
         is_demo: bool | np.ndarray = False,
@@ -110,11 +110,11 @@ class ProbedEpisode(Episode):
         states: np.ndarray | None = None,
     ) -> None:
         """Not offered: an arm decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
+        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
 
-    def look(self, images: Mapping[str, np.ndarray], state: np.ndarray) -> None:
+    def set_view(self, images: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Not offered: an arm decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
+        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
 
 
 class _Frames:

@@ -155,7 +155,7 @@ class MMEVLAModelServer(PredictModelServer):
         episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
-            episode.remember(np.stack(video), is_demo=True)
+            episode.add_frames(np.stack(video), is_demo=True)
         episode.observe({name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states))
         return episode
 

@@ -215,9 +215,9 @@ def test_own_actions_read_what_was_done_and_no_picture() -> None:
 
 def test_past_frames_without_states_are_refused() -> None:
     with pytest.raises(UserError, match="with their states"):
-        mover().start_episode("press the button").remember(moving_frames(3))
+        mover().start_episode("press the button").add_frames(moving_frames(3))
     episode = mover().start_episode("press the button")
-    episode.remember(moving_frames(3), states=np.zeros((3, 8), np.float32))
+    episode.add_frames(moving_frames(3), states=np.zeros((3, 8), np.float32))
     assert episode.history is not None and len(episode.history) == 3
 
 

@@ -189,9 +189,9 @@ def test_past_frames_of_one_camera_are_not_enough() -> None:
     episode = small().start_episode("press the button")
     pictures = moving_frames(4)
     with pytest.raises(UserError, match="of every camera"):
-        episode.remember(pictures)
+        episode.add_frames(pictures)
     with pytest.raises(UserError, match="of every camera"):
-        episode.look({"front": pictures[0], "wrist": pictures[0]}, np.zeros(8))
+        episode.set_view({"front": pictures[0], "wrist": pictures[0]}, np.zeros(8))
     drawn = {"front": np.arange(8), "wrist": np.array([7])}
     both = {"front": np.concatenate([pictures, pictures]), "wrist": pictures[:1]}
     episode.observe(both, np.zeros((8, 8), np.float32), rendered=drawn)

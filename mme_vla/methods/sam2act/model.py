@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.geometry import VIEWS, project, read_maps
-from mme_vla.methods.sam2act.image_encoder import ImageEncoder
-from mme_vla.methods.sam2act.memory import BankState, KeyframeBank, released_positions
+from mme_vla.methods.sam2act.sam2 import BankState, ImageEncoder, KeyframeBank, released_positions
 from mme_vla.speed.recompute import Recompute, run_layer
 
 _NEIGHBOURS = 9

@@ -15,8 +15,15 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, missing_extra
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
-from mme_vla.methods.sam2act.geometry import VIEWS, Cube, constant_channels, quaternions_of, unproject
-from mme_vla.methods.sam2act.render import EMPTY, virtual_images
+from mme_vla.methods.sam2act.geometry import (
+    EMPTY,
+    VIEWS,
+    Cube,
+    constant_channels,
+    quaternions_of,
+    unproject,
+    virtual_images,
+)
 from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, SampleSpec
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.registry import PROCESSORS

@@ -87,8 +87,8 @@ def test_an_episode_remembers(policy: DiffusionPolicy) -> None:
     def answer(seed: int) -> np.ndarray:
         episode = policy.start_episode("find the cube")
         past = moving_frames(8, seed=seed)
-        episode.remember(past, np.arange(8) < 7)
-        episode.look({"front": moving_frames(1)[0], "wrist": moving_frames(1)[0]}, np.zeros(8, np.float32))
+        episode.add_frames(past, np.arange(8) < 7)
+        episode.set_view({"front": moving_frames(1)[0], "wrist": moving_frames(1)[0]}, np.zeros(8, np.float32))
         return policy.act(episode, 2)
 
     same, again, other = answer(0), answer(0), answer(5)

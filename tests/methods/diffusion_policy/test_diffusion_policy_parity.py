@@ -335,7 +335,7 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
         draws = {"noise": arrays[f"{call}/sample_noise"][0], "added": arrays[f"{call}/step_noise"][:, 0]}
         monkeypatch.setattr(episode, "draw", lambda draws=draws: draws)
         views = {name: arrays[f"{call}/{name}"].numpy() for name in ROBOMME_JOINT.camera_names}
-        episode.look(views, arrays[f"{call}/state"].float().numpy())
+        episode.set_view(views, arrays[f"{call}/state"].float().numpy())
         actions = policy.act(episode)[: about["action_exec_horizon"]]
         close(seen[-1], arrays[f"{call}/global_cond"], SAMPLES)
         close(torch.from_numpy(actions).double(), arrays[f"{call}/actions"].double(), SAMPLES)
