@@ -8,15 +8,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Noise, stack_noise
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import MemoryModule
 from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
 from mme_vla.policy.saving import load_policy, push_to_hub, save_policy
+from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -31,7 +31,7 @@ class Policy(nn.Module):
     depend on its batch.
     """
 
-    memory: Memory | None
+    memory: MemoryModule | None
     processor: "PolicyProcessor | None"
     config: dict[str, Any]
     """What `from_config` was given; saved with the weights."""
@@ -75,11 +75,11 @@ class Policy(nn.Module):
         """Sample the random numbers for the losses of `count` samples, on the CPU: each value [count, …]."""
         return {}
 
-    def forward(self, batch: Any, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, batch: Any, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of a batch, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. draws: of `training_noise`, on the policy's device; sampled by default.
+            batch: with `actions`. noise: of `training_noise`, on the policy's device; sampled by default.
         """
         raise NotImplementedError
 
@@ -89,11 +89,11 @@ class Policy(nn.Module):
         """Sample the random numbers for one chunk, on the CPU, without a batch axis."""
         return {}
 
-    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
+    def sample_actions(self, batch: Any, noise: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
         """Sample a normalised chunk [b, h, a].
 
         Args:
-            draws: of `sampling_noise`, with a batch axis, on the policy's device; sampled by default.
+            noise: of `sampling_noise`, with a batch axis, on the policy's device; sampled by default.
             steps: of an iterative sampler; its default by default.
         """
         raise NotImplementedError
@@ -127,11 +127,11 @@ class Policy(nn.Module):
             )
         processor.require_stats()  # before the noise or memory of an episode changes
         batch = self.observation(episodes)
-        draws = stack_noise([e.draw() for e in episodes])
+        noise = stack_noise([e.draw() for e in episodes])
         was_training = self.training
         self.eval()
         try:
-            chunk = self.answer(batch, episodes, draws, steps).float().cpu()
+            chunk = self.answer(batch, episodes, noise, steps).float().cpu()
         finally:
             self.train(was_training)
         absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
@@ -146,7 +146,7 @@ class Policy(nn.Module):
         raise NotImplementedError
 
     def answer(
-        self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: Any, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """Sample a normalised chunk [n, h, a] for an `observation`, with the memories of the episodes."""
         raise NotImplementedError

@@ -11,13 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise
 from mme_vla.errors import UserError
-from mme_vla.speed.recompute import Recompute
-from mme_vla.speed.sharding import ShardGroup
+from mme_vla.types import Noise
 
 if TYPE_CHECKING:
-    from mme_vla.memory.base import Memory
+    from mme_vla.memory.base import MemoryModule
     from mme_vla.policy.episode import Episode
 
 
@@ -28,7 +26,7 @@ class HasVisionMemory(Protocol):
     history_dtype: torch.dtype
     """Of stored vision tokens."""
 
-    def require_memory(self) -> "Memory":
+    def require_memory(self) -> "MemoryModule":
         """Return the memory, or raise a `UserError`."""
         ...
 
@@ -84,24 +82,6 @@ class AugmentsImages(Protocol):
 
     def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """Random numbers [count, …] on the CPU for the images of `count` samples, beside `training_noise`'s."""
-        ...
-
-
-@runtime_checkable
-class Recomputes(Protocol):
-    """Can recompute activations in the backward pass instead of keeping them."""
-
-    def recompute(self, mode: Recompute) -> None:
-        """Set the mode: all, `selective` or none."""
-        ...
-
-
-@runtime_checkable
-class HasShardGroups(Protocol):
-    """Names the modules whose weights processes gather together; by default the stacked layers."""
-
-    def shard_groups(self) -> Sequence[ShardGroup]:
-        """All other weights are gathered for the full pass, in float32."""
         ...
 
 

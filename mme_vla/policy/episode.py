@@ -9,6 +9,7 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
+from mme_vla.memory.base import past_view_spec, start_history, start_stream, uses_proprio
 from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.policy.action_prefix import ActionPrefix, checked_prefix
 from mme_vla.policy.capabilities import with_vision_memory
@@ -19,7 +20,7 @@ from mme_vla.processing.prompt import checked_text
 from mme_vla.types import HistoryTokens, PastViews
 
 if TYPE_CHECKING:
-    from mme_vla.memory.base import Memory
+    from mme_vla.memory.base import MemoryModule
     from mme_vla.processing.base import PolicyProcessor
 
 
@@ -27,7 +28,7 @@ class Host(Protocol):
     """What an episode asks of its policy."""
 
     @property
-    def memory(self) -> "Memory | None": ...
+    def memory(self) -> "MemoryModule | None": ...
 
     @property
     def embodiment(self) -> Embodiment: ...
@@ -52,15 +53,15 @@ class Episode:
         self.options: tuple[Option, ...] = ()
         """What can be chosen, for policies that choose; set it before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else memory.start_history(with_vision_memory(policy).encode_frames)
-        if self.history is not None and memory is not None and memory.reads_motion:
+        self.history = None if memory is None else start_history(memory, with_vision_memory(policy).encode_frames)
+        if self.history is not None and uses_proprio(memory):
             self.history.motion = lambda frames: torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
             self.history.state_width = policy.embodiment.state.width
-        self.stream = None if memory is None else memory.start_stream()
+        self.stream = start_stream(memory)
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.read: History | None = None
         """The history as the last `act` read it, where a backbone marks what is stored."""
-        spec = None if memory is None else memory.past_view_spec
+        spec = past_view_spec(memory)
         self._past = None if spec is None else PastImages(spec)
         self.n_observed_frames = 0
         self._motion_of_frames: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
@@ -218,7 +219,7 @@ class Episode:
         self.n_observed_frames += len(demo)
 
     @property
-    def _memory(self) -> "Memory":
+    def _memory(self) -> "MemoryModule":
         return with_vision_memory(self._policy).require_memory()
 
     def _motion(self, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None) -> list[Tensor]:
@@ -227,7 +228,7 @@ class Episode:
         Raises:
             UserError: it does, and there are no states, or no statistics.
         """
-        if not self._memory.reads_motion:
+        if not uses_proprio(self._memory):
             return []
         if states is None:
             raise UserError(

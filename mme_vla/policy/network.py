@@ -9,11 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import MemoryModule, StreamingMemory, encode_histories
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.processing.base import HasMemoryImages
+from mme_vla.speed.recompute import Recomputes
+from mme_vla.speed.sharding import Sharded
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:
@@ -33,7 +35,7 @@ class MemoryTower(NamedTuple):
     settings: Sequence[str] = ()
 
 
-class NetworkPolicy(Policy):
+class NetworkPolicy(Policy, Recomputes, Sharded):
     """A policy of one network.
 
     A subclass sets its modules and `memory`, and implements `memory_tower` if it has a memory, `processor_sizes`, and
@@ -82,7 +84,7 @@ class NetworkPolicy(Policy):
         """The tower of the stored vision tokens."""
         raise NotImplementedError
 
-    def require_memory(self) -> Memory:
+    def require_memory(self) -> MemoryModule:
         """Return the memory, or raise a `UserError`."""
         if self.memory is None:
             raise UserError("This policy has no memory, so it stores no vision tokens of past frames.")
@@ -101,12 +103,13 @@ class NetworkPolicy(Policy):
         if self.memory is None:
             return None
         with self.autocast():
-            return self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+            histories, streams = [e.required_history() for e in episodes], [e.stream for e in episodes]
+            return encode_histories(self.memory, histories, streams)
 
     @torch.no_grad()
     def prepare(self, episode: Episode) -> bool:
         """Read a piece of what the next memory tokens need; return whether more remain."""
-        if self.memory is None or not episode.n_observed_frames:
+        if not isinstance(self.memory, StreamingMemory) or not episode.n_observed_frames:
             return False
         with self.autocast():
             return self.memory.prepare(episode.required_history(), episode.stream)
@@ -139,15 +142,3 @@ class NetworkPolicy(Policy):
         for setting in filter(None, source.settings):
             digest.update(setting.encode())
         return digest.hexdigest()
-
-
-def masked_mean(losses: Tensor, mask: Tensor | None) -> Tensor:
-    """The mean of losses [b, h] over the steps that count, of each sample first, so that batching does not change it.
-
-    Args:
-        mask: [b, h] bool (`data.mask_padding`); None counts all.
-    """
-    if mask is None:
-        return losses.mean()
-    weights = mask.to(losses.dtype)
-    return ((losses * weights).sum(1) / weights.sum(1).clamp(min=1)).mean()

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise
 from mme_vla.config.sections import read_section
 from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.policy.base import Policy
@@ -22,6 +21,7 @@ from mme_vla.probing.lines import EntryLine, Line, MomentLine
 from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy
 from mme_vla.probing.recordings import Recording, others
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.types import Noise
 
 
 @dataclass(frozen=True)

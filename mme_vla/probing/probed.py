@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise, stack_noise
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
@@ -20,6 +19,7 @@ from mme_vla.probing.channels import Channel, MemorySnapshot, Remembered, channe
 from mme_vla.probing.interventions import Moment
 from mme_vla.probing.recordings import SUBGOAL, Recording, others, stored_frames
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.types import Noise, stack_noise
 
 
 class Prober(Host, Protocol):

@@ -16,7 +16,8 @@ from mme_vla.data.dataset import TrainingDataset
 from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import AugmentsImages, Recomputes
+from mme_vla.policy.capabilities import AugmentsImages
+from mme_vla.speed.recompute import Recomputes
 from mme_vla.training.checkpoint import (
     checkpoint_name,
     restore,
@@ -99,13 +100,13 @@ class Trainer:
         if not self.sharded:
             policy.to(accelerator.device)
         self.policy = policy.train()
-        if isinstance(policy, Recomputes):
+        if settings.recomputation:
+            if not isinstance(policy, Recomputes):
+                raise UserError(
+                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute activations; set it "
+                    "to false."
+                )
             policy.recompute(settings.recomputation)
-        elif settings.recomputation:
-            raise UserError(
-                f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute activations; set it to "
-                "false."
-            )
         if settings.compile:
             policy.compile()
         if self.sharded:

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mme_vla.backbone.base import stack_noise
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.embodiment import ActionSpace, Embodiment
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
+from mme_vla.types import stack_noise
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """How processes share one training run: every one with all weights (DDP), or each with a part of them (FSDP2).
 
 Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of weights
-(`HasShardGroups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
+(`Sharded.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
 `accelerate launch`.
 """
 
@@ -20,9 +20,8 @@ from torch.distributed.tensor import DTensor
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import HasShardGroups
 from mme_vla.policy.saving import recompute_buffers
-from mme_vla.speed.sharding import ShardGroup, float32_modules, stacked_layers
+from mme_vla.speed.sharding import Sharded, ShardGroup, float32_modules, stacked_layers
 
 STRATEGIES = ("auto", "ddp", "fsdp")
 FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
@@ -85,7 +84,7 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
         rules = MixedPrecisionPolicy(param_dtype=kind, reduce_dtype=torch.float32, cast_forward_inputs=False)
         fully_shard(module, mesh=mesh, mp_policy=rules)
 
-    groups = policy.shard_groups() if isinstance(policy, HasShardGroups) else map(ShardGroup, stacked_layers(policy))
+    groups = policy.shard_groups() if isinstance(policy, Sharded) else map(ShardGroup, stacked_layers(policy))
     for group in groups:
         exact = [] if group.full or low is None or compiled else float32_modules(group.module)
         if exact:

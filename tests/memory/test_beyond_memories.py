@@ -82,7 +82,7 @@ def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_
 def test_retrieval_looks_at_tokens_as_they_are_stored() -> None:
     """What a prompt does to tokens (`mark`) is not known when a dataset is read, so it must not decide."""
     policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2}, backbone=FEW_TOKENS)
-    policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
+    policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
     frames, seen = moving_frames(40), []
     select = policy.require_memory().select
     policy.require_memory().select = lambda *given: seen.append(select(*given)) or seen[-1]  # type: ignore[method-assign]
@@ -340,9 +340,9 @@ def test_what_the_robot_did_is_no_vision_token_and_is_not_marked_beside_a_prompt
     members: list[Any] = [{"name": "framesamp", "budget": 64}, {"name": "actions", **SMALLER["actions"]}]
     for name, memory in (("actions_modul", SMALLER["actions"]), ("framesamp_ttt_modul", {"members": members})):
         policy = small_policy(name, memory=memory, backbone=FEW_TOKENS)
-        policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
+        policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
         batch = random_batch(policy, valid=96)
-        found = policy._conditioned_history(batch)
+        found = policy.conditioned_history(batch)
         assert batch.history is not None and found is not None
         # The actions' rows come first, for they are padded on the left.
         given, own = batch.history.features, batch.history.mask.shape[1] - (64 if "members" in memory else 0)

@@ -55,7 +55,7 @@ def test_a_dropped_frame_shifts_how_far_the_older_ones_stand_from_the_view_only_
         """From the first memory token to the first token of the current view."""
         memory = policy.encode_memory(selection)
         assert memory is not None
-        observed = policy.backbone.observation_blocks(views, views.images.float())
+        observed = policy.backbone.embed(replace(views, images=views.images.float()))
         blocks = policy.integration.blocks(observed, memory)
         positions = placed(token_positions(torch.cat([block.mask for block in blocks], 1)), blocks)
         return float(positions[0, len(blocks[0])] - positions[0, 0])

@@ -111,8 +111,9 @@ def test_augmentation_changes_past_views_as_it_does_the_current_ones() -> None:
     assert batch.past is not None
     still = batch.images[:, None].expand_as(batch.past.images)
     drawn = torch.rand(2, 7, generator=torch.Generator().manual_seed(1))
-    seen, views = policy._current_views(replace(batch, past=replace(batch.past, images=still)), drawn)
-    assert seen.past is not None and not torch.equal(views, policy._views(batch))
+    seen = policy.prepare_images(replace(batch, past=replace(batch.past, images=still)), drawn)
+    views = seen.images
+    assert seen.past is not None and not torch.equal(views, policy.prepare_images(batch).images)
     assert torch.equal(seen.past.images[:, 0], views) and torch.equal(seen.past.images[:, 1], views)
 
 

@@ -200,7 +200,7 @@ def test_what_the_goal_names_first_is_marked_in_pictures_and_memory() -> None:
     ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
     plain, plain_mask = processor.prompt("press the button")
     tokens = torch.arange(96.0).expand(2, 3, 96)
-    marked = backbone.mark(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
+    marked = backbone.condition_on_prompt(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
     assert marked[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
     assert torch.equal(marked[1], tokens[1])
 

@@ -9,6 +9,7 @@ from golden import error, load, params, vision_config
 
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.siglip import VisionTower, pool_grid
+from mme_vla.memory.base import make_scorer
 from mme_vla.memory.encoder import position_features
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
@@ -48,7 +49,7 @@ def tokens(buffer):
 
 def history_of(memory, frames, tokens, until: int) -> OnlineHistory:
     """An online history fed one frame at a time up to and including `until`."""
-    history = OnlineHistory(memory.storage, memory.make_scorer())
+    history = OnlineHistory(memory.storage, make_scorer(memory))
     pooled = pool_grid(tokens, memory.storage.grid)
     for t in range(until + 1):
         wanted = history.to_encode(1) + t

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
+from mme_vla.memory.base import ProprioMemory
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
@@ -123,10 +124,8 @@ class LSTMLayer(RecurrentLayer):
 
 
 @MEMORIES.register("actions")
-class ActionMemory(RecurrentMemory):
+class ActionMemory(RecurrentMemory, ProprioMemory):
     """`budget` tokens of what an LSTM makes of the robot's own states and actions."""
-
-    reads_motion = True
 
     def __init__(
         self,

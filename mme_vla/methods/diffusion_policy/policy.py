@@ -7,24 +7,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise, map_noise, stack_noise
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
 from mme_vla.integration.film import PooledIntegration
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.diffusion_policy import model
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.methods.diffusion_policy.model import DiffusionNetwork
 from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
+from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, masked_mean
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import MemoryTokens
+from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -107,18 +107,18 @@ class DiffusionPolicy(NetworkPolicy):
     def forward(
         self,
         batch: DiffusionBatch,
-        draws: Mapping[str, Tensor] | None = None,
+        noise: Mapping[str, Tensor] | None = None,
         corner: tuple[int, int] | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. draws: as `training_noise` makes them.
+            batch: with `actions`. noise: as `training_noise` makes them.
             corner: (top, left) of the crop; by default drawn while training and the centre's else.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        values = draws or self.training_noise(len(batch.actions), torch.default_generator)
+        values = noise or self.training_noise(len(batch.actions), torch.default_generator)
         sampled = map_noise(values, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history)
         with self.autocast():
@@ -172,19 +172,19 @@ class DiffusionPolicy(NetworkPolicy):
     def sample_actions(
         self,
         batch: DiffusionBatch,
-        draws: Mapping[str, Tensor] | None = None,
+        noise: Mapping[str, Tensor] | None = None,
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
         """A normalised chunk [b, h, a], from the first step of the current frame on.
 
         Args:
-            draws: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
+            noise: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
             memory: memory tokens encoded beforehand.
         """
-        if draws is None:
-            draws = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))])
-        sampled = map_noise(draws, lambda value: value.to(self.device))
+        if noise is None:
+            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))])
+        sampled = map_noise(noise, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():
             condition = self.condition(batch, memory)
@@ -205,10 +205,10 @@ class DiffusionPolicy(NetworkPolicy):
         return DiffusionBatch(torch.stack(images), processor.states(torch.stack(states)), text).to(self.device)
 
     def answer(
-        self, batch: DiffusionBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: DiffusionBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories."""
-        return self.sample_actions(batch, draws, steps, self.encode_memories(episodes))
+        return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
@@ -249,7 +249,7 @@ class DiffusionPolicy(NetworkPolicy):
             state=torch.zeros(1, sizes.window, robot.state.width, device=device),
             text=torch.zeros(1, sizes.text_dim, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(sizes.memory_width, device),
+            history=None if self.memory is None else full_history(self.memory, sizes.memory_width, device),
         )
 
     def warm_up_vision(self) -> None:

@@ -8,28 +8,28 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Noise, map_noise, stack_noise
 from mme_vla.backbone.config import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.memoryvla.episode import MemoryVlaEpisode, words
 from mme_vla.methods.memoryvla.model import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core, read_moments
 from mme_vla.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
 from mme_vla.methods.openvla_oft.processor import augment, centre_cut, draw_changes
 from mme_vla.methods.prismatic import IMAGENET, Prismatic
+from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.finetune import FineTuneSpec
-from mme_vla.policy.network import MemoryTower, NetworkPolicy, masked_mean
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import MemoryTokens
+from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
 
 @POLICIES.register("memoryvla")
@@ -156,15 +156,15 @@ class MemoryVlaPolicy(NetworkPolicy):
         size = self.group_size
         return {"changes": draw_changes(count * size, generator).unflatten(0, (count, size))}
 
-    def forward(self, batch: GroupBatch, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, batch: GroupBatch, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. draws: as `training_noise` and `augmentation_params` make them; fresh ones by default.
+            batch: with `actions`. noise: of `training_noise` and `augmentation_params`; fresh ones by default.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
-        values = dict(draws or self.training_noise(len(batch.images), torch.default_generator))
+        values = dict(noise or self.training_noise(len(batch.images), torch.default_generator))
         if "changes" not in values:
             values |= self.augmentation_params(len(batch.images), torch.default_generator)
         changes = values.pop("changes", None)
@@ -215,7 +215,7 @@ class MemoryVlaPolicy(NetworkPolicy):
     def sample_actions(
         self,
         batch: GroupBatch,
-        draws: Mapping[str, Tensor] | None = None,
+        noise: Mapping[str, Tensor] | None = None,
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
@@ -224,8 +224,8 @@ class MemoryVlaPolicy(NetworkPolicy):
         Args:
             memory: memory tokens of the last moments, encoded beforehand.
         """
-        if draws is None:
-            draws = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))])
+        if noise is None:
+            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))])
         if self.memory is not None:
             batch = batch.last()
             memory = self.encode_memory(batch.history) if memory is None else memory
@@ -233,7 +233,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         with self.autocast():
             read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
             last = [int(group[-1]) for group in groups]
-            return self.core.sample(draws["noise"].to(self.device), read[last], perceptual[last], steps)
+            return self.core.sample(noise["noise"].to(self.device), read[last], perceptual[last], steps)
 
     # Episodes
 
@@ -252,18 +252,18 @@ class MemoryVlaPolicy(NetworkPolicy):
         return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
 
     def answer(
-        self, batch: GroupBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: GroupBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""
         if self.memory is not None:
-            return self.sample_actions(batch, draws, steps, self.encode_memories(episodes))
+            return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
         with torch.no_grad():
             cognition, features, _ = self._of_batch(batch)
             with self.autocast():
                 read, perceptual = self.banked.read_banks(
                     [_memoryvla_episode(episode).banks for episode in episodes], cognition, features
                 )
-                chunk = self.core.sample(draws["noise"].to(self.device), read, perceptual, steps)
+                chunk = self.core.sample(noise["noise"].to(self.device), read, perceptual, steps)
         for i, episode in enumerate(episodes):
             _memoryvla_episode(episode).pending = (cognition[i], features[i])
         return chunk
@@ -319,7 +319,7 @@ class MemoryVlaPolicy(NetworkPolicy):
             times=torch.zeros(1, 1, dtype=torch.int64, device=known),
             valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(self.sizes.vision.width, device),
+            history=None if self.memory is None else full_history(self.memory, self.sizes.vision.width, device),
         )
 
     def warm_up_vision(self) -> None:

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Noise, map_noise
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.methods.sam2act.config import SAM2ActSizes
@@ -25,6 +24,7 @@ from mme_vla.policy.saving import policy_options
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
+from mme_vla.types import Noise, map_noise
 
 if TYPE_CHECKING:
     from mme_vla.policy.episode import Episode
@@ -62,21 +62,21 @@ class Scenes:
 
 @torch.no_grad()
 def augmented(
-    batch: KeyframeBatch, language: Tensor, draws: Mapping[str, Tensor] | None, cube: Cube, bins: int
+    batch: KeyframeBatch, language: Tensor, noise: Mapping[str, Tensor] | None, cube: Cube, bins: int
 ) -> Scenes:
     """Shift each keyframe's cloud and turn it about its target, and the target's rotation with it.
 
     Args:
-        language: [b, l, w] tokens of the goals. draws: as `augmentation_draws` makes them; None changes nothing.
+        language: [b, l, w] tokens of the goals. noise: as `augmentation_draws` makes them; None changes nothing.
         bins: of a whole turn.
     """
     keyframes = batch.points.shape[1]
     points, target, rotation = (x.flatten(0, 1) for x in (batch.points, batch.target, batch.rotation))
-    if draws is not None:
+    if noise is not None:
         low, high = target.new_tensor(cube.low), target.new_tensor(cube.high)
-        shift = draws["shift"].flatten(0, 1).to(target) * SHIFT * (high - low)
+        shift = noise["shift"].flatten(0, 1).to(target) * SHIFT * (high - low)
         shifted = (target + shift).clamp(low + _CLOSE_TO_EDGE, high - _CLOSE_TO_EDGE)
-        angle = draws["turn"].flatten().to(target) * ROTATION
+        angle = noise["turn"].flatten().to(target) * ROTATION
         points = shift_and_rotate(points, target, shifted - target, angle)
         target, rotation = shifted, _turned(rotation, angle)
     return Scenes(
@@ -227,10 +227,10 @@ class SAM2ActPolicy(NetworkPolicy):
         return augmentation_draws(count, self.keyframes, generator)
 
     def forward(
-        self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None
+        self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The stage's loss, and its parts to log (detached)."""
-        values = self.training_noise(len(batch.points), torch.default_generator) if draws is None else draws
+        values = self.training_noise(len(batch.points), torch.default_generator) if noise is None else noise
         sampled = map_noise(values, lambda value: value.to(self.device))
         cube, sizes = self.cube, self.backbone.sizes
         augmentation = sampled if self.training and self.augment else None
@@ -258,7 +258,7 @@ class SAM2ActPolicy(NetworkPolicy):
 
     @torch.no_grad()
     def sample_actions(
-        self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+        self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None, steps: int | None = None
     ) -> Tensor:
         """The waypoint [b, 1, 7] after the last keyframe of each sequence; those before it are remembered."""
         waypoints = []
@@ -304,7 +304,7 @@ class SAM2ActPolicy(NetworkPolicy):
         self,
         batch: list[SceneInputs],
         episodes: "Sequence[Episode]",
-        draws: Mapping[str, Tensor],
+        noise: Mapping[str, Tensor],
         steps: int | None = None,
     ) -> Tensor:
         """The next waypoints [n, 1, 7]; what is remembered of these keyframes counts from the next frames on."""
