@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from mme_vla.errors import UserError
 from mme_vla.memory.base import PastViewSpec
-from mme_vla.types import PastViews
+from mme_vla.types import FrameBatch, PastViews
 
 
 def resize_with_pad_uint8(frames: np.ndarray, size: tuple[int, int] | int) -> np.ndarray:
@@ -113,25 +113,22 @@ Prepare = Callable[[Sequence[np.ndarray]], Tensor]
 
 
 class PastImages:
-    """Holds an episode's images as they came, as far back as is looked; they are prepared when they are asked for.
-
-    Which of them are looked at is known only when the policy acts, and preparing one costs more than keeping it.
-    """
+    """An episode's recent images, as far back as a memory reads past views; prepared only when they are read."""
 
     def __init__(self, spec: PastViewSpec) -> None:
         self.spec = spec
         self._frames: dict[int, list[np.ndarray]] = {}
         self._count = 0
 
-    def take(self, views: Mapping[str, np.ndarray], count: int, rendered: Mapping[str, np.ndarray] | None) -> None:
-        """Add the next `count` frames of every camera; `rendered` as in `Episode.observe`."""
-        first, self._count = self._count, self._count + count
+    def take(self, views: Mapping[str, FrameBatch]) -> None:
+        """Add the next frames of every camera."""
+        first = self._count
+        self._count += next(iter(views.values())).length
         oldest = self._count - 1 - self.spec.span
         for frame in range(max(oldest, first), self._count):
-            places = [_place(frame - first, None if rendered is None else rendered[name]) for name in views]
-            if all(place is not None for place in places):
-                pairs = zip(views.values(), places, strict=True)
-                self._frames[frame] = [view[place].copy() for view, place in pairs if place is not None]
+            images = [image.copy() for view in views.values() if (image := view.image(frame - first)) is not None]
+            if len(images) == len(views):
+                self._frames[frame] = images
         self._frames = {frame: images for frame, images in self._frames.items() if frame >= oldest}
 
     def at(self, step: int, prepare: Prepare) -> PastViews:
@@ -142,8 +139,8 @@ class PastImages:
         lacking = [frame for frame in frames.tolist() if frame not in self._frames]
         if lacking:
             raise UserError(
-                f"This policy looks back at the frames {lacking[:5]}, which were not drawn of every camera: what "
-                "`frames_read` names has to be observed with all images."
+                f"This policy looks back at the frames {lacking[:5]}, which were not rendered by every camera: observe "
+                "all images of the frames in `frames_read`."
             )
         stored = [self._frames[frame] for frame in frames.tolist()]
         return [np.stack(of_camera) for of_camera in zip(*stored, strict=True)]
@@ -184,13 +181,6 @@ def full_past(spec: PastViewSpec | None, views: int, size: int, device: torch.de
         return None
     images = torch.zeros(1, spec.frames - 1, views, 3, size, size, dtype=torch.uint8, device=device)
     return PastViews(images, torch.ones(images.shape[:2], dtype=torch.bool, device=device), spec.every)
-
-
-def _place(offset: int, rendered: np.ndarray | None) -> int | None:
-    if rendered is None:
-        return offset
-    at = int(np.searchsorted(rendered, offset))
-    return at if at < len(rendered) and int(rendered[at]) == offset else None
 
 
 CROP = 0.95  # side of the crop, rounded down to whole pixels: 212 of 224
