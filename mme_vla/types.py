@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -77,6 +78,33 @@ class TensorStruct:
                 yield value
             elif isinstance(value, TensorStruct):
                 yield from value.tensors()
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """Consecutive frames of one camera, of which some have an image.
+
+    images: [n, H, W, 3] uint8. index: [n] int64, ascending; which of the `length` frames they show.
+    """
+
+    images: np.ndarray
+    index: np.ndarray
+    length: int
+
+    @classmethod
+    def of(cls, images: np.ndarray, index: np.ndarray | None = None, length: int | None = None) -> Self:
+        """A batch; by default every frame has an image."""
+        length = len(images) if length is None else length
+        return cls(images, np.arange(length) if index is None else np.asarray(index, np.int64), length)
+
+    def select(self, frames: np.ndarray) -> np.ndarray:
+        """Images of frames that have one."""
+        return self.images[np.searchsorted(self.index, frames)]
+
+    def image(self, frame: int) -> np.ndarray | None:
+        """The image of a frame, if it has one."""
+        row = int(np.searchsorted(self.index, frame))
+        return self.images[row] if row < len(self.index) and int(self.index[row]) == frame else None
 
 
 @dataclass

@@ -133,7 +133,7 @@ def choose_subgoals(
     if mode not in SUBGOAL_MODES:
         raise UserError(f"subgoal_mode={mode!r}. {did_you_mean(mode, SUBGOAL_MODES)}")
     if section is None:
-        if policy.require_processor().reads_subgoal:
+        if policy.require_processor().prompt_spec.reads_subgoal:
             logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
         return None
     kind = subgoal_kind(policy)

@@ -68,7 +68,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _summary(section))
-    settings.add_row("words", printable(policy.require_processor().words_from))
+    settings.add_row("words", printable(policy.require_processor().prompt_spec.encoder))
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
@@ -203,7 +203,7 @@ def _parts(policy: "Policy") -> dict[str, list[Any]]:
     """Parameters by the parts that fine-tuning speaks of, in the policy's order."""
     groups: dict[str, list[Any]] = {}
     for name, parameter in policy.named_parameters():
-        groups.setdefault(policy.component_of(name), []).append(parameter)
+        groups.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
     return groups
 
 

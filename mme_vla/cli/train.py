@@ -94,6 +94,7 @@ def _train(
     from accelerate.utils import broadcast_object_list
 
     from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.capabilities import with_vision_memory
     from mme_vla.policy.finetune import apply_finetuning, cast_frozen
     from mme_vla.policy.tensor_files import take_memory
     from mme_vla.training.checkpoint import check_disk, load_policy
@@ -126,7 +127,9 @@ def _train(
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
     if holds:
         take_memory(policy.to(accelerator.device))
-    encoder = broadcast_object_list([policy.vision_fingerprint() if first and policy.memory is not None else None])
+    encoder = broadcast_object_list(
+        [with_vision_memory(policy).vision_fingerprint() if first and policy.memory else None]
+    )
     local = config["data"]["cache"].get("local", False)
     with accelerator.local_main_process_first() if local else accelerator.main_process_first():
         of_run = (config["data"], config["seed"], run.checkpoint, cache_command(), line.say)

@@ -19,7 +19,7 @@ from mme_vla.config.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
-from mme_vla.policy.saving import CONFIG, policy_class
+from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
 from mme_vla.weights.load import ADAPTERS, read_as
 from mme_vla.weights.source import FORMATS, Source, open_source
@@ -182,9 +182,9 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         if "backbone" not in config:
             raise UserError(f"{opened.folder} holds our weights but no config.json that describes them.")
         import_trusted(config, str(opened.folder), trust_plugins)
-        policy: Policy = policy_class(config).from_saved(config, str(opened.folder / CONFIG))
+        policy: Policy = build_saved(policy_class(config), config, str(opened.folder / CONFIG))
         policy.processor = load_processor(opened.folder)
-        policy.check_processor(str(opened.folder))
+        check_processor(policy, str(opened.folder))
         return policy
     words, declared = list(overrides), opened.model
     named = [word.partition("=")[2] for word in words if word.startswith("model=")]

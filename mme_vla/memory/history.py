@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
+from mme_vla.types import FrameBatch
 
 
 @dataclass(frozen=True)
@@ -263,17 +264,10 @@ class OnlineHistory(History):
         self._scores.frames[self._scored], self._scores.values[self._scored] = frame, values
         self._scored += 1
 
-    def take(
-        self,
-        frames: np.ndarray,
-        encode: Callable[[np.ndarray], Tensor],
-        rendered: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches, d_vision]."""
-        offsets = self.to_encode(len(frames) if count is None else count, rendered)
-        places = offsets if rendered is None else np.searchsorted(rendered, offsets)
-        self.append(frames, encode(frames[places]), rendered, count)
+        stored = frames.select(self.to_encode(frames.length, frames.index))
+        self.append(frames.images, encode(stored), frames.index, frames.length)
 
     def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
         """Show the scorer the next frames that have an image; `numbers` says which they are."""
@@ -345,23 +339,18 @@ class LazyHistory(OnlineHistory):
         self._waiting: dict[int, np.ndarray] = {}
         self._encoded: dict[int, Tensor] = {}
 
-    def take(
-        self,
-        frames: np.ndarray,
-        encode: Callable[[np.ndarray], Tensor],
-        rendered: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, without encoding any."""
-        count = len(frames) if count is None else count
-        offsets = self.to_encode(count, rendered)
-        places = offsets if rendered is None else np.searchsorted(rendered, offsets)
+        offsets = self.to_encode(frames.length, frames.index)
         # Copies: a view would keep the whole message alive that a frame came in.
-        new = {int(frame): frames[at].copy() for frame, at in zip(offsets + self._length, places, strict=True)}
-        self._score(frames, np.arange(count) if rendered is None else rendered)
+        new = {
+            int(frame): image.copy()
+            for frame, image in zip(offsets + self._length, frames.select(offsets), strict=True)
+        }
+        self._score(frames.images, frames.index)
         self._waiting |= new
         self._stored_frames += new
-        self._length += count
+        self._length += frames.length
 
     def append(
         self,

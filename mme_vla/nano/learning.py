@@ -16,6 +16,7 @@ from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
 from mme_vla.types import Batch, HistoryTokens, stack_noise
@@ -213,7 +214,7 @@ def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, An
     items = []
     for place, frame in enumerate(decisions):
         state = demonstration.states[frame]
-        chunk, recorded = demonstration.motions.chunk(frame, processor.horizon)
+        chunk, recorded = demonstration.motions.chunk(frame, processor.embodiment.action.horizon)
         prompt, prompt_mask = processor.prompt(demonstration.goal, subgoal=subgoals[place], state=state)
         item = {
             "view_tokens": view_tokens[place], "prompt": prompt, "prompt_mask": prompt_mask,
@@ -240,8 +241,11 @@ def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
     )  # fmt: skip
     if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
         nothing = np.zeros((demonstration.length, policy.embodiment.action.width), np.float32)
-        motion = policy.require_processor().motion(
-            demonstration.states[: demonstration.length], nothing, np.zeros(demonstration.length, bool)
+        motion = motion_rows(
+            policy.require_processor(),
+            demonstration.states[: demonstration.length],
+            nothing,
+            np.zeros(demonstration.length, bool),
         )
         history.motion = motion.__getitem__
     return history

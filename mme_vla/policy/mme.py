@@ -17,7 +17,7 @@ from mme_vla.backbone.flow import HasFlowHead
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.config.devices import checked_products
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, listed
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import (
     CompilableMemory,
@@ -30,15 +30,14 @@ from mme_vla.memory.base import (
 )
 from mme_vla.memory.history import PromptConditionedHistory
 from mme_vla.model import MMEModel
+from mme_vla.policy.action_prefix import prefix_overlap
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_integrated
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.promises import prefix_overlap
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
-from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.policy.vision_cache import encode_frames, tower_fingerprint
-from mme_vla.processing.augment import augment_views, augmentation_draws
-from mme_vla.processing.images import full_past, stack_past
+from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed.graphs import CapturableSampling, CapturedSampling
 from mme_vla.speed.recompute import Recompute, Recomputes
@@ -50,7 +49,7 @@ if TYPE_CHECKING:
 
 
 @POLICIES.register("mme")
-class MMEPolicy(MMEModel, Policy):
+class MMEPolicy(MMEModel, NetworkPolicy):
     """One composition of backbone, memory and integration, as a policy. No method depends on the variant."""
 
     acts_in_bfloat16 = True
@@ -73,26 +72,18 @@ class MMEPolicy(MMEModel, Policy):
         """Put the parts together.
 
         Args:
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: the sections of `from_config`; saved with the weights.
-            compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
-            history_dtype: dtype of stored vision tokens; bfloat16 as released.
-            augment: augment the current views while training (memory features never are).
+            processor, config, compute_dtype, history_dtype, augment: as for `NetworkPolicy`.
             attention: backend: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
         """
-        super().__init__(backbone, memory, integration, dtype_of(compute_dtype, "policy.compute_dtype"))
-        self.processor = processor
-        self.config = dict(config or {})
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.augment = augment
+        NetworkPolicy.__init__(
+            self, processor, config, compute_dtype=compute_dtype, history_dtype=history_dtype, augment=augment
+        )
+        self.backbone, self.memory, self.integration = backbone, memory, integration
         self._set_backends(attention, checked_products(float32_products))
         self.horizon, self.action_dim = backbone.horizon, backbone.action_dim
         if isinstance(backbone, HasFlowHead):
             self.sample_steps, self.supports_rtc = backbone.head.steps, True
-        if isinstance(backbone, HasLoraTargets):
-            self.lora_targets, self.heads = backbone.lora_targets, backbone.heads
-            self.lora_exclude = backbone.lora_exclude
 
     def _set_backends(self, attention: str, float32_products: str) -> None:
         if isinstance(self.backbone, HasAttentionBackends):
@@ -338,17 +329,12 @@ class MMEPolicy(MMEModel, Policy):
         """Stored tokens [n, d_vision] of one episode, read with its prompt [l]."""
         return self.backbone.condition_on_prompt(tokens[None], prompt[None], prompt_mask[None])[0]
 
-    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
-        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        return encode_frames(self, frames, self._pooled_tokens, self.backbone.vision_width, batch_size)
+    @property
+    def memory_tower(self) -> MemoryTower:
+        return MemoryTower(self.backbone.vision, self._pooled_tokens, self.backbone.vision_width)
 
     def _pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
         return pool_grid(self.backbone.encode_images(images), grid, pooling)
-
-    def vision_fingerprint(self) -> str:
-        """A hash of the vision tower's weights and the dtype it runs in: what a cache of its tokens depends on."""
-        image_format = "" if self.processor is None else self.processor.memory_image_format
-        return tower_fingerprint(self.backbone.vision, self.compute_dtype, image_format)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """A batch of one without content: all views, the longest prompt without padding, and a memory that is full."""
@@ -371,30 +357,30 @@ class MMEPolicy(MMEModel, Policy):
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         processor = self.require_processor()
-        for name in ("image_size", "action_dim", "horizon"):
-            actual, expected = getattr(processor, name), getattr(self.backbone, name)
-            if actual != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                    "from two checkpoints, or one was changed."
-                )
+        sizes = {
+            name: (getattr(processor, name), getattr(self.backbone, name)) for name in ("image_size", "action_dim")
+        }
+        return {**sizes, "horizon": (processor.embodiment.action.horizon, self.backbone.horizon)}
 
-    def parts(self) -> Mapping[str, str]:
-        """The backbone's parts in its order; memory, integration and the latter's experts are the part `memory`."""
-        parts = {part: rf"backbone\.(?:{pattern})" for part, pattern in self.backbone.parts().items()}
-        experts = f"|{parts['memory']}" if "memory" in parts else ""
-        return {**parts, "memory": rf"memory\.|integration\.{experts}"}
+    @property
+    def finetune_spec(self) -> FineTuneSpec:
+        """The backbone's components in its order; memory, integration and its experts are the component `memory`."""
+        backbone = self.backbone
+        components = {name: rf"backbone\.(?:{pattern})" for name, pattern in backbone.parts().items()}
+        experts = f"|{components['memory']}" if "memory" in components else ""
+        components["memory"] = rf"memory\.|integration\.{experts}"
+        if not isinstance(backbone, HasLoraTargets):
+            return FineTuneSpec(components)
+        return FineTuneSpec(components, backbone.lora_targets, backbone.heads, backbone.lora_exclude)
 
 
 def mme_of(policy: Policy, what: str) -> MMEPolicy:
     """The policy, where it is made of backbone, memory and integration."""
     if not isinstance(policy, MMEPolicy):
         raise UserError(
-            f"{what} looks inside a backbone that a memory is integrated with; {policy.config.get('name', 'this')} is "
-            f"a {type(policy).__name__}, which has none."
+            f"{what} requires a policy of backbone, memory and integration; "
+            f"{policy.config.get('name', 'this')} is a {type(policy).__name__}."
         )
     return policy

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.scheduler import Act, Read, Scheduler
 
@@ -177,8 +178,10 @@ class Engine:
 
     async def _prepare(self, episode: Episode) -> None:
         """A piece of what a client's next request will need, while its robot moves."""
+        if not isinstance(policy := self.policy, PreparesChunks):
+            return
         try:
-            left = await self.call(lambda: self.policy.prepare(episode))
+            left = await self.call(lambda: policy.prepare(episode))
         except Exception:
             logger.exception("preparing an episode's next chunk failed; it will be computed when it is asked for")
             return

@@ -87,7 +87,7 @@ class MMEVLAModelServer(PredictModelServer):
                 "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
             )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
-        settings.check_robot(robot, self.policy.require_processor().past_actions)
+        settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
         self.sessions: dict[str, Running] = {}
         super().__init__(
@@ -155,7 +155,7 @@ class MMEVLAModelServer(PredictModelServer):
         episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
-            episode.remember(np.stack(video), is_demo=True)
+            episode.add_frames(np.stack(video), is_demo=True)
         episode.observe({name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states))
         return episode
 

@@ -68,7 +68,7 @@ class PolicyServer:
 
     def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
         policy.require_processor().require_stats()
-        settings.check_robot(policy.embodiment, policy.require_processor().past_actions)
+        settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
@@ -159,7 +159,7 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "state_dim": policy.embodiment.state.width,
         "action_space": policy.embodiment.action.answers,
         "action_dim": policy.embodiment.action.width,
-        "horizon": policy.horizon - policy.n_past_steps,
+        "horizon": policy.horizon - policy.require_processor().samples.window + 1,
         "execute": settings.executed(policy.embodiment),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),

@@ -112,6 +112,6 @@ def check_gradients(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor]) -
     loss.backward()
     idle = [
         name for name, parameter in policy.named_parameters()
-        if policy.component_of(name) == "memory" and (parameter.grad is None or not parameter.grad.any())
+        if policy.finetune_spec.component_of(name) == "memory" and (parameter.grad is None or not parameter.grad.any())
     ]  # fmt: skip
     assert not idle, f"no gradient reaches {', '.join(idle)}."

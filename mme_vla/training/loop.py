@@ -13,8 +13,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import AugmentsImages
+from mme_vla.speed.recompute import Recomputes
 from mme_vla.training.checkpoint import (
     checkpoint_name,
     restore,
@@ -97,7 +100,13 @@ class Trainer:
         if not self.sharded:
             policy.to(accelerator.device)
         self.policy = policy.train()
-        policy.recompute(settings.recomputation)
+        if settings.recomputation:
+            if not isinstance(policy, Recomputes):
+                raise UserError(
+                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute activations; set it "
+                    "to false."
+                )
+            policy.recompute(settings.recomputation)
         if settings.compile:
             policy.compile()
         if self.sharded:
@@ -167,7 +176,8 @@ class Trainer:
         draws = self.policy.training_noise(settings.batch_size, generator_for(settings.seed, "train", step))
         # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)
-        draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
+        if isinstance(self.policy, AugmentsImages):
+            draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():

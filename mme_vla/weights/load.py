@@ -16,6 +16,7 @@ from mme_vla.methods.openvla_oft.weights import openvla_adapter
 from mme_vla.methods.sam2act.weights import sam2act_adapter
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
+from mme_vla.policy.saving import recompute_buffers
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.utils import inside, read_json
@@ -75,7 +76,7 @@ def load_weights(
     if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
         stats = read_stats(checkpoint.folder)
     assign_tensors(policy, read_as(policy, checkpoint), str(source), kind)
-    policy.compute_unsaved()
+    recompute_buffers(policy)
     if stats is not None and policy.processor is not None:
         policy.processor.stats = stats
     elif len(datasets) > 1:
@@ -167,7 +168,7 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
 
 def _part(policy: Policy, name: str) -> str | None:
     """The part of a policy that another's parameter would belong to; None where it has none such."""
-    return next((part for part, pattern in policy.parts().items() if re.match(pattern, name)), None)
+    return next((part for part, pattern in policy.finetune_spec.components.items() if re.match(pattern, name)), None)
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:
@@ -176,10 +177,10 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     if policy.processor is None or not file.is_file():
         return
     source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
-    processor, target_fingerprint = policy.processor, policy.processor.words_fingerprint
+    processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
     if source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than {processor.words_from!r} "
+            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than {processor.prompt_spec.encoder!r} "
             f"({target_fingerprint}): its ids would mean other words. Set processor.tokenizer to that one."
         )
 

@@ -222,4 +222,5 @@ def test_the_memoryless_ports_start_an_own_integration_too(tmp_path: Path) -> No
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     policy = own_policy(Everything)
     start = transfer(policy, tmp_path / "lerobot")
-    assert set(start.new) == {name for name in policy.state_dict() if policy.component_of(name) == "memory"}
+    component = policy.finetune_spec.component_of
+    assert set(start.new) == {name for name in policy.state_dict() if component(name) == "memory"}

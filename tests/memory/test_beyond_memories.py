@@ -18,6 +18,7 @@ from mme_vla.memory.extensions.moment import Moment
 from mme_vla.memory.extensions.retrieval import Retrieval, chunks_of
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.base import motion_rows
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import (
     BEYOND,
@@ -214,9 +215,9 @@ def test_own_actions_read_what_was_done_and_no_picture() -> None:
 
 def test_past_frames_without_states_are_refused() -> None:
     with pytest.raises(UserError, match="with their states"):
-        mover().start_episode("press the button").remember(moving_frames(3))
+        mover().start_episode("press the button").add_frames(moving_frames(3))
     episode = mover().start_episode("press the button")
-    episode.remember(moving_frames(3), states=np.zeros((3, 8), np.float32))
+    episode.add_frames(moving_frames(3), states=np.zeros((3, 8), np.float32))
     assert episode.history is not None and len(episode.history) == 3
 
 
@@ -323,7 +324,7 @@ def test_an_episode_feels_and_does_what_a_dataset_says_it_did() -> None:
     policy, source = mover(), open_sources(["sample"])[0]
     start, length = int(source.exec_starts[0]), min(int(source.lengths[0]), int(source.exec_starts[0]) + 20)
     frames = np.arange(length)
-    recorded = policy.require_processor().motion(*source.robot_motion(0, frames))
+    recorded = motion_rows(policy.require_processor(), *source.robot_motion(0, frames))
     episode = policy.start_episode("press the button")
     states, actions = source.states(0, 0, length), source.actions(0, 0, length)
     for part in (slice(0, start + 1), slice(start + 1, start + 8), slice(start + 8, length)):

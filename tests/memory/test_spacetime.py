@@ -133,7 +133,7 @@ def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_differenc
     for index in (0, 12):
         step, batch = dataset.step(index), collate([dataset[index]])
         frames = np.arange(step.index + 1)
-        views = {name: source.frames(0, frames, name) for name in processor.cameras}
+        views = {name: source.frames(0, frames, name) for name in processor.embodiment.camera_names}
         states, demo = source.states(0, 0, len(frames)), frames < start
         for piece in (len(frames), 7):
             episode = policy.start_episode(step.goal, seed=1)
@@ -190,9 +190,9 @@ def test_past_frames_of_one_camera_are_not_enough() -> None:
     episode = small().start_episode("press the button")
     pictures = moving_frames(4)
     with pytest.raises(UserError, match="of every camera"):
-        episode.remember(pictures)
+        episode.add_frames(pictures)
     with pytest.raises(UserError, match="of every camera"):
-        episode.look({"front": pictures[0], "wrist": pictures[0]}, np.zeros(8))
+        episode.set_view({"front": pictures[0], "wrist": pictures[0]}, np.zeros(8))
     drawn = {"front": np.arange(8), "wrist": np.array([7])}
     both = {"front": np.concatenate([pictures, pictures]), "wrist": pictures[:1]}
     episode.observe(both, np.zeros((8, 8), np.float32), rendered=drawn)

@@ -101,7 +101,7 @@ def in_process(policy: MMEPolicy, numbers: list[int]) -> np.ndarray:
     seen = [[world.reset(None)] for world in worlds]
     for episode, world in zip(episodes, worlds, strict=True):
         if world.video:
-            episode.remember(np.stack(world.video), is_demo=True)
+            episode.add_frames(np.stack(world.video), is_demo=True)
     while len(worlds[0].taken) < STEPS:
         for episode, frames in zip(episodes, seen, strict=True):
             views = {"front": "agentview", "wrist": "wrist"}

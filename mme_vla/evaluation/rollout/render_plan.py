@@ -15,6 +15,7 @@ from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.memory.base import past_view_spec
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
 EVERY = range(2**31)
@@ -87,4 +88,4 @@ class RenderPlan:
         # A motion takes any number of frames, so that the policy may act at each.
         action = self._robot.action
         apart = 1 if action.frames is None else min(self._settings.execute or action.execute, action.horizon)
-        return self._policy.frames_read(exec_start + np.arange(0, self._settings.max_steps + 2, apart), exec_start)
+        return frames_read(self._policy, exec_start + np.arange(0, self._settings.max_steps + 2, apart), exec_start)

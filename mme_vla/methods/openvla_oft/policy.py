@@ -9,6 +9,7 @@ from torch import Tensor
 from mme_vla.methods.openvla_oft.processor import OpenVlaProcessor, augment, centre_crop, draw_changes
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.policy.network import MemoryTower
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
 from mme_vla.types import Batch
@@ -28,6 +29,12 @@ class OpenVlaPolicy(MMEPolicy):
         assert isinstance(processor, OpenVlaProcessor)
         states = processor.proprio(torch.stack([episode.state for episode in episodes]))
         return replace(super().observation(episodes), proprio=states.to(self.device))
+
+    @property
+    def memory_tower(self) -> MemoryTower:
+        processor = self.processor
+        settings = [processor.memory_image_format] if isinstance(processor, OpenVlaProcessor) else []
+        return super().memory_tower._replace(settings=settings)
 
     def full_batch(self, device: torch.device | str = "cpu") -> Batch:
         """As `MMEPolicy.full_batch`, with a state."""

@@ -85,7 +85,8 @@ def test_the_loss_depends_on_what_is_remembered_and_teaches_the_memory(policy: M
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
     policy.zero_grad()
     found[0].backward()
-    still = [n for n, p in policy.named_parameters() if policy.component_of(n) == "memory" and not p.grad.any()]  # type: ignore[union-attr]
+    component = policy.finetune_spec.component_of
+    still = [n for n, p in policy.named_parameters() if component(n) == "memory" and not p.grad.any()]  # type: ignore[union-attr]
     assert all(name.endswith("key.bias") for name in still), still  # a bias of all keys alike changes no weight
     policy.zero_grad()
     with pytest.raises(ValueError, match="has a memory"):
@@ -241,7 +242,7 @@ def test_what_cannot_stand_there_is_refused_in_words() -> None:
 
 def test_the_memory_learns_in_full_beside_adapters(policy: MemoryVlaPolicy) -> None:
     counts = apply_finetuning(policy, "expert_only")
-    of_memory = sum(p.numel() for n, p in policy.named_parameters() if policy.component_of(n) == "memory")
+    of_memory = sum(p.numel() for n, p in policy.named_parameters() if policy.finetune_spec.component_of(n) == "memory")
     assert counts["memory"] == of_memory > sum(p.numel() for p in policy.require_memory().parameters())
     assert counts["vision"] == counts["vlm"] == 0
     apply_finetuning(policy, freeze_vision=False)
@@ -261,7 +262,8 @@ def test_what_a_checkpoint_to_start_from_lacks_is_drawn(model: str, words: dict[
         policy = build_from_config(compose("policy", policy_words(model, words)), fresh_backbone=False)
     finally:
         torch.use_deterministic_algorithms(False)
-    waiting = {policy.component_of(name) for name, value in policy.state_dict().items() if value.isnan().any()}
+    component = policy.finetune_spec.component_of
+    waiting = {component(name) for name, value in policy.state_dict().items() if value.isnan().any()}
     assert waiting == {"vision", "vlm"}
 
 
@@ -274,7 +276,7 @@ def test_it_starts_from_a_policy_with_banks_whose_banks_stay_behind(tmp_path: Pa
     for source in ("ours", "theirs"):
         took = transfer(policy, tmp_path / source)
         assert all("_bank" in name for name in took.left) and took.left
-        assert {policy.component_of(name) for name in took.new} == {"memory"}
+        assert {policy.finetune_spec.component_of(name) for name in took.new} == {"memory"}
         assert torch.equal(policy.core.head.output.bias, banked.core.head.output.bias)  # type: ignore[union-attr]
     with pytest.raises(UserError, match="no name in this format"):
         WRITERS["memoryvla"](policy, tmp_path / "theirs", torch.float32, None)

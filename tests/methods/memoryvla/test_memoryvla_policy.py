@@ -71,10 +71,9 @@ def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
     loss, metrics = policy(batch, draws)
     assert torch.equal(loss, policy(batch, draws)[0]) and metrics["loss"] == loss
     loss.backward()
+    component = policy.finetune_spec.component_of
     for part in ("vision", "vlm", "memory", "action"):
-        learned = [
-            p for name, p in policy.named_parameters() if policy.component_of(name) == part and p.grad is not None
-        ]
+        learned = [p for name, p in policy.named_parameters() if component(name) == part and p.grad is not None]
         assert any(p.grad.abs().sum() > 0 for p in learned), part  # type: ignore[union-attr]
 
 
@@ -218,7 +217,7 @@ def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:
     policy = tiny()
     policy.save_pretrained(tmp_path)
     again = Policy.from_pretrained(tmp_path)
-    assert isinstance(again, MemoryVlaPolicy) and again.require_processor().group_size == 4
+    assert isinstance(again, MemoryVlaPolicy) and again.require_processor().samples.group_size == 4
     batch, noise = batch_of(policy), {"noise": torch.randn(2, policy.horizon, policy.action_dim)}
     assert torch.equal(policy.sample_actions(batch, noise), again.sample_actions(batch, noise))
     with pytest.raises(ValueError, match="actions"):

@@ -64,7 +64,7 @@ def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_pa
     for name in ("openvla_oft", "openvla_oft_framesamp_context"):
         policy = built(name, seed=2)
         took = transfer(policy, folder)
-        assert took.new and all(policy.component_of(new) in ("action", "memory") for new in took.new)
+        assert took.new and all(policy.finetune_spec.component_of(new) in ("action", "memory") for new in took.new)
         assert not took.left
     with pytest.raises(UserError, match="action_head/model"):
         load_weights(built(seed=2), folder)
