@@ -163,7 +163,7 @@ def resolve_root(root: str | Path) -> Path:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return `meta/info.json`: features with a `dtype` and a `shape` of whole numbers, frames per second, and others."""
+    """Return `meta/info.json`: features with a `dtype` and a `shape`, frames per second, and others."""
     path = root / "meta" / "info.json"
     info = read_json(path, "a dataset's description")
     features = info.get("features")
@@ -176,7 +176,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def lossy_coding(feature: dict[str, Any]) -> str | None:
-    """How a video was coded if something was lost by it, such as `av1 at crf 30`; None where not, or where nothing says.
+    """The lossy codec of a video, such as `av1 at crf 30`; None for a lossless one, or without information.
 
     LeRobot writes what is known under `info`; its default before it wrote the quality was AV1 at crf 30.
     """

@@ -277,7 +277,7 @@ def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tm
         (tmp_path / file).touch()
     run, step = tmp_path, tmp_path / files[0].split("/")[0]
     for place in (run, step):
-        with pytest.raises(UserError, match=rf"python -m mme_vla\.weights\.convert {place} \S+_converted"):
+        with pytest.raises(UserError, match=rf"mme-vla weights {place} \S+_converted"):
             resolve_checkpoint(place)
 
 

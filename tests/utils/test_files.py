@@ -5,6 +5,8 @@ import os
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,14 +15,16 @@ from mme_vla.errors import UserError, brief, listed
 from mme_vla.utils import (
     SUMS,
     FolderLock,
+    append_lines,
     check_sums,
     inside,
     parse_json,
     read_bytes,
     read_json,
-    read_json_lines,
+    read_lines,
     read_text,
     safe_name,
+    to_dataclass,
     write_atomically,
     write_json,
     write_sums,
@@ -58,13 +62,48 @@ def test_whatever_stands_in_a_files_place_is_refused_without_waiting(tmp_path: P
             read_text(tmp_path / name, limit=100)
 
 
-def test_lines_of_json_name_the_damaged_line(tmp_path: Path) -> None:
+@dataclass(frozen=True)
+class Reading:
+    name: str
+    value: float | None
+    ages: list[int] = field(default_factory=list)
+
+
+def readings(path: Path) -> list[Reading]:
+    return read_lines(path, partial(to_dataclass, Reading), "readings")
+
+
+def test_appended_lines_are_read_back(tmp_path: Path) -> None:
+    file, values = tmp_path / "log.jsonl", [Reading("\u2028", 1.5, [3, 4]), Reading("b", None)]
+    for value in values:
+        append_lines(file, [asdict(value)])
+    assert readings(file) == values
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('{"name"', "line 2 is not valid JSON"), ('{"name": "a"}', "line 2: .*missing value"),
+        ('{"name": "a", "value": 1, "x": 1}', "line 2: .*unknown x"),
+        ('{"name": {}, "value": 1}', "name={}: expected str"),
+        ('{"name": "a", "value": true}', "value=True: expected float"), ('{"name": "a", "value": NaN}', "NaN"),
+        ('{"name": "a", "value": 1, "ages": ["1"]}', r"ages=\['1'\]: expected list\[int\]"), ("[]", "an object"),
+        ('{"name": "a", "value": 1, "crc32": "0"}', "line 2 is not what was written"),
+    ],
+)  # fmt: skip
+def test_damaged_line_is_reported_with_its_number(tmp_path: Path, line: str, message: str) -> None:
     file = tmp_path / "log.jsonl"
-    file.write_text('{"a": "\u2028"}\n\n{"a": 2}\n{"a"\n', encoding="utf-8")
-    lines = read_json_lines(file)
-    assert [next(lines), next(lines)] == [(1, {"a": "\u2028"}), (3, {"a": 2})]
-    with pytest.raises(UserError, match="line 4"):
-        next(lines)
+    file.write_text(f'{{"name": "a", "value": 1}}\n{line}\n')
+    with pytest.raises(UserError, match=message):
+        readings(file)
+
+
+def test_half_written_last_line_is_ignored_with_a_warning(tmp_path: Path) -> None:
+    file = tmp_path / "log.jsonl"
+    append_lines(file, [asdict(Reading("a", 1.0)), asdict(Reading("b", 2.0))])
+    file.write_bytes(file.read_bytes()[:-2])
+    with pytest.warns(UserWarning, match="half-written"):
+        assert [reading.name for reading in readings(file)] == ["a"]
 
 
 def test_numbers_that_are_not_finite_are_read_where_they_are_allowed() -> None:
