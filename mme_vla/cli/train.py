@@ -141,7 +141,7 @@ def _train(
         validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)
     trainer = Trainer(policy, data.train, collate, validation, settings, run, config, accelerator)
     line.say(trainer.describe())
-    loggers = open_loggers(run.folder, config, run.step) if first else Loggers([])
+    loggers = open_loggers(run.folder, config, run.step) if first else Loggers()
     if first:
         remove_drafts(run.folder)
         with write_atomically(run.folder / CONFIG) as draft:
