@@ -111,7 +111,7 @@ class _Recorder:
         self._seed, self._on_step = task.seed, on_step
 
     def record(self) -> Any:
-        from mme_vla.data.hdf5_episode import SUBGOALS
+        from mme_vla.data.hdf5 import SUBGOALS
         from mme_vla.envs.recording.recorder import RecordedStep, Recording
 
         rng = np.random.default_rng(self._seed)

@@ -29,11 +29,11 @@ from mme_vla.training.checkpoint import trainable
 from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.optim import clip_gradients, make_optimizer
+from mme_vla.training.order import Validation
 from mme_vla.training.parallel import ParallelSettings, full_value, gathered, is_sharded, shard
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import shard_files
-from mme_vla.training.validation import Validation
 
 RUNS = [(2, "train,stop,policies,die"), (1, "go_on"), (3, "resume"), (1, "whole")]
 """How many processes do what one after the other; starting them takes longer than what they do, so few do much."""

@@ -15,8 +15,7 @@ from mme_vla.data.cache import VisionCache, fingerprint
 from mme_vla.data.cache_building import build_cache
 from mme_vla.data.convert import convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_episode import SUBGOALS
+from mme_vla.data.hdf5 import SUBGOALS, find_files, list_episodes, open_episode
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.memory.tokendrop import TokenDrop
 from mme_vla.utils import write_sums
@@ -106,7 +105,7 @@ class _SyntheticSource:
     def __len__(self) -> int:
         return len(LENGTHS)
 
-    def drawn(self, episode: int, camera: str | None = None) -> np.ndarray:
+    def rendered(self, episode: int, camera: str | None = None) -> np.ndarray:
         return np.ones(LENGTHS[episode], bool)
 
     def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:

@@ -21,9 +21,9 @@ from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
 from mme_vla.training.logging import JsonLines, Loggers, ProgressLine
 from mme_vla.training.loop import Trainer
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
-from mme_vla.training.validation import Validation
 from mme_vla.utils import read_lines, write_json
 
 DONE = "trained.json"

@@ -23,9 +23,9 @@ from mme_vla.training.checkpoint import check_disk
 from mme_vla.training.data import check_frozen
 from mme_vla.training.logging import Loggers, ProgressLine, check_logger, open_loggers, read_metrics
 from mme_vla.training.loop import Trainer, loss_change
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import Run, differing_keys, open_run, start_from
 from mme_vla.training.settings import KeepRule, TrainSettings
-from mme_vla.training.validation import Validation
 from mme_vla.types import Batch, HistoryTokens
 
 SMALL = {"depth": 1, "vision": {"depth": 1, "image_size": 16, "patch_size": 1, "width": 16, "mlp_dim": 16}}
