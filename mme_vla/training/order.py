@@ -1,4 +1,4 @@
-"""Batch order and random numbers as functions of (seed, step), so that resuming replays nothing; the validation loss."""
+"""Batch order, random numbers and validation loss as functions of (seed, step): resuming replays nothing."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence

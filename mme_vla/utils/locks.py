@@ -1,4 +1,8 @@
-"""One process at a time in a folder. The operating system lets go when the process ends, however it ends."""
+"""One process at a time in a folder, and work folders that a repeated command recognises.
+
+`flock` and not the package `filelock`: that empties the file which names the holder before it knows whether the folder
+is free, and a forked worker keeps its lock when the process is killed.
+"""
 
 import errno
 import fcntl
@@ -14,27 +18,26 @@ from mme_vla.errors import UserError
 from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
 
 LOCK = ".lock"
-_locked: set[int] = set()  # descriptors
+_held_descriptors: set[int] = set()
 
 
-def _release_all() -> None:
-    """A forked process holds nothing: it would continue holding the folder when this process is gone."""
-    while _locked:
-        os.close(_locked.pop())
+def _release_in_child() -> None:
+    """Close the locks of the parent in a forked process, which would hold the folder when the parent is gone."""
+    while _held_descriptors:
+        os.close(_held_descriptors.pop())
 
 
-os.register_at_fork(after_in_child=_release_all)
+os.register_at_fork(after_in_child=_release_in_child)
 
 
 class FolderLock:
-    """Hold a folder for this process, as a context manager or from `acquire()` to `release()`.
+    """Lock a folder for this process, as a context manager or from `acquire()` to `release()`.
 
-    The lock is the file `.lock` in the folder. Whoever lets go removes it, and the folder too if nothing else is in it;
-    after a kill it stays behind, without meaning.
+    The lock is a file in the folder. `release` removes it, and the folder if nothing else is in it. After a kill the
+    file stays, unlocked.
 
     Args:
-        folder: made if need be. what: it is for, in the message.
-        name: of the lock's file, where several kinds of holders share a folder.
+        folder: made if need be. what: its purpose, for the message. name: of the file, where several share a folder.
     """
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
@@ -42,14 +45,12 @@ class FolderLock:
         self._descriptor: int | None = None
 
     def acquire(self) -> Self:
-        """Take the lock, making the folder if need be."""
-        for last in (False,) * 99 + (True,):
+        """Lock the folder; raises an error that names the process which has locked it."""
+        for _ in range(100):
+            self.folder.mkdir(parents=True, exist_ok=True)
             try:
-                self.folder.mkdir(parents=True, exist_ok=True)
                 descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            except FileNotFoundError:  # its last holder has just removed the folder
-                if last:
-                    raise
+            except FileNotFoundError:  # the process before has just removed the folder
                 continue
             try:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -63,39 +64,36 @@ class FolderLock:
                     "Wait until it has ended, stop it, or write to another folder."
                 ) from None
             self._descriptor = descriptor
-            _locked.add(descriptor)
+            _held_descriptors.add(descriptor)
             if self._in_place():
                 break
-            self._forget()  # what we hold was removed by its last holder between our opening and our locking it
-        try:
+            self._close()  # the process before removed the file between opening and locking
+        with suppress(OSError):  # a full disk: the lock holds without its text
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
-        except OSError:  # a full disk: the lock holds without words
-            pass
         return self
 
     def release(self) -> None:
-        """Let go of the folder; harmless if it is not held."""
-        if self._descriptor not in _locked:
+        """Unlock the folder; harmless if it is not locked."""
+        if self._descriptor not in _held_descriptors:
             return
-        with suppress(OSError):  # the folder may have been moved or removed by its holder
+        with suppress(OSError):  # the folder may have been moved or removed meanwhile
             if self._in_place():
                 self.path.unlink()
                 self.folder.rmdir()
-        self._forget()
+        self._close()
 
     def _in_place(self) -> bool:
-        """Whether the file that is locked is still the one under the lock's name."""
+        """Whether the locked file is still the one under the lock's name."""
         assert self._descriptor is not None
-        try:
+        with suppress(FileNotFoundError):
             return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
-        except FileNotFoundError:
-            return False
+        return False
 
-    def _forget(self) -> None:
-        if self._descriptor in _locked:  # not so in a forked process
-            _locked.remove(self._descriptor)
-            os.close(self._descriptor)
+    def _close(self) -> None:
+        assert self._descriptor is not None
+        _held_descriptors.remove(self._descriptor)
+        os.close(self._descriptor)
         self._descriptor = None
 
     def __enter__(self) -> Self:
@@ -114,7 +112,7 @@ PLAN = "plan.json"
 def claim_plan(folder: Path, plan: Any) -> bool:
     """Make `folder` the work folder of a plan, or recognise it as such. The caller holds its lock.
 
-    A folder without any work is nobody's, whatever a run left that was killed while it wrote its plan.
+    A folder without any work is free, whatever a killed run left while it wrote its plan.
 
     Args:
         plan: plain JSON, an object or a list.
@@ -130,7 +128,7 @@ def claim_plan(folder: Path, plan: Any) -> bool:
                 remove_drafts(folder)
                 return True
         except UserError:
-            pass  # cut off when the machine went down: nobody's, if there is no work yet
+            pass  # cut off when the machine went down: free, if there is no work yet
         else:
             return False
     if any(_is_work(path) for path in folder.iterdir()):
