@@ -1,11 +1,6 @@
-"""One process at a time in a folder, and work folders that a repeated command recognises.
-
-`flock` and not the package `filelock`: that empties the file which names the holder before it knows whether the folder
-is free, and a forked worker keeps its lock when the process is killed.
-"""
+"""One process at a time in a folder, and work folders that a repeated command recognises."""
 
 import errno
-import fcntl
 import os
 import shutil
 import socket
@@ -14,27 +9,21 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from filelock import FileLock, Timeout
+
 from mme_vla.errors import UserError
 from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
 
 LOCK = ".lock"
-_held_descriptors: set[int] = set()
-
-
-def _release_in_child() -> None:
-    """Close the locks of the parent in a forked process, which would hold the folder when the parent is gone."""
-    while _held_descriptors:
-        os.close(_held_descriptors.pop())
-
-
-os.register_at_fork(after_in_child=_release_in_child)
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # errors of a file system without locks
 
 
 class FolderLock:
     """Lock a folder for this process, as a context manager or from `acquire()` to `release()`.
 
     The lock is a file in the folder. `release` removes it, and the folder if nothing else is in it. After a kill the
-    file stays, unlocked.
+    file stays, unlocked. A forked process does not have its parent's lock.
+    Deleting the object unlocks the folder.
 
     Args:
         folder: made if need be. what: its purpose, for the message. name: of the file, where several share a folder.
@@ -42,59 +31,47 @@ class FolderLock:
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
         self.folder, self.what, self.path = Path(folder), what, Path(folder) / name
-        self._descriptor: int | None = None
+        self._process = os.getpid()
+        # A second attempt counts where the process before removes the file between opening and locking it.
+        self._lock = FileLock(self.path, timeout=0.1, poll_interval=0.02, thread_local=False, fallback_to_soft=False)
 
     def acquire(self) -> Self:
         """Lock the folder; raises an error that names the process which has locked it."""
-        for _ in range(100):
+        for last in (False,) * 99 + (True,):
             self.folder.mkdir(parents=True, exist_ok=True)
             try:
-                descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+                self._lock.acquire()
+                break
             except FileNotFoundError:  # the process before has just removed the folder
-                continue
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-                os.close(descriptor)
-                if error.errno not in (errno.EAGAIN, errno.EACCES):  # a file system without locks
-                    return self
+                if last:
+                    raise
+            except Timeout:
                 raise UserError(
-                    f"{self.folder} is in use by another {self.what} ({holder or 'a process that has just started'}). "
+                    f"{self.folder} is in use by another {self.what} ({self._holder()}). "
                     "Wait until it has ended, stop it, or write to another folder."
                 ) from None
-            self._descriptor = descriptor
-            _held_descriptors.add(descriptor)
-            if self._in_place():
-                break
-            self._close()  # the process before removed the file between opening and locking
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                return self
         with suppress(OSError):  # a full disk: the lock holds without its text
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
+            self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
         return self
 
     def release(self) -> None:
-        """Unlock the folder; harmless if it is not locked."""
-        if self._descriptor not in _held_descriptors:
+        """Unlock the folder; harmless if this process has not locked it."""
+        if os.getpid() != self._process or not self._lock.is_locked:
             return
         with suppress(OSError):  # the folder may have been moved or removed meanwhile
-            if self._in_place():
-                self.path.unlink()
-                self.folder.rmdir()
-        self._close()
+            self.path.unlink()
+            self.folder.rmdir()
+        self._lock.release()
 
-    def _in_place(self) -> bool:
-        """Whether the locked file is still the one under the lock's name."""
-        assert self._descriptor is not None
-        with suppress(FileNotFoundError):
-            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
-        return False
-
-    def _close(self) -> None:
-        assert self._descriptor is not None
-        _held_descriptors.remove(self._descriptor)
-        os.close(self._descriptor)
-        self._descriptor = None
+    def _holder(self) -> str:
+        try:
+            return self.path.read_text(errors="replace")[:200].strip() or "a process that has just started"
+        except OSError:
+            return "a process that has just ended"
 
     def __enter__(self) -> Self:
         return self.acquire()

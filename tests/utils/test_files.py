@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tracemalloc
@@ -168,9 +169,9 @@ def test_the_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
     assert (tmp_path / SUMS).read_text() == f"{known}  a\n"
 
 
-def test_a_folder_belongs_to_one_process_until_that_ends_however_it_ends(tmp_path: Path) -> None:
+def test_folder_lock_holds_until_its_process_is_killed(tmp_path: Path) -> None:
     hold = "import sys; from pathlib import Path; from mme_vla.utils import FolderLock\n"
-    hold += "FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
+    hold += "lock = FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
     other = subprocess.Popen(
         [sys.executable, "-c", hold, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -183,6 +184,29 @@ def test_a_folder_belongs_to_one_process_until_that_ends_however_it_ends(tmp_pat
     with FolderLock(tmp_path), pytest.raises(UserError, match="in use"):
         FolderLock(tmp_path).acquire()
     FolderLock(tmp_path).acquire().release()
+
+
+FORK = """
+import os, sys, time
+from pathlib import Path
+from mme_vla.utils import FolderLock
+
+lock = FolderLock(Path(sys.argv[1])).acquire()
+child = os.fork()
+if child == 0:
+    os.close(1)
+    time.sleep(60)
+print(child, flush=True)
+os._exit(0)
+"""
+
+
+def test_forked_process_does_not_keep_the_lock(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", FORK, tmp_path], stdout=subprocess.PIPE, text=True, check=True)
+    try:
+        FolderLock(tmp_path).acquire().release()
+    finally:
+        os.kill(int(done.stdout), signal.SIGKILL)
 
 
 def test_values_and_lists_in_messages_stay_short() -> None:
