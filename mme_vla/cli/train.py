@@ -101,8 +101,8 @@ def _train(
     from mme_vla.training.data import check_frozen, prepare_data
     from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
     from mme_vla.training.loop import Trainer, finish
+    from mme_vla.training.order import Validation
     from mme_vla.training.runs import CONFIG, check_content, start_from, weights_to_start_from
-    from mme_vla.training.validation import Validation
 
     first = accelerator.is_main_process
     # Of processes that share the weights, one a machine holds them until they are shared: it may have to build a cache.
@@ -144,7 +144,7 @@ def _train(
         validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)
     trainer = Trainer(policy, data.train, collate, validation, settings, run, config, accelerator)
     line.say(trainer.describe())
-    loggers = open_loggers(run.folder, config, run.step) if first else Loggers([])
+    loggers = open_loggers(run.folder, config, run.step) if first else Loggers()
     if first:
         remove_drafts(run.folder)
         with write_atomically(run.folder / CONFIG) as draft:

@@ -21,11 +21,11 @@ from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
-from mme_vla.weights.load import ADAPTERS, read_as
+from mme_vla.weights.load import adapter_of, read_as
 from mme_vla.weights.source import FORMATS, Source, open_source
 from mme_vla.weights.statistics import read_stats
 from mme_vla.weights.tables import Adapter
-from mme_vla.weights.writers import WRITERS, check_target
+from mme_vla.weights.writers import check_target, write_policy
 
 
 def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
@@ -33,11 +33,11 @@ def print_mapping(policy: Policy, source: Source, to: str, console: Console | No
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     read, target_format = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
     console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
-    sides = {ADAPTERS[fmt]: title for fmt, title in ((to, "written"), (source.format, "read")) if fmt != "ours"}
+    sides = {fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"}
     if not sides:
         console.print("Both sides have the same names.")
-    for make, title in reversed(sides.items()):
-        _print_adapter(console, make(policy), policy, title)
+    for fmt, title in sides.items():
+        _print_adapter(console, adapter_of(fmt, policy), policy, title)
 
 
 def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: str) -> None:
@@ -164,7 +164,7 @@ def convert(
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     try:
-        WRITERS[to](policy, draft, kind, stats)
+        write_policy(policy, draft, to, kind, stats)
         draft.rename(target)
     finally:
         shutil.rmtree(draft, ignore_errors=True)

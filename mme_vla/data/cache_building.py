@@ -2,8 +2,10 @@
 
 import logging
 import os
+import queue
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
@@ -15,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.data.ahead import ahead
 from mme_vla.data.cache import (
     COMMAND,
     DTYPES,
@@ -258,7 +259,8 @@ def ensure_cache(
     if coded is not None and make_scorer(memory) is not None:
         log.warning(
             "%s: its videos are coded as %s, and this memory scores patches by how little they change: what "
-            "compression moves passes for motion. Convert the recordings with lossless videos, or choose another memory.",
+            "compression changes passes for motion. Convert the recordings with lossless videos, or choose another "
+            "memory.",
             source.name, coded,
         )  # fmt: skip
     expected = fingerprint(source, memory.storage, encoder, dtype)
@@ -275,3 +277,47 @@ def ensure_cache(
     # All of it here, also under torchrun, where training has its first process prepare the data for the others.
     build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
     return VisionCache(folder, source, expected, command)
+
+
+_END = object()
+
+
+def ahead[T](things: Iterable[T], count: int) -> Generator[T, None, None]:
+    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where they are used.
+
+    Closing the generator ends the thread.
+    """
+    made: queue.Queue[Any] = queue.Queue(count)
+    closed = threading.Event()
+
+    def put(thing: Any) -> bool:
+        while not closed.is_set():
+            try:
+                made.put(thing, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def make() -> None:
+        try:
+            for thing in things:
+                if not put((thing, None)):
+                    return
+            put((_END, None))
+        except BaseException as error:
+            put((_END, error))
+
+    thread = threading.Thread(target=make, name="ahead", daemon=True)
+    thread.start()
+    try:
+        while True:
+            thing, error = made.get()
+            if error is not None:
+                raise error
+            if thing is _END:
+                return
+            yield thing
+    finally:
+        closed.set()
+        thread.join()

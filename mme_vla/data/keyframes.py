@@ -16,7 +16,7 @@ import numpy as np
 from torch.utils.data import Dataset
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5_episode import RawEpisode
+from mme_vla.data.hdf5 import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import CAMERAS

@@ -21,10 +21,10 @@ from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
 from mme_vla.training.logging import JsonLines, Loggers, ProgressLine
 from mme_vla.training.loop import Trainer
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
-from mme_vla.training.validation import Validation
-from mme_vla.utils import read_json_lines, write_json
+from mme_vla.utils import read_lines, write_json
 
 DONE = "trained.json"
 HELD_OUT = 10
@@ -143,4 +143,4 @@ def prepared(
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:
     """What the run logged, a dictionary a line."""
-    return [line for _, line in read_json_lines(folder / "metrics.jsonl", "the log of a run")]
+    return read_lines(folder / "metrics.jsonl", dict, "the log of a run")

@@ -103,7 +103,7 @@ def save_shards(
     keep: KeepRule,
     hurry: bool = False,
 ) -> Path:
-    """Begin to write `folder`/step_… of a sharded run; all processes call it, and continue when `writer` has its copies.
+    """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the copies alone.
 
     Args:
         hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's weights into it

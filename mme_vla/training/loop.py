@@ -30,13 +30,12 @@ from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
 from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
-from mme_vla.training.order import BatchOrder, generator_for, readers, seed_of, size_of
+from mme_vla.training.order import BatchOrder, Collate, Samples, Validation, generator_for, readers, seed_of, size_of
 from mme_vla.training.parallel import full_value, gathered, reshard, shard
 from mme_vla.training.runs import PLOT, SUMMARY, Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
 from mme_vla.training.stopping import leave_signals_alone, stop_requests
-from mme_vla.training.validation import Collate, Samples, Validation
 from mme_vla.types import send
 from mme_vla.utils import write_atomically
 

@@ -10,8 +10,7 @@ import torch
 
 from helpers.trainings import RECIPE, policy
 from mme_vla.config.composition import compose
-from mme_vla.data.ahead import ahead
-from mme_vla.data.cache_building import PAGE, save_aligned
+from mme_vla.data.cache_building import PAGE, ahead, save_aligned
 from mme_vla.errors import UserError
 from mme_vla.memory.history import FrameScores
 from mme_vla.memory.tokendrop import FIRST_FRAME_SCORE, THRESHOLD, ranked_patches

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from mme_vla.backbone.base import Hook, LayerHooks, bind_hook
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import random_batch, small_policy
-from mme_vla.training.validation import Validation
+from mme_vla.training.order import Validation
 from mme_vla.types import Batch
 
 pytestmark = pytest.mark.slow

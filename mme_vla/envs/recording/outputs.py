@@ -165,7 +165,7 @@ class RecordingPlan:
     def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:
         """Write these places from the recorded files in `episodes`; each appears whole or not at all."""
         from mme_vla.data.convert import convert
-        from mme_vla.data.hdf5_episode import EpisodeRef
+        from mme_vla.data.hdf5 import EpisodeRef
 
         for place in missing:
             if place != self.dataset:

@@ -26,7 +26,7 @@ from mme_vla.subgoal.text import (
     subgoal_user,
     write_boxes,
 )
-from mme_vla.utils import Sums, inside, is_text, read_json_lines
+from mme_vla.utils import Sums, inside, is_text, read_lines
 
 Row = dict[str, Any]
 SETS = {"simple": ("qwenvl", "simple"), "grounded": ("qwenvl", "grounded"), "memer": ("memer", "grounded")}
@@ -150,14 +150,16 @@ def read_rows(file: str | Path) -> list[Row]:
     if not path.is_file():
         raise UserError(f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
     Sums(path.parent, remedy="Build the training data again").check(path.name)
-    rows: list[Row] = []
-    for number, row in read_json_lines(path, "rows of training data", _LIMIT):
-        if reason := _fault(row):
-            raise UserError(f"{path}, line {number}, is no row: {reason}. Build the training data again.")
-        rows.append(row)
+    rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
     if not rows:
         raise UserError(f"{path} holds no row.")
     return rows
+
+
+def _checked(row: Row) -> Row:
+    if reason := _fault(row):
+        raise UserError(f"no row of training data: {reason}. Build the training data again.")
+    return row
 
 
 def _fault(row: Row) -> str:

@@ -36,7 +36,7 @@ from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames
 from mme_vla.training.data import check_frozen, prepare_data
 from mme_vla.types import HistoryTokens
 from mme_vla.weights.load import transfer
-from mme_vla.weights.writers import WRITERS
+from mme_vla.weights.writers import write_policy
 
 
 def recalling(memory: Any = "framesamp", **options: Any) -> MemoryVlaPolicy:
@@ -272,11 +272,11 @@ def test_it_starts_from_a_policy_with_banks_whose_banks_stay_behind(tmp_path: Pa
     assert isinstance(banked.core, MemoryVlaCore)  # type: ignore[union-attr]
     banked.save_pretrained(tmp_path / "ours")
     (tmp_path / "theirs").mkdir()
-    WRITERS["memoryvla"](banked, tmp_path / "theirs", torch.float32, None)
+    write_policy(banked, tmp_path / "theirs", "memoryvla", torch.float32, None)
     for source in ("ours", "theirs"):
         took = transfer(policy, tmp_path / source)
         assert all("_bank" in name for name in took.left) and took.left
         assert {policy.finetune_spec.component_of(name) for name in took.new} == {"memory"}
         assert torch.equal(policy.core.head.output.bias, banked.core.head.output.bias)  # type: ignore[union-attr]
     with pytest.raises(UserError, match="no name in this format"):
-        WRITERS["memoryvla"](policy, tmp_path / "theirs", torch.float32, None)
+        write_policy(policy, tmp_path / "theirs", "memoryvla", torch.float32, None)
