@@ -307,8 +307,9 @@ def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.n
 
 def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> Any:
     """Memory-map these columns of all tables, as LeRobot does, through the cache folder of the `datasets` library."""
-    from datasets import Dataset, Features
     from lerobot.utils.utils import SuppressProgressBars
+
+    from datasets import Dataset, Features
 
     for name in _INTEGER_COLUMNS:
         if name in columns and not features[name]["dtype"].startswith(("int", "uint", "bool")):

@@ -18,7 +18,7 @@ from mme_vla.policy.build import build_from_config
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
 from mme_vla.training.checkpoint import check_disk
 from mme_vla.training.data import check_frozen
-from mme_vla.training.logging import Loggers, ProgressLine, check_logger, open_loggers, read_metrics
+from mme_vla.training.logging import ProgressLine, check_logger, open_loggers, read_metrics
 from mme_vla.training.loop import Trainer, loss_change
 from mme_vla.training.order import Validation
 from mme_vla.training.runs import Run, differing_keys, open_run, start_from
