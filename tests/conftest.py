@@ -2,9 +2,7 @@
 
 import gc
 import os
-import shutil
 import sys
-import tempfile
 from collections.abc import Sequence
 from multiprocessing import forkserver
 from pathlib import Path
@@ -18,7 +16,6 @@ os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(2**31 - 1))
 os.environ.setdefault("MALLOC_TOP_PAD_", str(2**26))
 
 import pytest
-import shared_compositions
 from forked_workers import Collected
 
 from mme_vla.envs.vector import processes
@@ -31,7 +28,7 @@ sys.dont_write_bytecode = False
 
 # What commands import besides: `forked.py` runs them in the same way as workers.
 processes.PRELOADED += [
-    "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.training.loop", "composed_before",
+    "lerobot.datasets.lerobot_dataset", "matplotlib.pyplot", "timm", "mme_vla.training.loop"
 ]  # fmt: skip
 
 
@@ -48,11 +45,6 @@ def pytest_configure(config: pytest.Config) -> None:
     Test workers have one process in common that commands and simulating processes are forked from.
     """
     config.option.loadscopereorder = False
-    if shared_compositions.FOLDER not in os.environ:
-        composed = os.environ[shared_compositions.FOLDER] = tempfile.mkdtemp(prefix="composed")
-        config.add_cleanup(lambda: shutil.rmtree(composed, ignore_errors=True))
-    if not getattr(config.option, "numprocesses", None):  # a process that runs tests, or that such are forked from
-        shared_compositions.share()
     given = getattr(config, "workerinput", {}).get("forkserver")
     if given is not None:
         server: Any = forkserver._forkserver

@@ -4,7 +4,7 @@ import os
 import sys
 from importlib import import_module
 
-from mme_vla.config.errors import print_user_errors
+from mme_vla.cli.errors import print_user_errors
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train a policy"),

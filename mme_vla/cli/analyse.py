@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mme_vla.config.composition import print_user_errors
-from mme_vla.config.help import argument_parser
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.utils import safe_name

@@ -127,6 +127,6 @@ def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
 
 def main() -> None:
     """Run `mme-vla gallery`."""
-    from mme_vla.config.composition import cli
+    from mme_vla.cli.command import cli
 
     cli("show")(run)()

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.errors import UserError, printable
 
 if TYPE_CHECKING:

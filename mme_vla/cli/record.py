@@ -259,6 +259,6 @@ def _claim(work: Path, jobs: Sequence[Job]) -> None:
 
 def main() -> None:
     """Run `mme-vla record`."""
-    from mme_vla.config.composition import cli
+    from mme_vla.cli.command import cli
 
     cli("record")(run)()

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling
-from mme_vla.config.composition import cli, log_to_terminal
 
 if TYPE_CHECKING:
     from mme_vla.serving.server import PolicyServer

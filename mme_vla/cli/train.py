@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.utils import remove_drafts, write_atomically

@@ -8,7 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli, compose, log_to_terminal
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 
 logger = logging.getLogger("mme_vla.nano")

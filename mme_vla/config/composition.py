@@ -1,34 +1,21 @@
-"""Composition of the YAML tree, and the decorator that turns a function into a `python -m` command.
+"""Composition of the YAML tree: every command and `build_policy` read the same Hydra tree.
 
-Every command and `build_policy` read the same Hydra tree. Mistakes in what the user typed are found here, before any
-work starts, and come back as one `UserError` with the near names.
+Mistakes in overrides are found here, before any work starts, and raise one `UserError` with the near names.
 """
 
-import functools
-import logging
-import os
-import pickle
-import sys
-import warnings
-from collections.abc import Callable, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from pathlib import Path
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.types import Override, ValueType
-from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config import plugins
-from mme_vla.config.errors import COMPOSITION_ERRORS, ConfigTree, paths
-from mme_vla.config.errors import print_user_errors as print_user_errors
-from mme_vla.config.help import help_page, unknown_option
-from mme_vla.config.hydra_engine import VERSION_BASE, is_fixed, local_hydra, parse
-from mme_vla.config.hydra_engine import config_dir as config_dir
-from mme_vla.config.naming import join_memories, several_memories, store_name, true_name
-from mme_vla.errors import UserError, printable
+from mme_vla.config.hydra_tree import config_dir as config_dir
+from mme_vla.config.hydra_tree import local_hydra, parse
+from mme_vla.config.naming import join_memories, several_memories, true_name
+from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
+from mme_vla.errors import UserError
 
 
 def compose(
@@ -47,54 +34,23 @@ def compose(
         extra_dirs: further trees searched after it, as `--config-dir` adds them.
     """
     trees = ((directory or config_dir()).resolve(), *extra_dirs)
-    words = tuple(several_memories(overrides))
-    if is_fixed(trees, words):
-        return pickle.loads(_composed_once(config_name, words, trees))
-    return _composed(config_name, words, trees)
-
-
-@functools.lru_cache(maxsize=512)
-def _composed_once(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]) -> bytes:
-    """The composition as bytes, a new copy from which takes a millisecond where composing takes a hundred."""
-    return pickle.dumps(_composed(config_name, overrides, trees))
-
-
-def _composed(config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]) -> DictConfig:
-    directory, *extra_dirs = trees
     for folder in trees:
         if not folder.is_dir():
             raise UserError(f"The config folder {str(folder)!r} does not exist.")
-    with local_hydra(directory, extra_dirs) as engine:
-        tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
+    words = several_memories(overrides)
+    with local_hydra(trees[0], trees[1:]) as engine:
+        tree = ConfigTree(engine.config_loader, config_name, parse(words))
         try:
-            cfg = join_memories(tree.composed(overrides))
+            cfg = join_memories(hydra.compose(config_name, words))
         except COMPOSITION_ERRORS as error:
             raise UserError(tree.explain(error)) from None
         tree.check_kinds()
     if {"name", "memory"} <= set(cfg):  # a tree without models has no such name
-        store_name(cfg, tree)
         cfg.name = true_name(cfg, config_name, tuple(folder.resolve() for folder in trees))
     return cfg
 
 
-def check_overrides(
-    config_name: str,
-    overrides: Sequence[str],
-    *,
-    directory: Path | None = None,
-    extra_dirs: Sequence[Path] = (),
-) -> None:
-    """Compose once to see that the overrides fit, every choice of a sweep (`model=a,b`) included."""
-    columns = [_choices(override) for override in parse(overrides)]
-    for row in zip_longest(*columns) if columns else [()]:
-        # A column shorter than the longest stays at its first choice: every choice is seen once, not their product.
-        combination = [
-            column[0] if value is None else value for value, column in zip(row, columns, strict=True) if column
-        ]
-        compose(config_name, combination, directory=directory, extra_dirs=extra_dirs)
-
-
-def _name_under_hydra(*, _root_: DictConfig) -> str:
+def name_under_hydra(*, _root_: DictConfig) -> str:
     """`${model_name:}` in a file of the tree: the composition's name, also while Hydra decides on the run's folder."""
     if not HydraConfig.initialized():
         return str(_root_.name)  # `compose` and the command have set it
@@ -110,139 +66,9 @@ def command_trees() -> tuple[Path, ...]:
     return tuple(dict.fromkeys(Path(source.path).resolve() for source in sources))
 
 
-OmegaConf.register_new_resolver("model_name", _name_under_hydra, replace=True)
+OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
 
 
 def import_plugins(cfg: DictConfig) -> None:
     """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`."""
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
-
-
-def cli[T](
-    config_name: str, directory: Path | None = None
-) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
-    """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
-
-    Before the command starts the overrides are checked. How it ends when the user, the system or the disk ends it is
-    `print_user_errors`' matter; any other exception keeps its traceback. Called with a config, the decorated function
-    runs `main` directly.
-    """
-
-    def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
-        @functools.wraps(main)
-        def job(cfg: DictConfig) -> T:
-            with print_user_errors():  # here too: Hydra would print a traceback before it gets further
-                _require_values(cfg)
-                join_memories(cfg)
-                if {"name", "memory"} <= set(cfg):
-                    cfg.name = _name_under_hydra(_root_=cfg)
-                import_plugins(cfg)
-                return main(cfg)
-
-        @functools.wraps(main)
-        def command(cfg: DictConfig | None = None) -> T | None:
-            if cfg is not None:
-                import_plugins(cfg)
-                return main(cfg)
-            tree = directory or config_dir()
-            sys.argv[1:] = options_first(several_memories(plugins.trust_as_override(sys.argv[1:])))
-            with print_user_errors():
-                _check_command_line(config_name, tree)
-                start = hydra.main(version_base=VERSION_BASE, config_path=str(tree.resolve()), config_name=config_name)
-                # Hydra makes the run folder: what the disk says to that is to come here, not to be printed there.
-                os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-                try:
-                    start(job)()
-                except HydraException as error:
-                    raise UserError(str(error)) from error
-            return None
-
-        return command
-
-    return decorate
-
-
-def options_first(words: Sequence[str]) -> list[str]:
-    """Move the options of a command line before its overrides: Hydra's parser takes no other order.
-
-    A command line with an unknown option stays as it is.
-    """
-    args, unknown = get_args_parser().parse_known_intermixed_args(words)
-    if unknown:
-        return list(words)
-    options = list(words)
-    options.reverse()
-    for override in reversed(args.overrides):
-        options.remove(override)  # its last occurrence: the value of an option may be the same word
-    return [*reversed(options), *args.overrides]
-
-
-def _check_command_line(config_name: str, tree: Path) -> None:
-    args, unknown = get_args_parser().parse_known_intermixed_args()
-    if unknown:
-        raise unknown_option(unknown[0], sys.argv[1:], known_keys(config_name, tree))
-    if args.help:
-        extra = [Path(folder).resolve() for folder in [args.config_dir] if folder]
-        print(help_text(args.config_name or config_name, args.overrides, [tree.resolve(), *extra]))
-        raise SystemExit(0)
-    if args.hydra_help or args.shell_completion or args.experimental_rerun or args.config_path:
-        return  # nothing of this tree is composed
-    extra = [Path(args.config_dir).resolve()] if args.config_dir else []
-    check_overrides(args.config_name or config_name, args.overrides, directory=tree, extra_dirs=extra)
-
-
-def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
-    """What a command answers to `--help` and these words (`mme_vla.config.help`).
-
-    Args:
-        trees: folders of YAML files, the library's first.
-    """
-
-    def selected_groups(overrides: Sequence[str]) -> dict[str, str]:
-        compose(config_name, overrides, directory=trees[0], extra_dirs=trees[1:])  # says what is misspelt
-        with local_hydra(trees[0], trees[1:]):
-            cfg = hydra.compose(config_name, list(overrides), return_hydra_config=True)
-            taken = cfg.hydra.runtime.choices.items()
-            words = {group: "null" if name is None else str(name) for group, name in taken}
-            return {group: name for group, name in words.items() if not group.startswith("hydra/")}
-
-    return help_page(config_name, words, trees, selected_groups)
-
-
-def known_keys(config_name: str, tree: Path) -> list[str]:
-    """Every dotted key of a command's configuration as it is by default."""
-    with local_hydra(tree, []):
-        return list(paths(OmegaConf.to_container(hydra.compose(config_name))))
-
-
-def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
-    """Let a command's logger, and warnings, speak on standard error; `clock` puts the time of day before each line."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
-    logger.setLevel(logging.INFO)
-    logger.handlers = [handler]
-    logger.propagate = False
-    warnings.showwarning = lambda message, *_, **__: logger.warning("%s", message)
-
-
-class _Printable(logging.Formatter):
-    """Lines as a terminal may have them: they name what untrusted files and clients sent."""
-
-    def format(self, record: logging.LogRecord) -> str:
-        return printable(super().format(record))
-
-
-def _choices(override: Override) -> list[str]:
-    """The overrides that a sweep means; the override itself when it is none."""
-    if not override.is_sweep_override():
-        return [str(override.input_line)]
-    if not override.is_discrete_sweep() or override.value_type == ValueType.GLOB_CHOICE_SWEEP:
-        return []  # an interval has no list of values, a glob names only what exists
-    left = str(override.input_line).partition("=")[0]
-    return [f"{left}={value}" for value in override.sweep_string_iterator()]
-
-
-def _require_values(cfg: DictConfig) -> None:
-    missing = sorted(OmegaConf.missing_keys(cfg))
-    if missing:
-        raise UserError(f"A value is needed for {', '.join(missing)}: add {' '.join(f'{key}=…' for key in missing)}")

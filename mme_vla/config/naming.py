@@ -9,10 +9,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+import hydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
-from mme_vla.config.errors import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.config.hydra_engine import is_fixed, local_hydra, parse
+from mme_vla.config.hydra_tree import config_dir, local_hydra, parse
+from mme_vla.config.override_errors import COMPOSITION_ERRORS
 from mme_vla.errors import UserError
 
 JOINED = "joined"
@@ -215,47 +216,22 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
     return result
 
 
-_names: dict[str, str] = {}
-"""Names of compositions of the library's own tree by what decides on them; finding one takes 60 ms a model."""
-
-
-def _what_names(cfg: DictConfig) -> str:
-    return json.dumps([str(cfg.name), decisive(cfg)], sort_keys=True, default=str)
-
-
-def store_name(cfg: DictConfig, tree: ConfigTree) -> None:
-    """Spare `true_name` the search where a composition is a model as its file says, whatever it is trained with."""
-    model = [str(choice.input_line) for choice in tree.choices] == [f"model={cfg.name}"]
-    values = {str(value.key_or_group).partition(".")[0] for value in tree.values}
-    if tree.fixed and model and not values & {*DECISIVE, "policy", "name"}:
-        _names[_what_names(cfg)] = str(cfg.name)
-
-
 def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    """What a composition is called (`mme_vla.config.naming`).
+    """The name of a composition, from the models of these trees.
 
     Args:
-        config_name: what was composed. trees: folders of YAML files, the library's first.
+        config_name: the file that was composed. trees: folders of YAML files, the library's first.
     """
     if isinstance(cfg.get("memory"), ListConfig):
         cfg = join_memories(cfg.copy())
-    if not is_fixed(trees, ()):
-        return resolve_name(cfg, config_name, trees)
-    key = _what_names(cfg)
-    if key not in _names:
-        _names[key] = resolve_name(cfg, config_name, trees)
-    return _names[key]
-
-
-def resolve_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    """`true_name`, found by comparing the models of these trees."""
     configured_name = str(cfg.name)
     config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
     mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
     plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
 
     def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        return (_cached_sections if is_fixed(searched, words) else _composed_sections)(config_name, words, searched)
+        library_alone = searched == (config_dir().resolve(),)  # its files do not change while a process runs
+        return (_cached_sections if library_alone else _composed_sections)(config_name, words, searched)
 
     def parts() -> Sections | None:
         groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
@@ -287,10 +263,10 @@ def _composed_sections(
     config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
 ) -> tuple[str, Sections] | None:
     """Name and decisive keys of a composition; None where these words do not compose."""
-    with local_hydra(trees[0], trees[1:]) as engine:
+    with local_hydra(trees[0], trees[1:]):
         try:
-            tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
-            cfg = join_memories(tree.composed(overrides))
+            parse(overrides)
+            cfg = join_memories(hydra.compose(config_name, list(overrides)))
             return str(cfg.name), decisive(cfg)
         except (*COMPOSITION_ERRORS, UserError):
             return None

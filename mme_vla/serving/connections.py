@@ -175,7 +175,7 @@ def _silence(connection: Connection) -> float:
 
 
 def timed_protocol(connections: Connections) -> type[H11Protocol]:
-    """The HTTP protocol of uvicorn, which adds each connection to `connections` and starts the time limit of headers."""
+    """HTTP protocol of uvicorn that adds each connection to `connections` and starts the time limit of headers."""
 
     class TimedProtocol(H11Protocol):
         def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]

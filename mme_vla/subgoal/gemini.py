@@ -301,7 +301,7 @@ class OpenAI(Gemini):
     """The same questions to any endpoint that speaks OpenAI's chat completions; videos are shown as images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
-    settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.
+    settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.
     """
 
     speaks = "openai"

@@ -32,7 +32,7 @@ SLOW = (
 
 
 COMMANDS = (
-    "composed_before", "mme_vla.cli.evaluate", "mme_vla.cli.gallery", "mme_vla.cli.play",
+    "mme_vla.cli.evaluate", "mme_vla.cli.gallery", "mme_vla.cli.play",
     "mme_vla.cli.record", "mme_vla.cli.serve", "mme_vla.cli.train", "mme_vla.cli.weights",
 )  # fmt: skip
 """Hydra, and what needs it: as it is imported it looks for its plugins, one of which is an extra's."""

@@ -17,7 +17,7 @@ from PIL import Image
 from mme_vla.errors import UserError
 from mme_vla.play import OpenAIPlayer
 from mme_vla.subgoal import OpenAI, build_predictor
-from mme_vla.subgoal.models.openai_chat import OpenAISettings
+from mme_vla.subgoal.models.connection import OpenAISettings
 
 pytest.importorskip("openai", reason="needs the extra openai")
 SECRET = "sk-not-a-real-key"
