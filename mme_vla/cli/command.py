@@ -18,8 +18,15 @@ from omegaconf import DictConfig, OmegaConf
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.cli.help import help_page, unknown_option
 from mme_vla.config import plugins
-from mme_vla.config.composition import compose, config_dir, import_plugins, name_under_hydra
-from mme_vla.config.hydra_tree import VERSION_BASE, local_hydra, parse
+from mme_vla.config.composition import (
+    VERSION_BASE,
+    compose,
+    config_dir,
+    import_plugins,
+    local_hydra,
+    name_under_hydra,
+    parse,
+)
 from mme_vla.config.naming import join_memories, several_memories
 from mme_vla.config.override_errors import paths
 from mme_vla.errors import UserError, printable

@@ -3,19 +3,94 @@
 Mistakes in overrides are found here, before any work starts, and raise one `UserError` with the near names.
 """
 
-from collections.abc import Sequence
+import functools
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import hydra
+from hydra import version
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.core.plugins import Plugins
+from hydra.core.utils import JobRuntime
+from hydra.errors import OverrideParseException
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from mme_vla.config import plugins
-from mme_vla.config.hydra_tree import config_dir as config_dir
-from mme_vla.config.hydra_tree import local_hydra, parse
-from mme_vla.config.naming import join_memories, several_memories, true_name
+from mme_vla.config.naming import (
+    POLICY,
+    Sections,
+    decisive,
+    join_memories,
+    literal,
+    may_be_of,
+    several_memories,
+    variant_name,
+)  # fmt: skip
 from mme_vla.config.override_errors import COMPOSITION_ERRORS, ConfigTree
 from mme_vla.errors import UserError
+
+VERSION_BASE = "1.3"
+
+
+def _load_installed_plugins() -> None:
+    """Load Hydra's plugins, but none of a folder `hydra_plugins` of the current directory."""
+    before, here = list(sys.path), Path.cwd().resolve()
+    sys.path[:] = [folder for folder in sys.path if Path(folder).resolve() != here]
+    try:
+        Plugins.instance()
+    finally:
+        sys.path[:] = before
+
+
+_load_installed_plugins()
+
+
+def config_dir() -> Path:
+    """Return the folder of the YAML tree: inside the package when a wheel is installed, else the repository's."""
+    package = Path(__file__).resolve().parents[1]
+    shipped = package / "configs"
+    return shipped if shipped.is_dir() else package.parent / "configs"
+
+
+@contextmanager
+def local_hydra(directory: Path, extra_dirs: Sequence[Path]) -> Iterator[Hydra]:
+    """Hydra's compose API with further folders, handing back the Hydra that a surrounding command runs under."""
+    base = version.VersionBase.instance()
+    outer, outer_base = GlobalHydra.instance().hydra, base.version_base
+    GlobalHydra.instance().clear()
+    search_path = create_config_search_path(str(directory))
+    for folder in extra_dirs:
+        search_path.prepend("command-line", f"file://{folder.resolve()}", anchor=SearchPathQuery(provider="schema"))
+    try:
+        version.setbase(VERSION_BASE)
+        name = JobRuntime.instance().get("name")  # a sweep's next job is still to be called by it
+        yield Hydra.create_main_hydra2(task_name=name, config_search_path=search_path)
+    finally:
+        GlobalHydra.instance().hydra = outer
+        base.version_base = outer_base
+
+
+def parse(overrides: Sequence[str]) -> list[Override]:
+    """Overrides under Hydra's grammar."""
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        for override in parsed:
+            if not override.key_or_group:
+                raise OverrideParseException(str(override.input_line), "the key is missing")
+    except OverrideParseException as error:
+        raise UserError(
+            f"Cannot read the override {error.override!r}: {error.message.splitlines()[0]}. "
+            "Write key=value, +key=value to add a key, ~key to remove one; quote values with special characters."
+        ) from error
+    return parsed
 
 
 def compose(
@@ -72,3 +147,62 @@ OmegaConf.register_new_resolver("model_name", name_under_hydra, replace=True)
 def import_plugins(cfg: DictConfig) -> None:
     """Import the modules that the user's configuration names under `plugins`; see `mme_vla.config.plugins`."""
     plugins.import_plugins(plugins.plugins_of(cfg, "the configuration"))
+
+
+def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
+    """The name of a composition, from the models of these trees.
+
+    Args:
+        config_name: the file that was composed. trees: folders of YAML files, the library's first.
+    """
+    if isinstance(cfg.get("memory"), ListConfig):
+        cfg = join_memories(cfg.copy())
+    configured_name = str(cfg.name)
+    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
+    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
+    plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
+
+    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
+        library_alone = searched == (config_dir().resolve(),)  # its files do not change while a process runs
+        return (_cached_sections if library_alone else _composed_sections)(config_name, words, searched)
+
+    def parts() -> Sections | None:
+        groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
+        for group, section in groups.items():
+            if section and not section.get("name"):
+                raise UserError(
+                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
+                    f"keys are set beside it, {group}.<key>=<value>."
+                )
+        words = [f"{group}={section.name if section else 'none'}" for group, section in groups.items()]
+        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
+            words.insert(0, f"model={configured_name}")
+        if "members" in (groups.get("memory") or {}):
+            words.append(f"memory.members={literal(OmegaConf.to_container(groups['memory'].members, resolve=True))}")
+        result = composed(tuple(words), trees)
+        return None if result is None else result[1]
+
+    sections = decisive(cfg)
+
+    def reference(model: str) -> tuple[str, Sections] | None:
+        if model in plugin_models and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
+            return None
+        return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
+
+    return variant_name(str(cfg.name), sections, mine | plugin_models, reference, parts)
+
+
+def _composed_sections(
+    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
+) -> tuple[str, Sections] | None:
+    """Name and decisive keys of a composition; None where these words do not compose."""
+    with local_hydra(trees[0], trees[1:]):
+        try:
+            parse(overrides)
+            cfg = join_memories(hydra.compose(config_name, list(overrides)))
+            return str(cfg.name), decisive(cfg)
+        except (*COMPOSITION_ERRORS, UserError):
+            return None
+
+
+_cached_sections = functools.cache(_composed_sections)

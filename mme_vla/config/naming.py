@@ -1,6 +1,5 @@
 """The name of a composition, found among the models of the tree it is composed from."""
 
-import functools
 import hashlib
 import json
 import re
@@ -9,12 +8,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-import hydra
 from omegaconf import DictConfig, ListConfig, OmegaConf
-
-from mme_vla.config.hydra_tree import config_dir, local_hydra, parse
-from mme_vla.config.override_errors import COMPOSITION_ERRORS
-from mme_vla.errors import UserError
 
 JOINED = "joined"
 """The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)."""
@@ -214,62 +208,3 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
     for key, value in values.items():
         result |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return result
-
-
-def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    """The name of a composition, from the models of these trees.
-
-    Args:
-        config_name: the file that was composed. trees: folders of YAML files, the library's first.
-    """
-    if isinstance(cfg.get("memory"), ListConfig):
-        cfg = join_memories(cfg.copy())
-    configured_name = str(cfg.name)
-    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
-    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
-    plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
-
-    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        library_alone = searched == (config_dir().resolve(),)  # its files do not change while a process runs
-        return (_cached_sections if library_alone else _composed_sections)(config_name, words, searched)
-
-    def parts() -> Sections | None:
-        groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
-        for group, section in groups.items():
-            if section and not section.get("name"):
-                raise UserError(
-                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
-                    f"keys are set beside it, {group}.<key>=<value>."
-                )
-        words = [f"{group}={section.name if section else 'none'}" for group, section in groups.items()]
-        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
-            words.insert(0, f"model={configured_name}")
-        if "members" in (groups.get("memory") or {}):
-            words.append(f"memory.members={literal(OmegaConf.to_container(groups['memory'].members, resolve=True))}")
-        result = composed(tuple(words), trees)
-        return None if result is None else result[1]
-
-    sections = decisive(cfg)
-
-    def reference(model: str) -> tuple[str, Sections] | None:
-        if model in plugin_models and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
-            return None
-        return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
-
-    return variant_name(str(cfg.name), sections, mine | plugin_models, reference, parts)
-
-
-def _composed_sections(
-    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
-) -> tuple[str, Sections] | None:
-    """Name and decisive keys of a composition; None where these words do not compose."""
-    with local_hydra(trees[0], trees[1:]):
-        try:
-            parse(overrides)
-            cfg = join_memories(hydra.compose(config_name, list(overrides)))
-            return str(cfg.name), decisive(cfg)
-        except (*COMPOSITION_ERRORS, UserError):
-            return None
-
-
-_cached_sections = functools.cache(_composed_sections)

@@ -38,9 +38,7 @@ def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str
     assert f"Stopped by {words}" in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("stop", "code"), [(KeyboardInterrupt(), 130), (Terminated(), 143)], ids=["Ctrl-C", "SIGTERM"]
-)
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt(), 130), (Terminated(), 143)], ids=["Ctrl-C", "SIGTERM"])
 @pytest.mark.parametrize("hidden", [AttributeError("half-made"), UserError("cannot be composed")], ids=["bug", "user"])
 def test_a_signal_is_reported_though_a_finally_fails(
     stop: BaseException, code: int, hidden: Exception, capsys: pytest.CaptureFixture[str]

@@ -13,8 +13,8 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from mme_vla.cli.command import check_overrides, cli, options_first
-from mme_vla.config.composition import compose, config_dir, import_plugins
-from mme_vla.config.naming import join_memories, true_name
+from mme_vla.config.composition import compose, config_dir, import_plugins, true_name
+from mme_vla.config.naming import join_memories
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
