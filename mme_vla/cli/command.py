@@ -37,9 +37,8 @@ def cli[T](
 ) -> Callable[[Callable[[DictConfig], T]], Callable[..., T | None]]:
     """Make `main(cfg)` a Hydra command: run folder, `--multirun`, `--help`, `--cfg job`, `--config-dir`.
 
-    Before the command starts the overrides are checked. How it ends when the user, the system or the disk ends it is
-    `print_user_errors`' matter; any other exception keeps its traceback. Called with a config, the decorated function
-    runs `main` directly.
+    The overrides are checked before the command starts. `print_user_errors` surrounds it: exceptions that are bugs keep
+    their traceback. Called with a config, the decorated function runs `main` directly.
     """
 
     def decorate(main: Callable[[DictConfig], T]) -> Callable[..., T | None]:
@@ -106,7 +105,7 @@ def _check_command_line(config_name: str, tree: Path) -> None:
 
 
 def help_text(config_name: str, words: Sequence[str], trees: Sequence[Path]) -> str:
-    """What a command answers to `--help` and these words (`mme_vla.cli.help`).
+    """The text of `--help` beside these words (`mme_vla.cli.help`).
 
     Args:
         trees: folders of YAML files, the library's first.
@@ -163,7 +162,7 @@ def _require_values(cfg: DictConfig) -> None:
 
 
 def log_to_terminal(logger: logging.Logger, clock: bool = False) -> None:
-    """Let a command's logger, and warnings, speak on standard error; `clock` puts the time of day before each line."""
+    """Write a command's log and warnings to standard error; `clock` puts the time of day before each line."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Printable("%(asctime)s %(message)s" if clock else "%(message)s", "%H:%M:%S"))
     logger.setLevel(logging.INFO)

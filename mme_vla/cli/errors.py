@@ -37,8 +37,8 @@ def print_user_errors() -> Iterator[None]:
         except KeyboardInterrupt as stop:
             _end_interrupted(stop)
         except Exception as error:
-            if (stop := _interrupted(error)) is not None:
-                _end_interrupted(stop)
+            if (hidden := _interrupted(error)) is not None:
+                _end_interrupted(hidden)
             message = str(error) if isinstance(error, UserError) else disk_trouble(error)
             if message is None:
                 raise

@@ -19,7 +19,7 @@ LEVELS = ("easy", "medium", "hard")
 
 @cli("vision_pretrain")
 def main(cfg: DictConfig) -> None:
-    """Draw what is not drawn, train what is not trained."""
+    """Render the scenes that are missing, then train the tower."""
     from mme_vla.envs.make import require_simulator
 
     require_simulator()

@@ -139,7 +139,7 @@ def convert(
 ) -> None:
     """Convert a checkpoint; the destination appears whole or not at all.
 
-    With `trust_plugins` the modules that a checkpoint names are imported: code of whoever wrote it.
+    With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
     """
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
     if not dry_run and target.exists():

@@ -91,7 +91,7 @@ def decisive(cfg: DictConfig) -> Sections:
 
 
 def may_be_of(model: Path, sections: Sections) -> bool:
-    """Whether a model may compose to this memory and integration: a look at its files, where composing takes 60 ms."""
+    """Whether a model may compose to this memory and integration: reads its files, where composing takes 60 ms."""
     described = _read(model)
     if not isinstance(described, dict):
         return True
@@ -117,7 +117,7 @@ def _read(file: Path) -> Any:
 
 @lru_cache(maxsize=256)
 def _parsed(file: Path, changed: int) -> Any:
-    """A YAML file as it was when it was last changed; every name with differences asks for all models."""
+    """A YAML file as it was when it was last changed; a name with differences compares all models."""
     return OmegaConf.to_container(OmegaConf.load(file))
 
 
@@ -186,7 +186,7 @@ def _differences(base: Sections, sections: Sections) -> Sections:
 
 
 def _suffix(differences: Sections, words: bool = True) -> str:
-    """The differences in words where these are short, else a digest of them."""
+    """The differences spelt out where these are short, else a digest of them."""
     text = "-".join(f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items())
     return text if words and len(text) <= LONGEST else digest(differences, 6)
 

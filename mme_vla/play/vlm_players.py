@@ -258,11 +258,11 @@ class GeminiPlayer(ModelPlayer):
         settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
 
-    speaks = "gemini"
+    provider = "gemini"
 
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
         super().__init__("", tries)
-        self.api = make_api(self.speaks, settings, "player", self.usage, client)
+        self.api = make_api(self.provider, settings, "player", self.usage, client)
         self.model = self.api.settings.model
         self._conversation: list[tuple[str, list[Any]]] = []
 
@@ -302,7 +302,7 @@ class OpenAIPlayer(GeminiPlayer):
     settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.
     """
 
-    speaks = "openai"
+    provider = "openai"
 
 
 def _clip(frames: Any) -> list[np.ndarray]:

@@ -125,13 +125,13 @@ class ServedConnection:
                 await doing
 
     async def _close(self, code: int, reason: str) -> None:
-        short = reason.encode()[:120].decode(errors="ignore")  # a close frame has room for no more
+        short = reason.encode()[:120].decode(errors="ignore")  # a close frame takes no more
         await self._socket.close(code, short)
 
 
 MSGPACK = "application/msgpack"
 METHODS = {"/healthz": "GET", "/metadata": "GET", "/stats": "GET", "/reset": "POST", "/infer": "POST"}
-OPEN = ("/healthz", "/metadata")  # need no key: the challenge's client asks for the metadata without one
+OPEN = ("/healthz", "/metadata")  # need no key: the challenge's client requests the metadata without one
 MIN_BYTES_S = 2**16  # bytes a second of a body, beside limits.receive_s
 LINGER_S = 5  # seconds for the remaining body of a refused request, so that the client can read the response
 

@@ -108,9 +108,9 @@ class PolicyServer:
             timeout_graceful_shutdown=1,
             lifespan="off",
             log_config=None,
-            log_level=logging.CRITICAL + 1,  # a failed handshake is the client's affair, not worth a traceback
+            log_level=logging.CRITICAL + 1,  # failed handshakes of clients print no traceback
             access_log=False,
-            proxy_headers=False,  # a session belongs to the address that connects, whatever it says of itself
+            proxy_headers=False,  # a session belongs to the address that connects, not to a header
             server_header=False,
             date_header=False,
         )
@@ -144,7 +144,7 @@ class PolicyServer:
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
-    """What a client is told when it connects."""
+    """The first message to a client."""
     limits = settings.limits
     return {
         "server": "mme_vla",

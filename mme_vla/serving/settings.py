@@ -101,8 +101,8 @@ class ServeSettings:
             )
         if self.action_space not in (None, robot.action.answers):
             raise UserError(
-                f"action_space={self.action_space}: this policy answers with {robot.action.answers}, "
-                f"{robot.action.width} numbers an action, and nothing is converted. Ask the client for that."
+                f"action_space={self.action_space}: this policy returns {robot.action.answers}, "
+                f"{robot.action.width} numbers an action, and nothing is converted. The client has to convert."
             )
 
     @property

@@ -332,7 +332,7 @@ def test_settings_and_policies_that_cannot_work_are_refused(policy):
     unknowing.require_processor().stats = None
     with pytest.raises(UserError, match="statistics"):
         PolicyServer(unknowing, ServeSettings())
-    with pytest.raises(UserError, match="answers with joint_angle"):
+    with pytest.raises(UserError, match="returns joint_angle"):
         PolicyServer(policy, ServeSettings(action_space="ee_pose"))
     with (
         Served(policy) as first,

@@ -1,4 +1,4 @@
-"""Questions to a model behind an API: retries, rate limit, time limit, cache of answers, cost. No secret is logged."""
+"""Questions to a model behind an API: retries, rate limit, time limit, cache of replies, cost. No secret is logged."""
 
 import hashlib
 import json
@@ -68,7 +68,7 @@ def side_by_side[A, T](call: Callable[[A], T], items: Sequence[A], workers: int)
 
 log = logging.getLogger(__name__)
 CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai": OpenAIConnection}
-"""Ways to speak to models, by the word that settings choose them with."""
+"""Clients by the name of their API."""
 
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
@@ -100,7 +100,7 @@ class Api:
     client: what the connection asks, such as google-genai's; None makes one: at once, but with a cache and no key when
         the first question comes that the cache does not hold.
     clock, sleep: of the rate limit and the pauses.
-    speaks: a key of `CONNECTIONS`.
+    provider: a key of `CONNECTIONS`.
     """
 
     settings: Settings
@@ -108,7 +108,7 @@ class Api:
     client: Any = None
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
-    speaks: str = "gemini"
+    provider: str = "gemini"
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _next: float = 0.0
 
@@ -120,7 +120,7 @@ class Api:
     def _connected(self) -> Connection:
         with self._lock:
             if self._connection is None:
-                self._connection = CONNECTIONS[self.speaks](self.settings, self.client)
+                self._connection = CONNECTIONS[self.provider](self.settings, self.client)
             return self._connection
 
     def _needed(self) -> Connection:
@@ -212,7 +212,7 @@ class Api:
     def _cache_file(self, system: str, messages: Sequence[Message]) -> Path | None:
         if self.settings.cache is None:
             return None
-        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.speaks].cached_as(self.settings), system]).encode())
+        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.provider].cached_as(self.settings), system]).encode())
         for role, parts in messages:
             digest.update(f"\n{role}".encode())
             for item in parts:
@@ -261,12 +261,12 @@ def _code(error: Exception) -> int:
     return next((code for code in codes if isinstance(code, int) and code), 0)
 
 
-def make_api(speaks: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
+def make_api(provider: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
     """An `Api` out of plain settings.
 
     Args:
-        speaks: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
+        provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
     """
-    if speaks not in CONNECTIONS:
-        raise UserError(f"{where}.api={speaks!r}. {did_you_mean(str(speaks), CONNECTIONS)}")
-    return Api(read_section(CONNECTIONS[speaks].settings_type, settings, where), usage, client, speaks=speaks)
+    if provider not in CONNECTIONS:
+        raise UserError(f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
+    return Api(read_section(CONNECTIONS[provider].settings_type, settings, where), usage, client, provider=provider)

@@ -27,7 +27,7 @@ class Settings:
     temperature: 0 for the likeliest answer; None for models that take none.
     timeout: seconds before an answer is given up.
     retries: further tries after a passing error. backoff: seconds before the first of them, doubled each time.
-    requests_per_minute: rate limit; None for none. cache: folder of answers; None keeps none.
+    requests_per_minute: rate limit; None for none. cache: folder of replies; None keeps none.
     input_price, output_price: US dollars for a million tokens.
     """
 
@@ -79,7 +79,7 @@ class RawReply:
 
 
 class Connection:
-    """One way to speak to models. A subclass says how it is set, and asks.
+    """A client of an API. A subclass has a type of settings, and `ask`.
 
     Args:
         settings: of its own kind.
@@ -169,7 +169,7 @@ class OpenAISettings(Settings):
     """As `Settings`, for OpenAI's chat completions.
 
     base_url: of the endpoint, such as http://127.0.0.1:8000/v1; None for OpenAI's own.
-    video_frames: images that stand for a video, which these endpoints take none of; even, 2 or more.
+    video_frames: images sent in place of a video, which these endpoints do not take; even, 2 or more.
     """
 
     model: str = "gpt-5-mini"
