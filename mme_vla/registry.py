@@ -127,7 +127,13 @@ PROCESSORS: Registry[Any] = Registry(
         "memoryvla": "mme_vla.methods.memoryvla.processor",
     },
 )
-SUBGOALS: Registry[Any] = Registry("subgoal predictor")
+SUBGOALS: Registry[Any] = Registry(
+    "subgoal predictor",
+    {
+        **{name: f"mme_vla.subgoal.{name}" for name in ("oracle", "qwenvl", "memer", "gemini", "notebook")},
+        "openai": "mme_vla.subgoal.gemini",
+    },
+)
 TASKS: Registry[Any] = Registry("task")
 PLAYERS: Registry[Any] = Registry(
     "player",

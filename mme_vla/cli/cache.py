@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
-from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.saving import composition_digest

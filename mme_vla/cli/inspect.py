@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.errors import UserError, printable
 from mme_vla.memory.base import make_scorer
 
@@ -196,11 +196,11 @@ def draw_memory(
 def _no_tokens(frames: int, patches: int) -> Any:
     import torch
 
-    return torch.zeros(frames, patches, 1)  # selections never look at tokens
+    return torch.zeros(frames, patches, 1)  # selections do not read tokens
 
 
 def _parts(policy: "Policy") -> dict[str, list[Any]]:
-    """Parameters by the parts that fine-tuning speaks of, in the policy's order."""
+    """Parameters by the parts of fine-tuning, in the policy's order."""
     groups: dict[str, list[Any]] = {}
     for name, parameter in policy.named_parameters():
         groups.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)

@@ -35,8 +35,8 @@ FAILED = "the demonstration did not end in success"
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
-    Where which frames are drawn depends on the demonstration, it is made twice: once without a look, which says what
-    these frames are, and again with images of them.
+    Where the rendered frames depend on the demonstration, it is made twice: first without images, to choose the frames,
+    and again with images of them.
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
@@ -69,7 +69,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             writer.close()
             task.close()
         if blind is not None and (blind.steps, blind.stored) != (result.steps, result.stored):
-            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when drawn.")
+            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when rendered.")
         if result.success:
             draft.rename(folder / f"{job.name}.h5")
             if previews is not None:
@@ -168,7 +168,7 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
                 yield future.result()
         except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
-            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: nobody waits for it
+            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: it is not awaited
                 for worker in multiprocessing.active_children():
                     worker.terminate()
             raise
@@ -241,7 +241,7 @@ def run(cfg: "DictConfig") -> None:
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
-    """How fast it went, in words; of a recording that was continued, what was new in it."""
+    """A line on the speed; of a resumed recording, on what was added."""
     hours = max(seconds, 1e-9) / 3600
     named = f"{workers} worker{'s'[: workers > 1]}"
     return (
@@ -261,6 +261,6 @@ def _claim(work: Path, jobs: Sequence[Job]) -> None:
 
 def main() -> None:
     """Run `mme-vla record`."""
-    from mme_vla.config.composition import cli
+    from mme_vla.cli.command import cli
 
     cli("record")(run)()

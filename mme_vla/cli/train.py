@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.utils import remove_drafts, write_atomically
@@ -109,7 +109,7 @@ def _train(
     sharded = settings.parallel.shards(accelerator.device)
     holds = accelerator.is_local_main_process or not sharded
     line = ProgressLine(settings.steps, run.step, visible=first)
-    # A backbone whose weights are about to be replaced is not drawn first.
+    # A backbone whose weights are about to be replaced is not initialised first.
     init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
     with nullcontext() if holds else torch.device("meta"):
         policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)

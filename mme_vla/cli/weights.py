@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from mme_vla.config.help import argument_parser
+from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
     parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
     args = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
-    from mme_vla.config.composition import print_user_errors
+    from mme_vla.cli.errors import print_user_errors
 
     with print_user_errors():
         convert(
@@ -139,7 +139,7 @@ def convert(
 ) -> None:
     """Convert a checkpoint; the destination appears whole or not at all.
 
-    With `trust_plugins` the modules that a checkpoint names are imported: code of whoever wrote it.
+    With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
     """
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
     if not dry_run and target.exists():

@@ -299,7 +299,7 @@ class OpenAIPlayer(GeminiPlayer):
     """The same conversation with any endpoint of OpenAI's chat completions; videos are shown as images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
-    settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.
+    settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.
     """
 
     provider = "openai"

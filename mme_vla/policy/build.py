@@ -8,8 +8,8 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.backbone.config import shapes_only
-from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.naming import words
+from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration, extension_points
 from mme_vla.memory.base import Memory, check_grid, past_view_spec
@@ -109,6 +109,8 @@ def build_policy(
 
     >>> policy = build_policy("framesamp_modul", memory={"budget": 256})  # doctest: +SKIP
     """
+    from mme_vla.config.composition import compose  # Hydra; a policy built in Python does without
+
     extra = [] if config_dir is None else [Path(config_dir)]
     config = compose("policy", policy_words(name, overrides), extra_dirs=extra)
     return build_from_config(config, device=device, seed=seed)
@@ -131,7 +133,7 @@ def build_from_config(
     Args:
         fresh_backbone: False where a checkpoint is loaded next: π0.5's own weights are then not drawn.
     """
-    import_plugins(config)
+    import_plugins(plugins_of(config, "the configuration"))
     container = OmegaConf.to_container(config, resolve=True)
     assert isinstance(container, dict)
     sections = {key: container[key] for key in SECTIONS if key in container}

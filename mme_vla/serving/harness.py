@@ -53,7 +53,7 @@ class MMEVLAModelServer(PredictModelServer):
         execute: actions of a chunk that are executed; by default the embodiment's.
         flow_steps: of an iterative head; by default its own.
         seed: of every episode's noise.
-        trust_plugins: import the modules that the checkpoint names: code of whoever wrote it.
+        trust_plugins: import the modules that the checkpoint names: their authors' code.
         max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of them.
     """
 
@@ -83,7 +83,7 @@ class MMEVLAModelServer(PredictModelServer):
             )
         if robot.action.of_pose:
             raise UserError(
-                f"This policy answers with differences to poses ({robot.action.answers}), which the harness does not "
+                f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
                 "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
             )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
@@ -134,7 +134,7 @@ class MMEVLAModelServer(PredictModelServer):
         if lacking or state is None:
             raise UserError(
                 f"the observation lacks {', '.join([*lacking, *(['states'] if state is None else [])])}: the "
-                "environment failed, or the benchmark does not send what get_observation_params() asks for."
+                "environment failed, or the benchmark does not send what get_observation_params() lists."
             )
         running.images.append({name: np.asarray(images[VIEWS[name]]) for name in names})
         running.states.append(np.asarray(state, np.float32))
@@ -181,5 +181,5 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
         host, port = name or host, int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):
-        logger.warning("host=%s: whoever reaches this port can use it, the harness has no key", host)
+        logger.warning("host=%s: every client that reaches this port can use it, the harness has no key", host)
     serve(server, host=host, port=port)

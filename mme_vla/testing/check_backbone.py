@@ -21,7 +21,7 @@ def check_backbone(name: str, **sizes: Any) -> None:
         name: the key in `BACKBONES`. sizes: small ones, as its YAML would give them.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown backbone or size.
     """
     kind: type[Backbone] = BACKBONES[name]

@@ -24,7 +24,7 @@ def check_integration(name: str, memory: str = "framesamp", backbone: str = "tin
         options: the integration's own, as its YAML would give them.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown integration, memory or option, or a backbone that has no place for it.
     """
     sections = tiny_sections(f"{memory}_context", backbone)

@@ -1,4 +1,4 @@
-"""`check_memory`: does a memory keep the promises that training, streaming and the integrations rely on?"""
+"""`check_memory`: the properties of a memory that training, streaming and the integrations rely on."""
 
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -29,7 +29,7 @@ def check_memory(name: str, frames: int = 48, **options: Any) -> None:
         options: the memory's own, as its YAML would give them.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown memory or option.
     """
     memory: Memory = MEMORIES.build({"name": name, **options}, d_vision=D_VISION, width=WIDTH)
@@ -122,7 +122,7 @@ def check_selection(memory: Memory, frames: int) -> None:
         read = memory.frames_read([step], episode.exec_start)
         assert selected_frames <= set(read.tolist()), f"at step {step} select chose what frames_read lacks."
         sparse = memory.select(episode.sparse(read, step + 1), step)
-        assert np.array_equal(selection, sparse), f"at step {step} select differs where only frames_read was drawn."
+        assert np.array_equal(selection, sparse), f"at step {step} select differs where only frames_read was rendered."
     for piece in (1, 16, 23):
         history = episode.online(piece)
         offline = memory.select(full, frames - 1)
@@ -149,7 +149,7 @@ def _valid(tokens: MemoryTokens) -> Tensor:
 def check_encoding(memory: Memory, frames: int) -> None:
     """`forward`: within budget, finite, blind to padding and to its batch, with gradients to all it learns."""
     full = Episode(memory, frames).cached()
-    history = _recalled(memory, full, 2, frames - 1)  # the first with padding, where there is room
+    history = _recalled(memory, full, 2, frames - 1)  # the first with padding, if it is shorter
     encoded = _encoded(memory, history)
     shape = (2, memory.budget, WIDTH)
     assert encoded.tokens.shape == shape, f"forward must return tokens {shape}; got {tuple(encoded.tokens.shape)}."
@@ -182,7 +182,7 @@ def check_encoding(memory: Memory, frames: int) -> None:
 
 @torch.no_grad()
 def check_streaming(memory: Memory, frames: int) -> None:
-    """`remember`: an episode that grows gives the tokens that a fresh look at the whole of it gives."""
+    """`remember`: an episode that grows gives the tokens of the complete one."""
     first, second = Episode(memory, frames, seed=1), Episode(memory, frames, seed=2)
     histories = [first.online(16, 16), second.online(16, 16)]
     streams = [start_stream(memory) for _ in histories]

@@ -14,7 +14,7 @@ def check_task(task: str, seed: int = 1, difficulty: str | None = None, **option
         task: the key in `TASKS`. seed, difficulty: of the scene. options: the task's own keywords.
 
     Raises:
-        AssertionError: says which promise does not hold, and what was found.
+        AssertionError: names the property that does not hold, and the values.
         UserError: an unknown task or option, or the simulator is not installed.
     """
     first, second = (_demonstrated(task, seed, difficulty, options) for _ in range(2))

@@ -199,4 +199,4 @@ def test_the_server_listens_on_this_machine_alone_by_default(
     monkeypatch.setattr(sys, "argv", ["vla_eval", *words, f"--args.checkpoint={tmp_path / 'checkpoint'}"])
     main()
     assert addresses == [address]
-    assert ("whoever reaches this port" in caplog.text) == warned
+    assert ("every client that reaches this port" in caplog.text) == warned

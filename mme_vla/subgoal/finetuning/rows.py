@@ -38,8 +38,8 @@ SETS |= {"memer_simple": ("memer", "simple")}
 class RowOptions:
     """How rows are made.
 
-    noise: lowest and highest integer added to every coordinate, drawn anew for each row; None adds none.
-    repeat_changes: repeat rows at changes of subgoal (as released only while drawing figures).
+    noise: lowest and highest integer added to every coordinate, sampled for each row; None adds none.
+    repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
     short_segments: a row for segments shorter than the stride too (not as released).
     second_keyframe: find a second keyframe in one window (as released it is missed, and all that follow with it).
     substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as released.
