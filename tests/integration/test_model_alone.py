@@ -19,7 +19,7 @@ def ones(*shape):
     return torch.ones(shape, dtype=torch.bool)
 
 history = HistoryTokens(torch.randn(1, 512, 64), torch.zeros(1, 512, 3), ones(1, 512))
-images, prompt = torch.zeros(1, 2, 3, 224, 224, dtype=torch.uint8), torch.ones(1, 16, dtype=torch.int64)
+images, prompt = torch.zeros(1, 2, 3, 64, 64, dtype=torch.uint8), torch.ones(1, 16, dtype=torch.int64)
 batches = [Batch(images, ones(1, 2), prompt, ones(1, 16), history, torch.randn(1, 20, 32))]
 """
 REPORT = """

@@ -46,7 +46,7 @@ class ImageEncoder(nn.Module):
         super().__init__()
         self.side = sizes.grid * _REDUCTION
         self.vision = _vision_model(sizes.encoder, self.side)
-        for block in self.vision.backbone.attention:
+        for block in self.vision.backbone.blocks:
             block.attn.qkv = LoraProjection(block.attn.qkv, sizes.encoder.lora)
         self.fine = nn.Conv2d(sizes.encoder.neck, sizes.token // 4, 1)
         self.middle = nn.Conv2d(sizes.encoder.neck, sizes.token // 2, 1)

@@ -46,7 +46,7 @@ class Stages:
         self.memory = self.policy.encode_memory(self.batch.history)
 
     def sequence(self) -> TokenSequence:
-        observation = self.backbone.attention_of(self.batch, fused(self.backbone, self.golden))
+        observation = self.backbone.blocks_of(self.batch, fused(self.backbone, self.golden))
         return self.backbone.sequence(self.policy.integration.inject(observation, self.memory).blocks)
 
     def as_golden(self, rows: Tensor, sequence: TokenSequence) -> tuple[Tensor, Tensor]:
@@ -106,7 +106,7 @@ def test_openvla_oft_sequence_hidden_states_and_read_out(stages: Stages) -> None
 def test_openvla_oft_loss_and_gradients(stages: Stages) -> None:
     golden, about, policy = stages.golden, stages.about, stages.policy
     memory = policy.encode_memory(stages.batch.history)
-    observation = stages.backbone.attention_of(stages.batch, fused(stages.backbone, golden))
+    observation = stages.backbone.blocks_of(stages.batch, fused(stages.backbone, golden))
     answer = stages.backbone.predict_from(policy.integration.inject(observation, memory).blocks)
     near(answer.detach(), golden["out/predicted_actions"])
     errors = absolute_error(answer, golden["in/actions"])
@@ -130,7 +130,7 @@ def test_openvla_oft_prediction_from_the_prompt_alone(stages: Stages) -> None:
     golden, stats = stages.golden, stages.about["norm_stats"]["proprio"]
     quantiles = ClippedQuantiles.of(SimpleNamespace(**{name: stats[name] for name in ("q01", "q99", "min", "max")}))
     asked = replace(stages.batch, proprio=quantiles.normalize(golden["in/raw_proprio"].double()).float())
-    observation = stages.backbone.attention_of(asked, fused(stages.backbone, golden))
+    observation = stages.backbone.blocks_of(asked, fused(stages.backbone, golden))
     blocks = stages.policy.integration.inject(observation, stages.memory).blocks
     near(stages.backbone.predict_from(blocks), golden["out/predict_normalised"])
 
@@ -186,9 +186,7 @@ def test_openvla_oft_first_updates(folder: Path) -> None:
         rate = about["optimizer"]["lr"] * (about["gamma"] if i >= about["milestone"] else 1)
         assert rate == pytest.approx(update["lr"])
         optimizer.param_groups[0]["lr"] = rate
-        errors = absolute_error(
-            backbone.predict_from(backbone.attention_of(data, fused(backbone, golden))), data.actions
-        )
+        errors = absolute_error(backbone.predict_from(backbone.blocks_of(data, fused(backbone, golden))), data.actions)
         assert errors.mean().item() == pytest.approx(update["loss_value"], rel=TOLERANCE)
         optimizer.zero_grad()
         errors.mean().backward()
