@@ -14,6 +14,7 @@ pytest.importorskip("diffusers")
 from mme_vla import Policy, UserError, build_policy
 from mme_vla.cli.train import train
 from mme_vla.config.composition import compose
+from mme_vla.memory.base import full_history
 from mme_vla.methods.diffusion_policy.policy import DiffusionPolicy
 from mme_vla.testing.small import moving_frames, unit_stats
 from mme_vla.types import HistoryTokens
@@ -35,7 +36,7 @@ def policy() -> DiffusionPolicy:
 
 
 def history(policy: DiffusionPolicy, seed: int) -> HistoryTokens:
-    found = policy.require_memory().full_history(policy.sizes.memory_width)
+    found = full_history(policy.require_memory(), policy.sizes.memory_width)
     generator = torch.Generator().manual_seed(seed)
     return HistoryTokens(torch.randn(found.features.shape, generator=generator), found.positions, found.mask)
 

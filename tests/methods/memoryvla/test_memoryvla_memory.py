@@ -21,7 +21,7 @@ from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.vector.pool import Job
-from mme_vla.memory.base import stack_history
+from mme_vla.memory.base import full_history, stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, RecallingCore
 from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.base import Policy
@@ -50,7 +50,7 @@ def policy() -> MemoryVlaPolicy:
 
 def histories(policy: MemoryVlaPolicy, count: int, seed: int = 0) -> HistoryTokens:
     """Full selections of so many moments, each with features of its own."""
-    full = policy.require_memory().full_history(policy.sizes.vision.width)
+    full = full_history(policy.require_memory(), policy.sizes.vision.width)
     features = torch.randn(count, *full.features.shape[1:], generator=torch.Generator().manual_seed(seed))
     return replace(full.rows(torch.zeros(count, dtype=torch.int64)), features=features)
 
