@@ -40,8 +40,8 @@ def check_integrated(
     if has_tokens != (integration.memory_width > 0):
         if memory is not None and not has_tokens:
             raise UserError(
-                f"The memory {config['memory']['name']!r} produces no tokens with these settings. Set integration=none or "
-                "memory.states=true."
+                f"The memory {config['memory']['name']!r} produces no tokens with these settings. Set integration=none "
+                "or memory.states=true."
             )
         mismatch = "an integration without a memory" if memory is None else "a memory without an integration"
         raise UserError(f"This configuration names {mismatch}; name both, or neither for the memoryless policy.")
@@ -67,8 +67,8 @@ def check_positions(config: Mapping[str, Any], integration: Integration, memory:
         return
     if not memory.timed:
         raise UserError(
-            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} have no time each. "
-            "Take memory_position=slot, or a memory that is `timed`."
+            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} have no time "
+            "each. Take memory_position=slot, or a memory that is `timed`."
         )
     if "blocks" in extension_points(type(integration)) and "positions" not in supports:
         raise UserError(

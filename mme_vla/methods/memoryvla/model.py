@@ -118,7 +118,7 @@ class BankStates:
 
 
 class Core(nn.Module):
-    """From cognition and perceptual tokens to a chunk of actions; a subclass defines the memory that they are fused with.
+    """From cognition and perceptual tokens to a chunk of actions. A subclass defines the memory they are fused with.
 
     Legend: m moments · p patches · widths: c of a vision feature, d of the language model, e of a perceptual token.
     """

@@ -74,7 +74,7 @@ class TokenSequence:
 class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sharded):
     """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
-    Nothing is causal and no block is hidden from another, so an integration's visibility table has no effect here; memory
+    Nothing is causal and no block is hidden from another, so an integration's visibility table has no effect; memory
     stands after the state, wherever the integration names it. A slot is answered by the hidden state *before* it, as
     in predicting the next token (Kim et al., OpenVLA-OFT).
     """
