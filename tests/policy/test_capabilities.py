@@ -21,7 +21,6 @@ from mme_vla.policy.capabilities import (
 )
 from mme_vla.types import FrameBatch
 
-
 KINDS = (AugmentsImages, CompilesSampling, HasVisionMemory, PreparesChunks, SelectsFrames)
 
 
