@@ -8,11 +8,10 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from mme_vla import Backbone, Batch, register
-from mme_vla.backbone.attention import additive_mask, attend
+from mme_vla.backbone.attention import Block, Span, additive_mask, attend, attention_mask
 from mme_vla.backbone.base import HasLoraTargets, Injection
-from mme_vla.backbone.blocks import Block, Span, attention_mask
 from mme_vla.backbone.config import BackboneConfig
-from mme_vla.speed.recompute import Recomputes
+from mme_vla.speed import Recomputes
 
 
 class Layer(nn.Module):

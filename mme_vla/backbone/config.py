@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from mme_vla.backbone.base import Backbone
-from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief
 from mme_vla.registry import BACKBONES
 
@@ -115,6 +114,8 @@ class _WithoutInit(TorchFunctionMode):
 
 def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     """The class that the section `backbone` names, and its sizes."""
+    from mme_vla.config.sections import read_section
+
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
     return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
 

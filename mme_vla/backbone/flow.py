@@ -12,7 +12,6 @@ from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.registry import HEADS
-from mme_vla.speed.rtc import rtc_guidance
 from mme_vla.types import Noise, Overlap
 
 EULER_STEPS = 10  # as released
@@ -117,6 +116,8 @@ class FlowHead:
         """Integrate from noise [b, h, a] to chunks; `overlap` guides them to actions that are already fixed."""
         velocity = self.velocity(predict, steps, noise.device)
         if overlap is not None:
+            from mme_vla.speed.rtc import rtc_guidance
+
             velocity = rtc_guidance(velocity, overlap, self.times(steps, noise.device))
         return euler(noise, steps, velocity)
 

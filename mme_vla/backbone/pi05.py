@@ -2,25 +2,26 @@
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.attention import HasAttentionBackends, check_backend
+from mme_vla.backbone.attention import Block, check_backend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
-from mme_vla.backbone.blocks import Block
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.flow import HasFlowHead, time_embedding
 from mme_vla.backbone.gemma import Conditioning, JointTransformer, KVCache, Layout
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, float32_linear
 from mme_vla.backbone.siglip import VisionTower
 from mme_vla.registry import BACKBONES
-from mme_vla.speed.graphs import CapturableSampling
-from mme_vla.speed.recompute import Recompute, Recomputes
-from mme_vla.speed.sharding import Sharded, ShardGroup, backbone_groups
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recomputes, Sharded
+from mme_vla.speed.recompute import Recompute
 from mme_vla.types import Batch, Noise, PastViews
+
+if TYPE_CHECKING:
+    from mme_vla.speed.sharding import ShardGroup
 
 
 @BACKBONES.register("pi05")
@@ -237,8 +238,10 @@ class Pi05Backbone(
         """Recompute layers in the backward pass (activation checkpointing)."""
         self.transformer.gradient_checkpointing = mode
 
-    def shard_groups(self) -> Sequence[ShardGroup]:
+    def shard_groups(self) -> "Sequence[ShardGroup]":
         """Tower, token embedding, and every layer of all experts."""
+        from mme_vla.speed.sharding import ShardGroup, backbone_groups
+
         return [*backbone_groups(self), ShardGroup(self.embedding, full=True)]
 
     def compile_sampling(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.attention import HasAttentionBackends, check_backend
+from mme_vla.backbone.attention import check_backend
 from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets
 from mme_vla.backbone.config import read_backbone, shapes_only
 from mme_vla.backbone.flow import HasFlowHead
@@ -39,9 +39,10 @@ from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
 from mme_vla.processing.images import augment_views, augmentation_draws, full_past, stack_past
 from mme_vla.registry import INTEGRATIONS, POLICIES
-from mme_vla.speed.graphs import CapturableSampling, CapturedSampling
-from mme_vla.speed.recompute import Recompute, Recomputes
-from mme_vla.speed.sharding import Sharded, ShardGroup, backbone_groups
+from mme_vla.speed import CapturableSampling, HasAttentionBackends, Recomputes, Sharded
+from mme_vla.speed.graphs import CapturedSampling
+from mme_vla.speed.recompute import Recompute
+from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch, MemoryTokens, Noise, map_noise, named_noise, send, stack_noise
 
 if TYPE_CHECKING:
@@ -182,7 +183,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         if not isinstance(self.backbone, Recomputes):
             raise UserError(
                 f"train.recompute: {type(self.backbone).__name__} does not inherit from `Recomputes` "
-                "(mme_vla.speed.recompute). Set train.recompute=false."
+                "(mme_vla.speed). Set train.recompute=false."
             )
         self.backbone.recompute(mode)
 

@@ -16,18 +16,6 @@ Run = Callable[[Inputs], Tensor]
 """Inputs → chunks [b, h, a], without waiting for the GPU anywhere."""
 
 
-class CapturableSampling:
-    """Capability of a backbone: `sample` never waits for the GPU, so that it can be captured as a CUDA graph."""
-
-    def compile_sampling(self) -> None:
-        """Keep what depends on weights alone between chunks."""
-        raise NotImplementedError
-
-    def sampling_stamp(self) -> object:
-        """Identifies the weights that the kept values were computed from; graphs are captured anew when it changes."""
-        raise NotImplementedError
-
-
 @dataclass
 class _Captured:
     graph: torch.cuda.CUDAGraph

@@ -1,6 +1,6 @@
 """Sharding groups: which weights processes gather together, and in what precision."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from torch import nn
@@ -30,14 +30,6 @@ def stacked_layers(module: nn.Module) -> Iterator[nn.Module]:
             yield from inside
         else:
             yield from stacked_layers(child)
-
-
-class Sharded:
-    """Capability of a backbone: it has sharding groups of its own instead of `backbone_groups`."""
-
-    def shard_groups(self) -> Sequence[ShardGroup]:
-        """Modules that are gathered one by one. All other weights are gathered for a whole pass, in float32."""
-        raise NotImplementedError
 
 
 def backbone_groups(backbone: nn.Module) -> list[ShardGroup]:

@@ -43,15 +43,14 @@ class FlexMask(NamedTuple):
         queries, keys = sum(layout.lengths), mask.shape[-1]
         return cls(layout, create_block_mask(visible, len(mask), None, queries, keys, device=device))
 
-
-def attend_by_blocks(q: Tensor, k: Tensor, v: Tensor, mask: FlexMask) -> Tensor:
-    """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query without visible keys returns zeros."""
-    q, k, v = (x.transpose(1, 2) for x in (q, k, v))
-    # Inside a compiled layer it is part of that layer's code. The CPU runs the uncompiled function.
-    flex: Any = flex_attention if torch.compiler.is_compiling() or not q.is_cuda else _compiled_flex()
-    options = WIDE_HEAD_OPTIONS if q.is_cuda and q.shape[-1] >= WIDE_HEAD else None
-    output: Tensor = flex(q, k, v, block_mask=mask.blocks, enable_gqa=True, kernel_options=options)
-    return output.transpose(1, 2).flatten(2)
+    def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query without visible keys returns zeros."""
+        q, k, v = (x.transpose(1, 2) for x in (q, k, v))
+        # Inside a compiled layer it is part of that layer's code. The CPU runs the uncompiled function.
+        flex: Any = flex_attention if torch.compiler.is_compiling() or not q.is_cuda else _compiled_flex()
+        options = WIDE_HEAD_OPTIONS if q.is_cuda and q.shape[-1] >= WIDE_HEAD else None
+        output: Tensor = flex(q, k, v, block_mask=self.blocks, enable_gqa=True, kernel_options=options)
+        return output.transpose(1, 2).flatten(2)
 
 
 @cache
@@ -83,18 +82,17 @@ class PackedMask(NamedTuple):
             runs.append(PackedRun(length, order, starts))
         return cls(layout, tuple(runs))
 
-
-def attend_packed(q: Tensor, k: Tensor, v: Tensor, mask: PackedMask) -> Tensor:
-    """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query without visible keys returns zeros."""
-    batch, max_keys = k.shape[:2]
-    outputs = []
-    for part, run in zip(q.split([run.queries for run in mask.runs], 1), mask.runs, strict=True):
-        queries, keys, values = part.flatten(0, 1), k.flatten(0, 1)[run.order], v.flatten(0, 1)[run.order]
-        of_sample = torch.arange(batch + 1, device=q.device, dtype=torch.int32) * run.queries
-        attend = varlen_attn if q.is_cuda else _one_by_one
-        output: Any = attend(queries, keys, values, of_sample, run.starts, run.queries, max_keys)
-        outputs.append(output.unflatten(0, (batch, run.queries)))
-    return torch.cat(outputs, 1).flatten(2)
+    def attend(self, q: Tensor, k: Tensor, v: Tensor) -> Tensor:
+        """Attention [b, q, N·h] of q [b, q, N, h] on k, v [b, k, K, h]; a query without visible keys returns zeros."""
+        batch, max_keys = k.shape[:2]
+        outputs = []
+        for part, run in zip(q.split([run.queries for run in self.runs], 1), self.runs, strict=True):
+            queries, keys, values = part.flatten(0, 1), k.flatten(0, 1)[run.order], v.flatten(0, 1)[run.order]
+            of_sample = torch.arange(batch + 1, device=q.device, dtype=torch.int32) * run.queries
+            attend = varlen_attn if q.is_cuda else _one_by_one
+            output: Any = attend(queries, keys, values, of_sample, run.starts, run.queries, max_keys)
+            outputs.append(output.unflatten(0, (batch, run.queries)))
+        return torch.cat(outputs, 1).flatten(2)
 
 
 def _one_by_one(q: Tensor, k: Tensor, v: Tensor, q_starts: Tensor, k_starts: Tensor, max_q: int, max_k: int) -> Tensor:

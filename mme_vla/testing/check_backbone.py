@@ -5,7 +5,7 @@ from typing import Any
 
 import torch
 
-from mme_vla.backbone.base import Backbone, Injection
+from mme_vla.backbone.base import Backbone, HasLoraTargets, Injection
 from mme_vla.backbone.siglip import pool_grid
 from mme_vla.config.sections import read_section
 from mme_vla.registry import BACKBONES
@@ -113,6 +113,8 @@ def check_parts(backbone: Backbone) -> None:
         assert part is not None, f"no part of parts() holds {name!r}; its last pattern must match the rest."
         parts.add(part)
     assert {"vision", "action"} <= parts, f"parts() must name 'vision' and 'action'; parameters fall into {parts}."
+    if not isinstance(backbone, HasLoraTargets):
+        return
     names = [name for name, _ in backbone.named_modules()]
     for end in (*backbone.lora_targets, *backbone.heads):
         assert any(f".{name}".endswith(f".{end}") for name in names), f"{end!r} ends no module's name."

@@ -48,7 +48,7 @@ def port_adapter(policy: MMEPolicy) -> Adapter:
     """
     table = prefixed("backbone", names.torch_names(pi05_of(policy)))
     memory = policy.memory
-    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == pi05_of(policy).vlm.width:
+    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == pi05_of(policy).config.vlm.width:
         table |= {f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")}
     return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
 

@@ -6,8 +6,7 @@ from test_sight import TABLES, blocks_of, validity
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.attention import attend, build_mask, select_rows
-from mme_vla.backbone.blocks import MaskLayout, Visibility
+from mme_vla.backbone.attention import MaskLayout, Visibility, attend, build_mask, select_rows
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 
 OTHERS = ["flex", "varlen"]

@@ -9,8 +9,16 @@ from torch import Tensor
 
 from mme_vla import UserError
 from mme_vla.backbone import attention, gemma
-from mme_vla.backbone.attention import ALIGNMENT, BIG_NEGATIVE, layout_mask
-from mme_vla.backbone.blocks import PI05_VISIBILITY, MaskLayout, Span, Visibility, attention_mask
+from mme_vla.backbone.attention import (
+    ALIGNMENT,
+    BIG_NEGATIVE,
+    PI05_VISIBILITY,
+    MaskLayout,
+    Span,
+    Visibility,
+    attention_mask,
+    layout_mask,
+)
 from mme_vla.integration.base import MEMORY_VISIBILITY, memory_visibility
 from mme_vla.testing.small import random_batch, small_policy
 

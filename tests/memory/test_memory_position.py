@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.blocks import placed, token_positions
+from mme_vla.backbone.attention import apply_custom_positions, token_positions
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing import check_integration
@@ -57,7 +57,7 @@ def test_a_dropped_frame_shifts_how_far_the_older_ones_stand_from_the_view_only_
         assert memory is not None
         observed = policy.backbone.embed(replace(views, images=views.images.float()))
         blocks = policy.integration.blocks(observed, memory)
-        positions = placed(token_positions(torch.cat([block.mask for block in blocks], 1)), blocks)
+        positions = apply_custom_positions(token_positions(torch.cat([block.mask for block in blocks], 1)), blocks)
         return float(positions[0, len(blocks[0])] - positions[0, 0])
 
     dropped = without(history, 2 * OLD, OLD)

@@ -8,8 +8,7 @@ import torch
 from golden import error, load, params, vision_config
 
 from mme_vla.backbone import flow
-from mme_vla.backbone.attention import additive_mask, attend
-from mme_vla.backbone.blocks import Span, attention_mask, token_positions
+from mme_vla.backbone.attention import Span, additive_mask, attend, attention_mask, token_positions
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.gemma import JointBlock
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, rms_normalise, rotate, rotation
