@@ -130,7 +130,7 @@ _KEYS = (
 
 @dataclass(frozen=True)
 class ActionSpace:
-    """What a policy answers with.
+    """The actions of a policy.
 
     width: w; numbers of an action. key: columns of the dataset that hold them, joined; empty for the usual names.
     space: the benchmark's action space that takes them; None for a robot that is not the benchmark's.
@@ -142,7 +142,7 @@ class ActionSpace:
     frames: camera frames an action takes; None where an action is one planned motion of any length.
     choice: numbers of which one is 1 and the others 0, the letters a, b, … of the options that an episode offers; what
         is predicted are scores, and `decide` takes the best that is offered. Normalised as [0, 1], never by statistics.
-    point: the two numbers that say where in the memory camera's image: y and x as shares of its height and width.
+    point: the two numbers of a point in the memory camera's image: y and x as shares of its height and width.
     of_pose: numbers that are differences to the tool's pose at their own step, i. e. to the pose's number at the same
         place, angles (from the fourth on) by the shorter way: recorded, predicted and sent as such. Who executes an
         action adds the pose of that moment (`beside_pose`). Past a recording's end they are 0.
@@ -210,7 +210,7 @@ class ActionSpace:
             **scalars,
             **listed,
             "angles": {str(place): centre for place, centre in self.angles.items()},
-            **(choices if self.choice else {}),  # which robots of earlier versions did not say
+            **(choices if self.choice else {}),  # absent in files of earlier versions
             **(posed if self.of_pose else {}),  # likewise
         }
 

@@ -1,4 +1,4 @@
-"""RoboMME's Panda in joint space: the robot of every checkpoint that does not say what robot it is for."""
+"""RoboMME's Panda in joint space: the robot of checkpoints that name none."""
 
 from collections.abc import Mapping, Sequence
 from string import ascii_uppercase

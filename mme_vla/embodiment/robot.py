@@ -127,7 +127,7 @@ class Embodiment:
         return replace(self, action=replace(self.action, horizon=horizon, execute=execute))
 
     def check_network(self, action_dim: int, horizon: int) -> None:
-        """Make sure that a network of these sizes can answer for this robot.
+        """Make sure that a network has the sizes of this robot.
 
         Raises:
             UserError: its actions are too narrow, or its chunks have another length.
@@ -145,7 +145,7 @@ class Embodiment:
 
 
 def _described(camera: Camera) -> dict[str, Any]:
-    depth = {"depth": True} if camera.depth else {}  # which cameras of earlier versions did not say
+    depth = {"depth": True} if camera.depth else {}  # absent in files of earlier versions
     return {"key": camera.key, "augment": camera.augment, **depth}
 
 

@@ -45,7 +45,7 @@ def direction_of(word: str, width: int) -> Tensor:
 def load_with_goal_encoder[P: PolicyProcessor](
     kind: type[P], name: str, folder: Path, encoder: Path | str | None, trusted: tuple[str, ...]
 ) -> P:
-    """Build a processor whose `text` names an encoder from a folder of a checkpoint, which may be an untrusted.
+    """Build a processor whose `text` names an encoder from a folder of a checkpoint, which may be untrusted.
 
     Args:
         name: of this kind of processor. encoder: in place of what `processor.json` names. trusted: encoders that are

@@ -131,7 +131,7 @@ class Prismatic(nn.Module):
         """Run the Llama.
 
         Args:
-            tokens: embeddings [b, n, d]. mask: additive [b, 1, n, n] in their dtype; it alone says who sees whom.
+            tokens: embeddings [b, n, d]. mask: additive [b, 1, n, n] in their dtype; it alone decides the visibility.
             positions: [b, n] int64. every_layer: return what stands before each layer too.
 
         Returns:
@@ -162,7 +162,7 @@ class Angles(nn.Module):
         self.head_dim = head_dim
 
     def forward(self, x: Tensor, position_ids: Tensor) -> tuple[Tensor, Tensor]:
-        """Angles' cos and sin [b, n, h] at positions [b, n], in x's dtype: what transformers' layers ask for."""
+        """Angles' cos and sin [b, n, h] at positions [b, n], in x's dtype: as transformers' layers take them."""
         rope = rotation(position_ids, self.head_dim)
         return rope.cos.squeeze(2).to(x.dtype), rope.sin.squeeze(2).to(x.dtype)
 

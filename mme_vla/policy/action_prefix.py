@@ -1,4 +1,4 @@
-"""Actions that are promised while the next chunk is chosen, as the network meets them (real-time chunking)."""
+"""Action prefixes of real-time chunking: actions that the robot executes while the next chunk is sampled."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,8 +23,8 @@ class ActionPrefix:
 
 
 def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) -> ActionPrefix:
-    """A promise of a chunk of `horizon` actions of `width` numbers."""
-    values = finite_array(actions, "the promised actions")
+    """A prefix of a chunk of `horizon` actions of `width` numbers."""
+    values = finite_array(actions, "the actions of the prefix")
     if values.ndim != 2 or values.shape[1] != width or not 1 <= len(values) <= horizon:
         raise UserError(
             f"set_action_prefix() needs 1 to {horizon} actions of {width} numbers, got shape {values.shape}."
@@ -39,7 +39,7 @@ def checked_prefix(actions: np.ndarray, delay: int, horizon: int, width: int) ->
 def prefix_overlap(
     prefixes: Sequence[ActionPrefix | None], states: Tensor, processor: PolicyProcessor, action_dim: int
 ) -> Overlap | None:
-    """What the next chunks of n episodes, at raw states [n, s], are to agree with; None where nothing is promised."""
+    """The normalised prefixes of n episodes at raw states [n, s]; None if none has one."""
     if all(prefix is None for prefix in prefixes):
         return None
     horizon, width = processor.embodiment.action.horizon, processor.embodiment.action.width

@@ -35,13 +35,13 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
 def check_integrated(
     config: Mapping[str, Any], integration: Integration, memory: Memory | None, supports: Set[str]
 ) -> None:
-    """Make sure that memory and integration go together, and that the backbone has a place for what they bring."""
-    speaks = memory is not None and memory.budget > 0
-    if speaks != (integration.memory_width > 0):
-        if memory is not None and not speaks:
+    """Make sure that memory, integration and backbone fit together."""
+    has_tokens = memory is not None and memory.budget > 0
+    if has_tokens != (integration.memory_width > 0):
+        if memory is not None and not has_tokens:
             raise UserError(
-                f"The memory {config['memory']['name']!r} hands over no tokens as it is set, for an integration to "
-                "bring to the backbone: choose integration=none, or let it have some (memory.states=true)."
+                f"The memory {config['memory']['name']!r} produces no tokens with these settings. Set integration=none "
+                "or memory.states=true."
             )
         mismatch = "an integration without a memory" if memory is None else "a memory without an integration"
         raise UserError(f"This configuration names {mismatch}; name both, or neither for the memoryless policy.")
@@ -52,7 +52,7 @@ def check_integrated(
 
 
 def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
-    """Make sure that a memory that gives past views has a backbone whose vision tower looks at them."""
+    """Make sure that the backbone reads past views if the memory gives them."""
     if past_view_spec(memory) is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
@@ -62,13 +62,13 @@ def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) ->
 
 
 def check_positions(config: Mapping[str, Any], integration: Integration, memory: Memory, supports: Set[str]) -> None:
-    """Make sure that a memory that shall be placed in time can be: its tokens have one, the backbone a place for it."""
+    """Make sure that positions in time are possible: the tokens have a time, and the backbone takes positions."""
     if integration.memory_position != "time":
         return
     if not memory.timed:
         raise UserError(
-            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} stand for no one "
-            "moment each. Take memory_position=slot, or a memory that says `timed`."
+            f"integration.memory_position=time: the tokens of the memory {config['memory']['name']!r} have no time "
+            "each. Take memory_position=slot, or a memory that is `timed`."
         )
     if "blocks" in extension_points(type(integration)) and "positions" not in supports:
         raise UserError(
@@ -131,14 +131,14 @@ def build_from_config(
     """Build the policy a composed configuration describes; other sections (data, train, …) are ignored.
 
     Args:
-        fresh_backbone: False where a checkpoint is loaded next: π0.5's own weights are then not drawn.
+        fresh_backbone: False if a checkpoint is loaded next: the backbone's weights are not initialised.
     """
     import_plugins(plugins_of(config, "the configuration"))
     container = OmegaConf.to_container(config, resolve=True)
     assert isinstance(container, dict)
     sections = {key: container[key] for key in SECTIONS if key in container}
     check_token_budget(sections)
-    # Shapes need no words: on meta the full-size tokenizer is not asked for.
+    # On meta the tokenizer is not needed.
     bare = torch.device(device).type == "meta"
     processor = None if bare else build_processor(sections)
     with torch.random.fork_rng(devices=[]), shapes_only() if bare else torch.device(device):
@@ -165,7 +165,6 @@ def check_token_budget(sections: Mapping[str, Any]) -> None:
 
 
 def build_processor(sections: Mapping[str, Any]) -> PolicyProcessor:
-    """Build the processor of a composed configuration (`processor.name`), at its backbone's sizes."""
     if not sections.get("processor"):
         raise UserError(
             f"No processor goes with the backbone {sections['backbone'].get('name')!r}: under `defaults` of its file "

@@ -1,4 +1,4 @@
-"""Capabilities that some policies have beside `Policy`; callers ask for them with `isinstance`.
+"""Capabilities that some policies have beside `Policy`; check for them with `isinstance`.
 
 A policy has a capability as soon as it defines the members: no base class is needed.
 """

@@ -1,6 +1,6 @@
 """Which parameters of a policy learn: all of them, the action side, or low-rank adapters (configs/finetune).
 
-`Policy.finetune_spec` says which parameters are which component. Of π0.5, from the outside in: `vision` (tower and
+`Policy.finetune_spec` maps parameters to components. Of π0.5, from the outside in: `vision` (tower and
 projector), `vlm` (token embedding and VLM expert), `action` (action expert, its final norm, action and time heads) and
 `memory` (memory, integration, and the memory's own expert).
 """
@@ -72,13 +72,13 @@ def apply_finetuning(
             `targets`, and in full what `train` names.
         freeze_vision: leave the vision tower as it is in every mode; needed where a memory reads cached tokens.
         rank, alpha, dropout: of the adapters: W + (alpha / rank)·B·A.
-        init: how A is drawn: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins at zero.
+        init: distribution of A: `uniform` (Kaiming), or `gaussian` of deviation 1 / rank; B begins at zero.
         targets: linear layers and convolutions, by the end of their name: `experts.vlm.qkv` is that matrix in every
             layer. By default those the policy names (`Policy.finetune_spec`).
         train: with `lora`, what learns in full beside them: parts, or ends of module names such as `action_out`. By
             default the memory and the policy's heads.
-        frozen_dtype: `bfloat16` holds what does not learn at half the size, as the released training does; it rounds
-            those weights, and asks for compute in bfloat16.
+        frozen_dtype: `bfloat16` holds what is not trained at half the size, as the released training does; it rounds
+            those weights, and requires compute in bfloat16.
 
     Returns:
         Trained parameters per part, adapters counted in the part they wrap.
@@ -120,7 +120,7 @@ def check_frozen_dtype(policy: "Policy", name: str | None) -> None:
 
 
 def cast_frozen(policy: "Policy", name: str | None) -> None:
-    """Hold what does not learn in this dtype (None: as it is)."""
+    """Hold what is not trained in this dtype (None: as it is)."""
     if name is not None:
         for parameter in policy.parameters():
             if not parameter.requires_grad and parameter.is_floating_point():

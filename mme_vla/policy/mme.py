@@ -180,7 +180,6 @@ class MMEPolicy(MMEModel, NetworkPolicy):
             return self.backbone.velocity(injection, x_t, time)  # type: ignore[operator]
 
     def recompute(self, mode: Recompute) -> None:
-        """Compute activations again in the backward pass instead of keeping them, or keep them."""
         if not isinstance(self.backbone, Recomputes):
             raise UserError(
                 f"train.recompute: {type(self.backbone).__name__} does not inherit from `Recomputes` "
@@ -354,7 +353,6 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         return int(self.config["processor"]["prompt_length"]) + self.embodiment.action.options_length
 
     def warm_up_vision(self) -> None:
-        """Run the vision tower on one black memory frame."""
         size = self.backbone.image_size
         self.backbone.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 

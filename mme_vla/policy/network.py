@@ -14,8 +14,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.processing.base import HasMemoryImages
-from mme_vla.speed.recompute import Recomputes
-from mme_vla.speed.sharding import Sharded
+from mme_vla.speed import Recomputes, Sharded
 from mme_vla.types import HistoryTokens, MemoryTokens
 
 if TYPE_CHECKING:

@@ -1,10 +1,9 @@
-"""Who has the policy when: one order of work for the policy server and for rollouts.
+"""`Scheduler`: the order of policy calls for the server and for rollouts.
 
-Episodes bring frames, which are read in pieces, and then wait for actions, chosen for many at once. A turn is: the new
-frames of everyone who has only a piece left, then one batch of whoever waits for actions, then pieces of long videos
-for as long as the rest of the turn took, at least one. So whoever replans at the same time travels together, and those
-with a thousand frames and those with few each get half of the machine while there are both. Where nobody waits, a piece
-is done of what a later batch will need.
+Episodes bring frames, which are read in pieces, and then wait for actions, sampled for many at once. One round reads
+the new frames of episodes with at most one piece left, then samples one batch of actions, then reads pieces of long
+videos for as long as the round took so far, at least one. Episodes that replan at the same time share a batch, and long
+and short readers each get half of the time. When nothing waits, a round prepares a part of a later batch.
 """
 
 import time
@@ -16,7 +15,7 @@ from weakref import WeakKeyDictionary
 
 
 class Reading(Protocol):
-    """Frames on their way into memory."""
+    """Frames that are being read into memory."""
 
     @property
     def pieces(self) -> int:
@@ -33,23 +32,23 @@ class Read[R]:
 
 @dataclass(frozen=True)
 class Act[A]:
-    """Choose actions for these, in one batch."""
+    """Sample actions for these, in one batch."""
 
     batch: list[A]
 
 
 @dataclass(frozen=True)
 class Prepare[L]:
-    """Do a piece of what this will need when it acts next; whoever does it says where more is left (`Turns.later`)."""
+    """Prepare a part of this one's next chunk; add it to `Scheduler.later` again if more remains."""
 
     work: L
 
 
 class Scheduler[R: Reading, A, L]:
-    """Collects who waits; `turn` says what is to be done next, and the caller does it before asking on.
+    """Collects what waits; `next_steps` yields the next round, step by step.
 
     Args:
-        max_batch: most that act together.
+        max_batch: most episodes in a batch.
     """
 
     def __init__(self, max_batch: int) -> None:
@@ -57,14 +56,13 @@ class Scheduler[R: Reading, A, L]:
         self.reading: deque[R] = deque()
         self.acting: deque[A] = deque()
         self.later: WeakKeyDictionary[L, None] = WeakKeyDictionary()
-        """Who has acted and will again, each once; whoever is gone is not kept for it."""
+        """What has acted and will act again."""
 
     def __bool__(self) -> bool:
-        """Whether there is anything to do."""
         return bool(self.reading or self.acting or self.later)
 
     def next_steps(self) -> Iterator[Read[R] | Act[A] | Prepare[L]]:
-        """The steps of one turn. Who comes in the meantime may be in its batch already."""
+        """The steps of one round. What arrives meanwhile may still join its batch."""
         begun = time.perf_counter()
         for short in [work for work in self.reading if work.pieces <= 1]:
             yield from self._piece(short)

@@ -1,4 +1,4 @@
-"""Folders of safetensors: written sharded where large; read strictly, whoever wrote them."""
+"""Folders of safetensors: large ones are sharded, and reading is strict."""
 
 import shutil
 import stat
@@ -70,7 +70,6 @@ def list_weight_files(folder: Path) -> list[str]:
 
 
 def read_safetensors(file: Path) -> dict[str, Tensor]:
-    """Read one safetensors file."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -119,7 +118,6 @@ def check_fit(
     source: str,
     optional: Collection[str] = (),
 ) -> None:
-    """Compare names and shapes."""
     missing = sorted(set(expected) - set(tensors) - set(optional))
     unexpected = sorted(set(tensors) - set(expected))
     misshapen = [

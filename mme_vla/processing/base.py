@@ -28,7 +28,7 @@ DEFAULT = "pi05"
 
 @dataclass(frozen=True)
 class Sample:
-    """One training step as it is recorded, with the frames before it that the processor asked for.
+    """One training step as it is recorded, with the frames of the window before it.
 
     views: camera → images [t, H, W, 3] uint8, in the embodiment's order, the current one last. states: [t, s].
     goal: the task in words; subgoal: its current part, where the policy reads one.
@@ -83,7 +83,7 @@ class PromptSpec:
 class StatsSpec:
     """What normalisation statistics are computed from.
 
-    horizon: chunk steps of each observation, relative where the embodiment says so; None for the full chunk.
+    horizon: chunk steps of each observation, relative if the embodiment says so; None for the full chunk.
     every: every execution step once, in the data's order; else shuffled batches without an incomplete last one, as the
         released code of π0.5 does.
     extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a histogram.
@@ -130,7 +130,7 @@ class PolicyProcessor:
         self._stats = stats
 
     def require_stats(self) -> NormStats:
-        """Return the statistics, or say where they come from."""
+        """Return the statistics, or raise a `UserError`."""
         if self._stats is None:
             raise UserError(
                 "States and actions need normalisation statistics, and this processor has none. Training computes them "
@@ -207,7 +207,7 @@ class PolicyProcessor:
         """Read what `save` wrote; nothing outside of the folder is read on its word.
 
         Args:
-            folder: of a checkpoint, which may be an untrusted.
+            folder: of a checkpoint, which may be untrusted.
             tokenizer: in place of the one that `processor.json` names.
         """
         raise NotImplementedError
@@ -241,7 +241,7 @@ def motion_rows(processor: PolicyProcessor, states: np.ndarray, actions: np.ndar
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """What `processor.json` of a checkpoint says."""
+    """Read `processor.json` of a checkpoint."""
     if not (folder / CONFIG_FILE).is_file():
         raise UserError(f"No {CONFIG_FILE} in {folder}: this is not a checkpoint of this library.")
     check_sums(folder, [CONFIG_FILE])

@@ -149,14 +149,14 @@ class PastImages:
 def past_views(
     spec: PastViewSpec, step: int, read: Callable[[np.ndarray], Sequence[np.ndarray]], prepare: Prepare
 ) -> PastViews:
-    """Past views of a step, unbatched; where there is no such frame yet, black images that nobody sees.
+    """Past views of a step, unbatched; where there is no such frame yet, masked black images.
 
     Args:
         read: frames [n], ascending, at least one → images [n, H, W, 3] of every camera.
     """
     requested = spec.at(step)
     there = requested >= 0
-    # The current frame goes along where there is no other: it says how large images are.
+    # Without a past frame, the current one gives the size of the images.
     frames = requested[there] if there.any() else np.array([step])
     prepared = prepare(read(frames))
     images = prepared.new_zeros(len(requested), *prepared.shape[1:])

@@ -97,12 +97,10 @@ class NormStats:
         return cls(**{key: QuantileStats.from_dict(inner[key], key) for key in ("state", "actions")})
 
     def save(self, path: Path | str) -> None:
-        """Write `norm_stats.json`."""
         Path(path).write_text(json.dumps(self.to_dict(), indent=2) + "\n")
 
     @classmethod
     def load(cls, path: Path | str) -> Self:
-        """Read `norm_stats.json`."""
         path = Path(path)
         if not path.is_file():
             raise UserError(f"No normalisation statistics at {path}.")
@@ -126,7 +124,6 @@ def normalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
 
 
 def unnormalize(x: Tensor, stats: QuantileStats, by: str = "quantiles") -> Tensor:
-    """Invert `normalize`."""
     low, span = _range(x, stats, by)
     n = len(stats)
     out = x.clone()

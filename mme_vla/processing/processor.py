@@ -49,7 +49,7 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
     for key in ("image_size", "tokenizer"):
         if key not in settings:
             raise UserError(f"The processor's settings lack {key!r}; they hold {listed(sorted(settings))}.")
-    PROMPTS[str(settings.get("prompt", "plain"))]  # a misspelt name is told before any file is read
+    PROMPTS[str(settings.get("prompt", "plain"))]  # checks the name before any file is read
     fingerprint, stats = settings.pop("tokenizer_fingerprint", None), settings.pop("stats", None)
     if (views := settings.pop("views", OLD_VIEWS)) != OLD_VIEWS:
         raise UserError(f"processor.views={brief(views)}: cameras are named in the section 'embodiment' now.")
@@ -66,7 +66,7 @@ def constructor_settings(config: Mapping[str, Any], arguments: Iterable[str]) ->
 
 
 def saved_settings(folder: Path, tokenizer: Path | str | None) -> dict[str, Any]:
-    """What `processor.json` of a checkpoint says, its files found in the folder and compared with their checksums.
+    """Read `processor.json` of a checkpoint; check that its files are in the folder, and their checksums.
 
     Args:
         tokenizer: in place of the one it names.
@@ -109,7 +109,7 @@ LARGEST = 2**16  # of any size here: what is larger is a damaged file, and would
 
 @PROCESSORS.register("pi05")
 class Processor(PolicyProcessor):
-    """Turns raw images, words, states and actions into what the network reads, and its answer back into actions.
+    """Converts raw images, text, states and actions into the network's inputs, and its chunks into actions.
 
     Args:
         image_size: s; side of the square images the vision tower takes, in pixels.
@@ -160,7 +160,6 @@ class Processor(PolicyProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes."""
         backbone = shape_of(sections["backbone"])
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
@@ -241,7 +240,7 @@ class Processor(PolicyProcessor):
         return encode_prompt(self.prompt_format, self.tokenizer, inputs, self.longest_prompt)
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        """Turn recorded actions into what the network should answer.
+        """Convert recorded actions into targets of the network.
 
         Args:
             chunk: [h, w] absolute actions.
@@ -262,7 +261,7 @@ class Processor(PolicyProcessor):
         return pad_width(normalize(relative, stats.actions), self.action_dim)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """Turn the network's answer into actions the robot takes: the inverse of `actions`.
+        """Convert a chunk of the network into actions of the robot: the inverse of `actions`.
 
         Args:
             chunk: [..., h, action_dim] normalised.
@@ -332,7 +331,7 @@ class Processor(PolicyProcessor):
         """Read what `save` wrote. Nothing outside of the folder is read for it, and of the hub only π0.5's tokenizer.
 
         Args:
-            folder: of a checkpoint, which may be an untrusted.
+            folder: of a checkpoint, which may be untrusted.
             tokenizer: in place of the one that `processor.json` names, as `Tokenizer.load` takes it.
         """
         config = saved_settings(Path(folder), tokenizer)

@@ -42,7 +42,7 @@ class PromptInput:
 class PromptFormat:
     """The interface of a prompt format.
 
-    A subclass sets what it reads beside the goal (so that nobody computes the rest) and implements `pieces`.
+    A subclass sets what it reads beside the goal and implements `pieces`.
     """
 
     reads_subgoal: bool = False
@@ -73,7 +73,6 @@ class State(PromptFormat):
     reads_state = True
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
-        """Return one text."""
         if inputs.state is None:
             raise UserError(
                 "The prompt format 'state' needs the robot's state; give one, or choose the format 'plain'."
@@ -86,7 +85,7 @@ class State(PromptFormat):
 class Subgoal(PromptFormat):
     """The goal and the language subgoal: symbolic memory, as released.
 
-    Where a step has no subgoal the prompt is the plain one (as released), and a warning says so once.
+    Where a step has no subgoal the prompt is the plain one (as released), with one warning.
     """
 
     reads_subgoal = True
@@ -121,7 +120,6 @@ class PastActions(PromptFormat):
     past_actions = 16
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
-        """Return one text."""
         if inputs.past_actions is None:
             raise UserError(
                 "The prompt format 'past_actions' needs the executed actions (none yet: an empty array [0, w])."
@@ -135,7 +133,6 @@ class OpenVla(PromptFormat):
     """The question that OpenVLA was trained on, the goal in lower case."""
 
     def pieces(self, inputs: PromptInput) -> list[Piece]:
-        """Return one text."""
         return [(f"In: What action should the robot take to {self.language(inputs)}?\nOut:", True)]
 
     def language(self, inputs: PromptInput) -> str:
@@ -182,7 +179,7 @@ def encode_prompt(
         prompt_format: which texts to build (`PROMPTS[name]()`).
         tokenizer: its ids.
         inputs: what the texts are made of.
-        max_length: l; a longer prompt loses its end, and a warning says so once.
+        max_length: l; a longer prompt loses its end, with one warning.
 
     Returns:
         ids [l] int64, padded on the right with 0; mask [l] bool, False on the padding.

@@ -20,7 +20,7 @@ class HasAttentionBackends:
 
 
 class Recomputes:
-    """Capability of a backbone: it can compute activations again in the backward pass."""
+    """Capability of a backbone or policy: it can compute activations again in the backward pass."""
 
     def recompute(self, mode: "Recompute") -> None:
         """Set what to compute again; False keeps all activations."""
@@ -28,7 +28,7 @@ class Recomputes:
 
 
 class Sharded:
-    """Capability of a backbone: it has sharding groups of its own instead of `backbone_groups`."""
+    """Capability of a backbone or policy: it has sharding groups of its own instead of `backbone_groups`."""
 
     def shard_groups(self) -> "Sequence[ShardGroup]":
         """Modules that are gathered one by one. All other weights are gathered for a whole pass, in float32."""

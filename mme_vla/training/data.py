@@ -56,9 +56,9 @@ def prepare_data(
         check_sums(stats_from, [STATS_FILE])
         processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
-        counted = processor.stats_spec
+        counted, horizon = processor.stats_spec, processor.embodiment.action.horizon
         processor.stats = compute_norm_stats(
-            sources, split.train, counted.horizon or processor.embodiment.action.horizon, offset, seed, policy.embodiment,
+            sources, split.train, counted.horizon or horizon, offset, seed, policy.embodiment,
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video,
         )  # fmt: skip

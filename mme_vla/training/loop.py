@@ -17,7 +17,7 @@ from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import AugmentsImages
-from mme_vla.speed.recompute import Recomputes
+from mme_vla.speed import Recomputes
 from mme_vla.training.checkpoint import (
     checkpoint_name,
     restore,

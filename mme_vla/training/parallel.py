@@ -21,7 +21,8 @@ from torch.distributed.tensor import DTensor
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import recompute_buffers
-from mme_vla.speed.sharding import Sharded, ShardGroup, float32_modules, stacked_layers
+from mme_vla.speed import Sharded
+from mme_vla.speed.sharding import ShardGroup, float32_modules, stacked_layers
 
 STRATEGIES = ("auto", "ddp", "fsdp")
 FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)

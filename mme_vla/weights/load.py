@@ -182,8 +182,9 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
     if source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than {processor.prompt_spec.encoder!r} "
-            f"({target_fingerprint}): its ids would mean other words. Set processor.tokenizer to that one."
+            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than "
+            f"{processor.prompt_spec.encoder!r} ({target_fingerprint}): its ids would mean other words. Set "
+            "processor.tokenizer to that one."
         )
 
 

@@ -176,7 +176,7 @@ def test_it_joins_with_others_and_two_that_look_back_are_refused() -> None:
 def test_where_it_has_no_place_a_sentence_says_so() -> None:
     with pytest.raises(UserError, match="'nano' sees one image at a time"):
         small_policy("spacetime_modul", backbone="nano")
-    with pytest.raises(UserError, match="hands over no tokens as it is set"):
+    with pytest.raises(UserError, match="produces no tokens with these settings"):
         small_policy("spacetime_context", memory={"states": False})
     with pytest.raises(UserError, match="leave nothing to remember"):
         small_policy("spacetime_context", memory={"states": False, "views": False})

@@ -118,7 +118,7 @@ def test_execution_start_is_the_length_of_the_video(policy, frames):
 
 def test_episodes_refuse_what_they_cannot_use(policy, frames):
     episode = policy.start_episode("press the button")
-    with pytest.raises(UserError, match="no frame yet"):
+    with pytest.raises(UserError, match="No frame was observed"):
         policy.act([episode])
     state = np.zeros((2, 8), np.float32)
     with pytest.raises(UserError, match="wrist"):

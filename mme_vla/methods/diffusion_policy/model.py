@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 Schedule = Any
-"""A `diffusers.DDPMParallelScheduler`, whose package is asked for only where it is used."""
+"""A `diffusers.DDPMParallelScheduler`, imported only where it is used."""
 
 
 def require_diffusers() -> None:
@@ -50,7 +50,7 @@ def noise_schedule(steps: int) -> Schedule:
 
 
 def add_noise(schedule: Schedule, chunk: Tensor, noise: Tensor, step: Tensor) -> Tensor:
-    """Chunks [b, h, a] as noisy as the steps [b] say."""
+    """Noised chunks [b, h, a] at steps [b]."""
     noisy: Tensor = schedule.add_noise(chunk, noise, step)
     return noisy
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @POLICIES.register("diffusion_policy")
 class DiffusionPolicy(NetworkPolicy):
-    """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks under what is seen, felt and asked for.
+    """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks conditioned on images, state and goal.
 
     Any memory may stand beside it, through an integration that makes one vector of its tokens (`film`).
     """
@@ -74,7 +74,6 @@ class DiffusionPolicy(NetworkPolicy):
     def from_config(
         cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `memory`, `integration`, `policy`."""
         model.require_diffusers()
         sizes, robot = DiffusionSizes.from_dict(config["backbone"]), embodiment_of(config)
         integration = _pooled(config.get("integration"), sizes)
@@ -83,7 +82,7 @@ class DiffusionPolicy(NetworkPolicy):
             raise UserError(f"This configuration names {mismatch}; name both, or neither.")
         if robot.action.width != sizes.action_dim:
             raise UserError(
-                f"backbone.action_dim={sizes.action_dim}: Diffusion Policy answers with the robot's own "
+                f"backbone.action_dim={sizes.action_dim}: Diffusion Policy predicts the robot's own "
                 f"{robot.action.width} numbers an action; leave it to the embodiment."
             )
         feature = 0 if integration is None else integration.feature_width
@@ -100,7 +99,7 @@ class DiffusionPolicy(NetworkPolicy):
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """The `noise` [n, h, a] that is added and the `step` [n] that says how much."""
+        """The `noise` [n, h, a] that is added and the `step` [n] of the noise level."""
         step = torch.randint(self.sizes.diffusion_steps, (count,), generator=generator)
         return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
 
@@ -114,7 +113,7 @@ class DiffusionPolicy(NetworkPolicy):
 
         Args:
             batch: with `actions`. noise: as `training_noise` makes them.
-            corner: (top, left) of the crop; by default drawn while training and the centre's else.
+            corner: (top, left) of the crop; by default sampled while training and the centre's else.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
@@ -218,7 +217,6 @@ class DiffusionPolicy(NetworkPolicy):
         return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
 
     def require_processor(self) -> DiffusionProcessor:
-        """Return the processor, or say what it takes to have one."""
         processor = super().require_processor()
         assert isinstance(processor, DiffusionProcessor)
         return processor
@@ -253,7 +251,6 @@ class DiffusionPolicy(NetworkPolicy):
         )
 
     def warm_up_vision(self) -> None:
-        """Run the memory's vision tower on one black frame."""
         side = self.sizes.memory_tower.image_size
         self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))
 

@@ -44,7 +44,7 @@ class HashedWords(GoalEncoder):
 
 
 class ClipText(GoalEncoder):
-    """CLIP's text tower and projection, frozen, on the CPU; read when the first text is asked for."""
+    """CLIP's text tower and projection, frozen, on the CPU; loaded with the first text."""
 
     def __init__(self, width: int, source: str | Path = CLIP) -> None:
         """Remember where it is.
@@ -103,7 +103,7 @@ BY = "extremes"
 
 @dataclass
 class DiffusionBatch(TensorStruct):
-    """What Diffusion Policy reads, and for training what it should answer.
+    """Inputs of Diffusion Policy, and for training its targets.
 
     images: [b, t, v, 3, H, W] uint8; the window's images, the current ones last. state: [b, t, s] normalised.
     text: [b, d] the goal's vector. actions: [b, h, a] normalised. action_mask: [b, h] bool; None counts all steps.
@@ -159,7 +159,6 @@ class DiffusionProcessor(PolicyProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes."""
         from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 
         sizes, settings = DiffusionSizes.from_dict(sections["backbone"]), dict(sections["processor"])
@@ -210,12 +209,12 @@ class DiffusionProcessor(PolicyProcessor):
     # Actions
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        """Recorded actions [h, w] between their extremes, relative first where the embodiment says so."""
+        """Recorded actions [h, w] between their extremes, relative first if the embodiment says so."""
         raw, at = (torch.as_tensor(x, dtype=torch.float32) for x in (chunk, state))
         return normalize(self.embodiment.action.to_relative(raw, at), self.require_stats().actions, BY)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """The network's answer [..., h, a] as actions [..., h, w]: the inverse of `actions`."""
+        """A chunk [..., h, a] as actions [..., h, w]: the inverse of `actions`."""
         predicted = unnormalize(chunk.float(), self.require_stats().actions, BY)
         return self.embodiment.action.to_absolute(predicted, state.to(predicted))
 
@@ -231,8 +230,6 @@ class DiffusionProcessor(PolicyProcessor):
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> DiffusionBatch:
-        """Items as a batch."""
-
         def stack(name: str) -> Tensor | None:
             return torch.stack([item[name] for item in items]) if name in items[0] else None
 
@@ -243,7 +240,6 @@ class DiffusionProcessor(PolicyProcessor):
     # Folders
 
     def to_config(self) -> dict[str, Any]:
-        """Describe this processor as `processor.json` does."""
         return {
             "name": "diffusion_policy",
             "picture": list(self.picture),
@@ -261,7 +257,7 @@ class DiffusionProcessor(PolicyProcessor):
         """Read what `save` wrote.
 
         Args:
-            folder: of a checkpoint, which may be an untrusted.
+            folder: of a checkpoint, which may be untrusted.
             tokenizer: the folder of a CLIP, in place of what `processor.json` names.
         """
         return load_with_goal_encoder(cls, "diffusion_policy", Path(folder), tokenizer, trusted=(CLIP_NAME, HASHED))

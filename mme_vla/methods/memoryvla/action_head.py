@@ -129,7 +129,7 @@ class Dit(nn.Module):
     """Predicts the noise in a chunk.
 
     The time and the cognition token make one token in front of the chunk's. In training the cognition token of some
-    samples gives way to a learned one that says nothing, which guidance asks later; perceptual tokens always stay.
+    samples gives way to a learned empty one, which guidance uses later; perceptual tokens always stay.
     """
 
     def __init__(self, config: DitConfig, action_dim: int, horizon: int, d_cognition: int, d_perceptual: int) -> None:

@@ -62,7 +62,7 @@ class MemoryVlaEpisode(Episode):
         if moments:
             self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
 
-    # What was written, for those who look at it (`policy/episode.py`)
+    # Writable memory (`policy/capabilities.py`)
 
     memory_clock = "moments"
 
@@ -75,7 +75,6 @@ class MemoryVlaEpisode(Episode):
         )
 
     def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
-        """See `Writes`."""
         twin, banks = copy.copy(self), self.banks
         cognition, perceptual = stores
         twin.banks = replace(
@@ -84,7 +83,6 @@ class MemoryVlaEpisode(Episode):
         return twin
 
     def resume_from(self, twin: Episode) -> None:
-        """See `Writes`."""
         assert isinstance(twin, MemoryVlaEpisode)
         self.pending = twin.pending
 

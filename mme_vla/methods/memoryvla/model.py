@@ -1,4 +1,4 @@
-"""MemoryVLA behind its VLM: perceptual tokens, what is read of the past, and the diffusion head that answers."""
+"""MemoryVLA behind its VLM: perceptual tokens, retrieval from the past, and the diffusion head."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -118,7 +118,7 @@ class BankStates:
 
 
 class Core(nn.Module):
-    """From cognition and perceptual tokens to a chunk of actions; a subclass says what of the past they are fused with.
+    """From cognition and perceptual tokens to a chunk of actions. A subclass defines the memory they are fused with.
 
     Legend: m moments · p patches · widths: c of a vision feature, d of the language model, e of a perceptual token.
     """
@@ -146,14 +146,14 @@ class Core(nn.Module):
         Args:
             cognition: [m, 1, d]. features: [m, p, c].
             times: [m]. sequences: places of the moments that share a bank, in the order of time. Banks read these.
-            memory: tokens [m, n, e] of each moment's own past, where they stand in the banks' place.
+            memory: tokens [m, n, e] of each moment's own past, if they replace the banks.
         """
         raise NotImplementedError
 
     def noise_error(
         self, actions: Tensor, cognition: Tensor, perceptual: Tensor, draws: Mapping[str, Tensor]
     ) -> Tensor:
-        """The head's error [n, h] on chunks [n, h, a], noised as the draws say."""
+        """The head's error [n, h] on chunks [n, h, a], noised with the given noise."""
         noised = self.schedule.noised(actions, draws["noise"], draws["steps"])
         drop = draws["drop"] < self.config.dropout
         predicted = self.head(noised, draws["steps"], cognition, perceptual, drop)
@@ -188,7 +188,7 @@ class RecallingCore(Core):
 
     def __init__(self, config: MemoryVlaConfig) -> None:
         widths, of_bank = (config.vlm.width, config.perceptual_width), config.bank
-        # Without a time code: each token of a memory says itself when and where it was, if it knows.
+        # Without a time code: tokens of a memory carry their own time and place.
         cognition, perceptual = (
             Retrieval(width, of_bank.retrieval_layers, False, of_bank.fusion, config.perceptual_width)
             for width in widths
@@ -219,7 +219,6 @@ class MemoryVlaCore(Core):
         super().__init__(config, cognition_bank=cognition_bank, perceptual_bank=perceptual_bank)
 
     def init_state(self) -> BankStates:
-        """Both banks empty."""
         return BankStates(self.cognition_bank.init_state(1), self.perceptual_bank.init_state(self.patches))
 
     # Training

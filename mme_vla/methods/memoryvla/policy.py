@@ -35,10 +35,10 @@ from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 @POLICIES.register("memoryvla")
 class MemoryVlaPolicy(NetworkPolicy):
     """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two towers), each with a
-    bank of past moments that is read, fused and written; a diffusion transformer answers.
+    bank of past moments that is read, fused and written. A diffusion transformer predicts the chunk.
 
     Training sees groups of moments of one episode, each group in banks of its own; acting writes moment by moment.
-    A memory of the library may stand in the banks' place: each moment then reads its own history's tokens.
+    A memory of the library may replace the banks: each moment then reads its own history's tokens.
     """
 
     acts_in_bfloat16 = True
@@ -80,7 +80,6 @@ class MemoryVlaPolicy(NetworkPolicy):
     def from_config(
         cls, config: Mapping[str, Any], processor: PolicyProcessor | None = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `memory`, `policy`."""
         section = {key: value for key, value in config["backbone"].items() if key != "name"}
         sizes = read_section(MemoryVlaConfig, section, "backbone")
         embodiment_of(config).check_network(sizes.action_dim, sizes.horizon)
@@ -188,7 +187,6 @@ class MemoryVlaPolicy(NetworkPolicy):
         return loss, {"loss": loss.detach(), **{f"memory/{name}": value for name, value in reported.items()}}
 
     def recompute(self, mode: Recompute) -> None:
-        """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
@@ -281,7 +279,6 @@ class MemoryVlaPolicy(NetworkPolicy):
         return banks
 
     def require_processor(self) -> MemoryVlaProcessor:
-        """Return the processor, or say what it takes to have one."""
         processor = super().require_processor()
         assert isinstance(processor, MemoryVlaProcessor)
         return processor
@@ -323,7 +320,6 @@ class MemoryVlaPolicy(NetworkPolicy):
         )
 
     def warm_up_vision(self) -> None:
-        """Run the vision towers on one black frame."""
         size = self.sizes.vision.image_size
         self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
 

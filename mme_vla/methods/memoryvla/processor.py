@@ -102,7 +102,7 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         return self._quantiles().normalize(raw)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """As `OpenVlaProcessor.absolute_actions`, of answers that are clipped to ±1 first."""
+        """As `OpenVlaProcessor.absolute_actions`, of chunks that are clipped to ±1 first."""
         raw = self._quantiles().unnormalize(chunk.float().clamp(-1, 1))
         return self.embodiment.action.to_absolute(raw, state.to(raw))
 
@@ -162,5 +162,4 @@ class MemoryVlaProcessor(OpenVlaProcessor):
         )
 
     def to_config(self) -> dict[str, Any]:
-        """As `OpenVlaProcessor.to_config`."""
         return {**super().to_config(), "name": "memoryvla", "group_size": self.samples.group_size}

@@ -61,7 +61,7 @@ class ActionHead(nn.Module):
 class TokenSequence:
     """One pass of the VLM: tokens [b, n, d], who may be seen [b, n], positions [b, n].
 
-    read: [b, h·a]; the place whose hidden state answers for each slot.
+    read: [b, h·a]; the position whose hidden state predicts each slot.
     """
 
     tokens: Tensor
@@ -74,7 +74,7 @@ class TokenSequence:
 class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sharded):
     """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
-    Nothing is causal and no block is hidden from another, so an integration's visibility table has no say here; memory
+    Nothing is causal and no block is hidden from another, so an integration's visibility table has no effect; memory
     stands after the state, wherever the integration names it. A slot is answered by the hidden state *before* it, as
     in predicting the next token (Kim et al., OpenVLA-OFT).
     """
@@ -180,8 +180,8 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
 
     def slots(self, sequence: TokenSequence, hidden: Tensor) -> Tensor:
         """What the head reads [b, h, a·d]: the hidden states before the slots, a step's side by side."""
-        answers = hidden.gather(1, sequence.read[..., None].expand(-1, -1, hidden.shape[-1]))
-        return answers.unflatten(1, (self.horizon, self.action_dim)).flatten(2)
+        outputs = hidden.gather(1, sequence.read[..., None].expand(-1, -1, hidden.shape[-1]))
+        return outputs.unflatten(1, (self.horizon, self.action_dim)).flatten(2)
 
     def predict_from(self, blocks: Sequence[Block]) -> Tensor:
         """The chunk [b, h, a] for the blocks of an injection."""
@@ -201,7 +201,6 @@ class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sha
         return self.predict_from(injection.blocks)
 
     def recompute(self, mode: Recompute) -> None:
-        """Recompute the language model's layers in the backward pass."""
         self.vlm.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:

@@ -195,7 +195,6 @@ def augment(images: Tensor, draws: Tensor) -> Tensor:
 
 
 def brighten(pixels: Tensor, by: Tensor) -> Tensor:
-    """Add to every colour."""
     return pixels + by
 
 
@@ -264,7 +263,7 @@ class OpenVlaProcessor(Processor):
     # Words
 
     def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:
-        """As `Processor.prompt`, closed by the piece `▁`, whose state answers for the first number of the chunk."""
+        """As `Processor.prompt`, closed by the piece `▁`, whose state predicts the first number of the chunk."""
         ids, mask = super().prompt(*args, **named)
         place = min(int(mask.sum()), len(ids) - 1)
         ids[place], mask[place] = self.tokenizer.piece("▁"), True
@@ -283,7 +282,6 @@ class OpenVlaProcessor(Processor):
         return ClippedQuantiles.of(self.require_stats().actions).normalize(raw)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """As `Processor.absolute_actions`."""
         raw = ClippedQuantiles.of(self.require_stats().actions).unnormalize(chunk.float())
         return self.embodiment.action.to_absolute(raw, state.to(raw))
 
@@ -294,9 +292,7 @@ class OpenVlaProcessor(Processor):
         return super().item(sample) | {"proprio": self.proprio(sample.states[-1])}
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Batch:
-        """As `Processor.collate`."""
         return replace(super().collate(items), proprio=torch.stack([item["proprio"] for item in items]))
 
     def to_config(self) -> dict[str, Any]:
-        """As `Processor.to_config`."""
         return {"name": "openvla", **super().to_config(), "jpeg": self.jpeg}

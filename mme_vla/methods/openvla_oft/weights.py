@@ -70,7 +70,7 @@ def has_adapters(folder: Path) -> bool:
 
 
 def named_base(folder: Path) -> str:
-    """What a run says its adapters were trained on; for messages alone."""
+    """The base model that a run names; for messages only."""
     name = _settings(folder).get("base_model_name_or_path")
     return name if isinstance(name, str) and name else "its base model"
 
@@ -80,7 +80,7 @@ def merged(base: Mapping[str, Tensor], folder: Path) -> dict[str, Tensor]:
     settings, file = _settings(folder), folder / FOLDER / FILE
     rank, alpha = settings.get("r"), settings.get("lora_alpha")
     if not isinstance(rank, int) or not isinstance(alpha, int | float) or rank < 1:
-        raise UserError(f"{folder / FOLDER / SETTINGS} says r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.")
+        raise UserError(f"{folder / FOLDER / SETTINGS} has r={brief(rank)}, lora_alpha={brief(alpha)}: no LoRA's.")
     if other := [name for name in ("use_dora", "use_rslora", "rank_pattern", "alpha_pattern") if settings.get(name)]:
         raise UserError(f"{folder / FOLDER / SETTINGS} sets {listed(other)}, which are not read: merge it with peft.")
     adapters = read_files(folder / FOLDER, (file,))

@@ -18,8 +18,8 @@ class EncoderSizes:
     """SAM2's image encoder (Hiera and its neck); Hiera-B+ by default.
 
     width, heads: of the first stage; both double from stage to stage. blocks, windows: number of blocks and side of the
-    attention windows, of each stage. global_blocks: blocks, counted through all stages, that look at the whole image.
-    background: side of the table of positions. neck: width of the maps it answers with. lora: rank of the adapters.
+    attention windows, of each stage. global_blocks: blocks, counted through all stages, that attend to the whole image.
+    background: side of the table of positions. neck: width of its output maps. lora: rank of the adapters.
     """
 
     width: int = 112

@@ -31,7 +31,6 @@ class SceneInputs:
     language: Tensor
 
     def to(self, device: torch.device) -> "SceneInputs":
-        """The same on a device."""
         return SceneInputs(*(x.to(device) for x in (self.points, self.colours, self.state, self.language)))
 
 
@@ -82,7 +81,7 @@ class Watcher(Host, Protocol):
 class KeyframeEpisode(Episode):
     """Goal, bank and current shots of one episode.
 
-    A keyframe is a frame at which a waypoint is asked for: the last one of those that arrive together. Of the
+    A keyframe is a frame at which a waypoint is predicted: the last one of those that arrive together. Of the
     conditioning video some frames, evenly spread, are taken into the bank once the first execution frame is there.
     """
 
@@ -148,7 +147,7 @@ class KeyframeEpisode(Episode):
         """What `decided` noted last, until the next frames are observed."""
         return self._after
 
-    # What was written, for those who look at it (`policy/episode.py`)
+    # Writable memory (`policy/capabilities.py`)
 
     memory_clock = None
 
@@ -158,13 +157,11 @@ class KeyframeEpisode(Episode):
         return (MemoryEntries("memory", tuple(enumerate(maps)), len(maps)),)
 
     def with_entries(self, stores: Sequence[Sequence[tuple[int, Tensor]]]) -> Self:
-        """See `Writes`."""
         twin = copy.copy(self)
         twin.remembered = BankState(tuple(content for _, content in stores[0]))
         return twin
 
     def resume_from(self, twin: Episode) -> None:
-        """See `Writes`."""
         assert isinstance(twin, KeyframeEpisode) and twin.awaiting is not None
         newest = twin.awaiting.maps[-1]  # the others are not what this episode saw
         self.decided(BankState((*self.remembered.maps, newest)[-self._policy.most_remembered :]))

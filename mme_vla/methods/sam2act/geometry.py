@@ -30,7 +30,7 @@ def unproject(depth: np.ndarray, intrinsic: np.ndarray, extrinsic: np.ndarray) -
 
 @dataclass(frozen=True)
 class Cube:
-    """The part of the world that is looked at, scaled to the cube [−1, 1]³ by its longest side.
+    """The workspace, scaled to the cube [−1, 1]³ by its longest side.
 
     low, high: corners in metres.
     """
@@ -107,7 +107,7 @@ def depths(points: Tensor) -> Tensor:
 
 
 def constant_channels(side: int, device: torch.device | None = None) -> Tensor:
-    """What each image says of itself, [3 views, 3, side, side]: its number from −1 to 1, and every row and column."""
+    """Constant channels of each image, [3 views, 3, side, side]: its number from −1 to 1, and every row and column."""
     line = torch.linspace(-1, 1, side, device=device)
     number = torch.linspace(-1, 1, VIEWS, device=device)[:, None, None].expand(VIEWS, side, side)
     rows, columns = line[:, None].expand(side, side), line[None].expand(side, side)
@@ -152,7 +152,7 @@ def to_bins(quaternions: Tensor, count: int) -> Tensor:
 
 
 def angles_of_bins(bins: Tensor, count: int) -> Tensor:
-    """The angles [..., 3] in degrees that bins [..., 3] stand for."""
+    """The angles [..., 3] in degrees of bins [..., 3]."""
     return bins.double() * (360 / count) - 180
 
 

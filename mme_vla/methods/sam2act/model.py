@@ -63,7 +63,7 @@ _WIDER = 4  # feed-forward layers, inside
 
 @dataclass(frozen=True)
 class EncodedViews:
-    """What one look at the scene gives the network.
+    """The network's encoding of one view of the scene.
 
     images: [b, 3, 10, s, s] of `virtual_pictures`. maps: of the image encoder for all views, finest first:
     [b·3, token/4, 4g, 4g], [b·3, token/2, 2g, 2g], [b·3, neck, g, g]. state: [b, p]. language: [b, l, w].
@@ -236,7 +236,7 @@ class Heads(nn.Module):
     def forward(self, features: Tensor, rotation: Tensor | None = None) -> dict[str, Tensor]:
         """Logits `gripper` [b, 2], `collision` [b, 2], and of each rotation bin `x`, `y`, `z` [b, bins].
 
-        The bin about y is told what the one about x is, and the one about z both.
+        The bin about y is conditioned on the one about x, the one about z on both.
 
         Args:
             features: [b, f]. rotation: [b, 3] bins to tell; the most likely ones by default.

@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 SHIFT, ROTATION = 0.125, math.pi / 4
 """Augmentation as released: shifts to this part of the cube's sides, turns to this angle."""
 _CLOSE_TO_EDGE = 1e-3  # metres that a shifted target keeps from the bounds
-_BIN_OFFSETS = (-2, 2)  # how far off the bins that the heads are told may be; the upper end is left out
+_BIN_OFFSETS = (-2, 2)  # how far off the bins given to the heads; the upper end is left out
 
 
 def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Noise:
-    """Random numbers of `count` samples: shifts and turns in [−1, 1], and how far off told bins are."""
+    """Random numbers of `count` samples: shifts and turns in [−1, 1], and the offsets of the given bins."""
     return {
         "shift": 2 * torch.rand(count, keyframes, 3, generator=generator) - 1,
         "turn": 2 * torch.rand(count, keyframes, generator=generator) - 1,
@@ -104,7 +104,7 @@ def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Ten
     The closer look stands at the true waypoint, and the heads read there.
 
     Args:
-        offsets: [n, 3]; by how many bins the rotation that the heads are told differs from the true one.
+        offsets: [n, 3]; by how many bins the rotation given to the heads differs from the true one.
     """
     side, centre = network.sizes.side, scenes.target
     images = cloud_images(scenes.points, scenes.colours, cube, side)
@@ -139,7 +139,6 @@ STAGES = {
 
 
 def check_stage(stage: str) -> str:
-    """Return the stage's name."""
     if stage not in STAGES:
         raise UserError(f"Unknown training stage {brief(stage)} of SAM2Act+. {did_you_mean(str(stage), STAGES)}")
     return stage
@@ -192,11 +191,10 @@ class SAM2ActPolicy(NetworkPolicy):
     def from_config(
         cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
     ) -> Self:
-        """Build from plain sections `backbone`, `embodiment`, `policy`."""
         sizes, robot = SAM2ActSizes.from_dict(config["backbone"]), embodiment_of(config)
         if robot.action.width != WIDTH or robot.action.frames is not None or robot.action.horizon != 1:
             raise UserError(
-                f"SAM2Act+ answers with one planned motion of {WIDTH} numbers; the robot {robot.name!r} is asked for "
+                f"SAM2Act+ predicts one planned motion of {WIDTH} numbers; the robot {robot.name!r} is asked for "
                 f"chunks of {robot.action.horizon} × {robot.action.width}. Set embodiment=robomme_keyframes."
             )
         if config.get("memory") or config.get("integration"):
@@ -217,13 +215,13 @@ class SAM2ActPolicy(NetworkPolicy):
 
     @property
     def cube(self) -> Cube:
-        """The part of the world that is looked at: its processor's, else its configuration's."""
+        """The workspace of the processor, else of the configuration."""
         return Cube.of(self.config["processor"]["bounds"]) if self.processor is None else self.processor.cube
 
     # Training
 
     def training_noise(self, count: int, generator: torch.Generator) -> Noise:
-        """Shifts and turns of `count` samples' clouds, and how far off the told rotations are."""
+        """Shifts and turns of `count` samples' clouds, and offsets of the given rotations."""
         return augmentation_draws(count, self.keyframes, generator)
 
     def forward(
@@ -245,7 +243,6 @@ class SAM2ActPolicy(NetworkPolicy):
         return loss, {"loss": loss.detach(), **{name: part.detach() for name, part in parts.items()}}
 
     def recompute(self, mode: Recompute) -> None:
-        """Compute the layers' activations again in the backward pass instead of keeping them, or keep them."""
         self.backbone.recompute(mode)
 
     def shard_groups(self) -> Sequence[ShardGroup]:
@@ -317,7 +314,6 @@ class SAM2ActPolicy(NetworkPolicy):
         return torch.stack(waypoints)[:, None]
 
     def require_processor(self) -> SAM2ActProcessor:
-        """Return the processor, or say what it takes to have one."""
         processor = super().require_processor()
         assert isinstance(processor, SAM2ActProcessor)
         return processor
@@ -360,6 +356,5 @@ class SAM2ActPolicy(NetworkPolicy):
         )
 
     def warm_up_vision(self) -> None:
-        """Run the encoder on the virtual images of nothing."""
         side = self.backbone.encoder.side
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))

@@ -139,7 +139,6 @@ class HashedTokens(GoalTokens):
     """One fixed random vector a word, zeros behind the last: equal words, equal vectors."""
 
     def encode(self, text: str) -> Tensor:
-        """See `GoalTokens`."""
         tokens = torch.zeros(self.words, self.width)
         for place, word in enumerate(text.lower().split()[: self.words]):
             tokens[place] = direction_of(word, self.width)
@@ -147,7 +146,7 @@ class HashedTokens(GoalTokens):
 
 
 class ClipTokens(GoalTokens):
-    """All states of a CLIP's text tower after its last norm, frozen, on the CPU; read when the first text is asked for.
+    """All states of a CLIP's text tower after its last norm, frozen, on the CPU; loaded with the first text.
 
     The released model reads OpenAI's RN50 text tower (width 512), which no repository of the hub holds in this form.
     """
@@ -180,7 +179,6 @@ class ClipTokens(GoalTokens):
 
     @torch.no_grad()
     def encode(self, text: str) -> Tensor:
-        """See `GoalTokens`."""
         tokenizer, tower = self._parts
         read = tokenizer([text], padding="max_length", truncation=True, max_length=self.words, return_tensors="pt")
         # The released code fills with zeros, where transformers repeats the end-of-text token.
@@ -217,7 +215,7 @@ class Recorded(Protocol):
 
 @PROCESSORS.register(NAME)
 class SAM2ActProcessor(PolicyProcessor):
-    """Nothing here is normalised: points are metres, and the network's answer is a waypoint in the world."""
+    """Nothing here is normalised: points are metres, and the network's output is a waypoint in the world."""
 
     samples = SampleSpec(kind="keyframes")
 
@@ -242,7 +240,7 @@ class SAM2ActProcessor(PolicyProcessor):
             side: pixels that images are brought to before they become points.
             bounds: of the scene in metres, lowest corner first; what is outside is not seen.
             trained_waypoints, waypoints: keyframes that the clock counts to, in training and when acting.
-            video_frames: frames of the conditioning video that are looked at, evenly spread.
+            video_frames: frames of the conditioning video that are encoded, evenly spaced.
             field_of_view: of all cameras, in degrees; the benchmark's have 90.
         """
         sizes = {"language": language, "words": words, "side": side, "trained_waypoints": trained_waypoints,
@@ -273,7 +271,6 @@ class SAM2ActProcessor(PolicyProcessor):
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
-        """Build the processor of a composed configuration, at its backbone's sizes."""
         backbone, settings = sections["backbone"], dict(sections["processor"])
         settings.pop("name", None)
         sizes = {"language": backbone["language"], "words": backbone["words"]}
@@ -335,7 +332,7 @@ class SAM2ActProcessor(PolicyProcessor):
         return 2 * (1 - min(place / max(waypoints - 1, 1), 1)) - 1
 
     def state(self, finger: float, place: int) -> Tensor:
-        """What the network is told of the robot [4] when acting: open, both fingers (alike), time."""
+        """The robot's state for the network [4] when acting: open, both fingers (alike), time."""
         opened = float(finger > FINGER_COUNTS_OPEN)
         return torch.tensor([opened, finger, finger, self.clock(place, self.waypoints)], dtype=torch.float32)
 
@@ -352,7 +349,7 @@ class SAM2ActProcessor(PolicyProcessor):
         return torch.as_tensor(chunk, dtype=torch.float32)
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """The network's answer, which is in the world already."""
+        """The waypoint, which is in the world already."""
         return chunk
 
     # Batches
@@ -371,19 +368,17 @@ class SAM2ActProcessor(PolicyProcessor):
             "target": torch.from_numpy(targets[:, :3]),
             "rotation": rotation.float(),
             "gripper": torch.from_numpy((targets[:, 6] > 0).astype(np.int64)),
-            # The recorder's plans may touch things: no way of theirs is told to keep away.
+            # The recorder's plans ignore collisions.
             "collision": torch.ones(len(targets), dtype=torch.int64),
         }
 
     def collate(self, items: Sequence[dict[str, Any]]) -> KeyframeBatch:
-        """Items as a batch."""
         names = KeyframeBatch.__dataclass_fields__
         return KeyframeBatch(**{name: torch.stack([item[name] for item in items]) for name in names})
 
     # Folders
 
     def to_config(self) -> dict[str, Any]:
-        """Describe this processor as `processor.json` does."""
         return {
             "name": NAME,
             "text": self.text_name,
@@ -404,7 +399,7 @@ class SAM2ActProcessor(PolicyProcessor):
         """Read what `save` wrote.
 
         Args:
-            folder: of a checkpoint, which may be an untrusted.
+            folder: of a checkpoint, which may be untrusted.
             tokenizer: the folder of a CLIP, in place of what `processor.json` names.
         """
         return load_with_goal_encoder(cls, NAME, Path(folder), tokenizer, trusted=(HASHED,))

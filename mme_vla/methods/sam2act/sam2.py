@@ -112,7 +112,6 @@ class MaskShrinker(nn.Module):
         self.out = nn.Conv2d(channels[-1], width, 1)
 
     def forward(self, mask: Tensor) -> Tensor:
-        """Shrink."""
         for convolution, norm in zip(self.convolutions, self.norms, strict=True):
             mask = nn.functional.gelu(norm(convolution(mask).movedim(1, -1)).movedim(-1, 1))
         out: Tensor = self.out(mask)
@@ -270,7 +269,7 @@ class BankState:
 class KeyframeBank(nn.Module):
     """Reads and writes the states; keeps none itself.
 
-    Views stand in the batch axis n and never see each other: n is 3 for one episode, 3·b for b in step.
+    Views are in the batch axis n and do not attend to each other: n is 3 for one episode, 3·b for b in step.
     """
 
     def __init__(

@@ -96,7 +96,6 @@ def released_name(target: str, mask_stages: int) -> str:
 
 
 def released_names(targets: Iterable[str], mask_stages: int) -> NameTable:
-    """The table of a network's tensors."""
     table: NameTable = {}
     for name in targets:
         released = released_name(name, mask_stages)

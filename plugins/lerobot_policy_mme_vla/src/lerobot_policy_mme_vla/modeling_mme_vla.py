@@ -19,6 +19,7 @@ from mme_vla.config.composition import compose
 from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
 from mme_vla.policy.build import build_from_config
+from mme_vla.policy.capabilities import SupportsRTC
 from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.policy.saving import (
     build_saved,
@@ -140,7 +141,11 @@ class MMEVLAPolicy(PreTrainedPolicy):
 
     def supports_rtc(self) -> bool:
         """Whether a chunk can be chosen while another is executed: of flows that need not know what was executed."""
-        return self.model.supports_rtc and self.model.require_processor().prompt_spec.past_actions == 0
+        return (
+            isinstance(self.model, SupportsRTC)
+            and self.model.supports_rtc
+            and self.model.require_processor().prompt_spec.past_actions == 0
+        )
 
     def _see(self, batch: Mapping[str, Any]) -> list[Row]:
         states = batch[STATE].float().cpu().numpy()
