@@ -23,11 +23,8 @@ from mme_vla.data.hdf5 import (
     EpisodeRef,
     RawEpisode,
     RawFrame,
-    all_have_choices,
-    all_have_poses,
-    any_selected_frames,
     open_episode,
-    pose_columns,
+    recorded_options,
 )
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
@@ -143,9 +140,9 @@ class ConvertOptions:
 def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, dict[str, Any]]:
     """The dataset's columns, spelt as `options.names` says."""
     tool = [*POSE, "gripper"]
-    choice_columns = [CHOICE_ACTIONS] if options.choices else []
     joints = [*(f"joint{i}" for i in range(1, ARM_JOINTS + 1)), "gripper"]
     kind = "video" if options.images == "video" else "image"
+    choice = {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS}
     view = {"dtype": kind, "shape": shape, "names": ["height", "width", "channel"]}
     columns = {
         "image": dict(view),
@@ -154,10 +151,7 @@ def features(shape: tuple[int, int, int], options: ConvertOptions) -> dict[str, 
         "actions": {"dtype": "float32", "shape": (len(joints),), "names": joints},
         **{name: {"dtype": "float32", "shape": (len(tool),), "names": tool} for name in options.poses},
         **({POSE_STATE: {"dtype": "float32", "shape": (len(POSE),), "names": list(POSE)}} if options.tool_pose else {}),
-        **{
-            name: {"dtype": "float32", "shape": (len(CHOICE_NUMBERS),), "names": CHOICE_NUMBERS}
-            for name in choice_columns
-        },
+        **({CHOICE_ACTIONS: choice} if options.choices else {}),
         "is_demo": {"dtype": "bool", "shape": (1,), "names": None},
         "exec_start_idx": {"dtype": "int32", "shape": (1,), "names": None},
         "step_idx": {"dtype": "int32", "shape": (1,), "names": None},
@@ -180,9 +174,7 @@ def convert(episodes: Sequence[EpisodeRef], output: Path, options: ConvertOption
     """
     if not episodes:
         raise UserError("There is no episode to convert.")
-    content: dict[str, Any] = {"poses": pose_columns(episodes), "choices": all_have_choices(episodes)}
-    content["tool_pose"] = all_have_poses(episodes)
-    options = replace(options or ConvertOptions(), partly=any_selected_frames(episodes), **content)
+    options = replace(options or ConvertOptions(), **recorded_options(episodes))
     plan = _plan(episodes, options)
     partial = _work_folder(output)
     if _finished(output, plan) and not partial.exists():
@@ -208,14 +200,7 @@ def _work_folder(output: Path) -> Path:
 
 def planned_options(options: ConvertOptions) -> dict[str, Any]:
     """The options as a plan holds them; what plans from before had none of stands beside them, or where it is said."""
-    beside = (
-        "poses",
-        "tool_pose",
-        "choices",
-        "partly",
-        "keyframes",
-        *(["names"] if options.names == "robomme" else []),
-    )
+    beside = ["poses", "tool_pose", "choices", "partly", "keyframes"] + ["names"] * (options.names == "robomme")
     return {key: value for key, value in asdict(options).items() if key not in beside}
 
 
@@ -231,13 +216,9 @@ def _plan(episodes: Sequence[EpisodeRef], options: ConvertOptions) -> dict[str, 
         {"file": ref.file.name, "bytes": ref.file.stat().st_size, "sha256": sums[ref.file], "episode": ref.index}
         for ref in episodes
     ]
-    return (
-        {"options": planned_options(options), "episodes": origins}
-        | ({"poses": list(options.poses)} if options.poses else {})
-        | ({"tool_pose": True} if options.tool_pose else {})
-        | ({"choices": True} if options.choices else {})
-        | ({"keyframes": True} if options.keyframes else {})
-    )
+    content = {"poses": list(options.poses), **{key: getattr(options, key) for key in ("tool_pose", "choices")}}
+    content["keyframes"] = options.keyframes
+    return {"options": planned_options(options), "episodes": origins, **{k: v for k, v in content.items() if v}}
 
 
 def _convert(
@@ -342,15 +323,15 @@ def _write_dataset(episode: RawEpisode, root: Path, options: ConvertOptions) -> 
                 # LeRobot drops frames when this queue is full, as a live recorder must: never let it be.
                 encoder_queue_maxsize=episode.length + 1,
             )
-        scalars = {"is_demo": frame.is_demo, "exec_start_idx": episode.exec_start, "step_idx": step}
-        dtypes = {"is_demo": np.bool_, "exec_start_idx": np.int32, "step_idx": np.int32}
         row = {
             "image": frame.front,
             "wrist_image": frame.wrist,
             "state": frame.state,
             "actions": frame.action.astype(np.float32),
             **{name: rows[step] for name, rows in tool.items()},
-            **{name: np.array([value], dtypes[name]) for name, value in scalars.items()},
+            "is_demo": np.array([frame.is_demo]),
+            "exec_start_idx": np.array([episode.exec_start], np.int32),
+            "step_idx": np.array([step], np.int32),
             **frame.subgoals,
             **{f"{c}{RENDERED_SUFFIX}": np.array([c in frame.rendered]) for c in CAMERAS if options.partly},
             "task": goal,

@@ -3,11 +3,12 @@
 A value is checked where it is read: the files hold tens of gigabytes, and conversion reads each value once.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -140,7 +141,7 @@ class RawEpisode:
     def _image(self, step: int, camera: str) -> np.ndarray:
         if self.frames is not None and not self.rendered[camera][step]:
             raise UserError(
-                f"{self.ref.file} {self.ref.group}: {camera} was not rendered at step {step}; the episode was recorded "
+                f"{self.ref.file} {self.ref.group}: {camera} was not drawn at step {step}; the episode was recorded "
                 f"with frames={self.frames['at']}."
             )
         return self._checked(
@@ -254,11 +255,8 @@ class RawEpisode:
         shapes = {"depth": colours.shape[:2], "intrinsic": (3, 3), "extrinsic": (3, 4)}
         arrays: dict[str, np.ndarray] = {"colours": colours}
         for name, shape in shapes.items():
-            values = self._checked(
-                parts[name],
-                lambda x, shape=shape: x.size == np.prod(shape) and bool(np.isfinite(x).all()),
-                f"{list(shape)} finite numbers",
-            )
+            valid = partial(_is_finite_array, size=math.prod(shape))
+            values = self._checked(parts[name], valid, f"{list(shape)} finite numbers")
             arrays[name] = values.reshape(shape).astype(np.float32 if name == "depth" else np.float64)
         return arrays
 
@@ -297,6 +295,10 @@ class RawEpisode:
             )
 
 
+def _is_finite_array(array: np.ndarray, size: int) -> bool:
+    return array.size == size and bool(np.isfinite(array).all())
+
+
 def _decode(value: bytes | str) -> str:
     return value if isinstance(value, str) else str(value, "utf-8")
 
@@ -331,42 +333,22 @@ def list_episodes(files: Sequence[Path]) -> list[EpisodeRef]:
     return refs
 
 
-def pose_columns(refs: Sequence[EpisodeRef]) -> tuple[str, ...]:
-    """The columns of `POSE_ACTIONS` that every one of these episodes has."""
-    files = {file: [ref.group for ref in refs if ref.file == file] for file in dict.fromkeys(ref.file for ref in refs)}
-    columns = set(POSE_ACTIONS)
-    for file, groups in files.items():
-        with _open(file) as handle:
-            columns = {n for n in columns if all(f"{group}/timestep_0/{POSE_ACTIONS[n]}" in handle for group in groups)}
-    return tuple(name for name in POSE_ACTIONS if name in columns)
+def recorded_options(refs: Sequence[EpisodeRef]) -> dict[str, Any]:
+    """What was recorded with these episodes, as `ConvertOptions` names it.
 
-
-def all_have_poses(refs: Sequence[EpisodeRef]) -> bool:
-    """Whether the tool's poses were recorded with every one of these episodes."""
+    Returns:
+        `poses`: the columns of `POSE_ACTIONS` that all episodes have. `tool_pose`, `choices`: whether all have the
+        tool's poses, options and choices. `partly`: whether one of them has images of selected frames alone.
+    """
+    poses, tool_pose, choices, partly = list(POSE_ACTIONS), True, True, False
     for file in dict.fromkeys(ref.file for ref in refs):
         with _open(file) as handle:
-            if not all(f"{ref.group}/timestep_0/obs/{POSE_STATE}" in handle for ref in refs if ref.file == file):
-                return False
-    return True
-
-
-def all_have_choices(refs: Sequence[EpisodeRef]) -> bool:
-    """Whether options and choices were recorded with every one of these episodes."""
-    for file in dict.fromkeys(ref.file for ref in refs):
-        with _open(file) as handle:
-            groups = [ref.group for ref in refs if ref.file == file]
-            if not all(f"{group}/{name}" in handle for group in groups for name in CHOICES):
-                return False
-    return True
-
-
-def any_selected_frames(refs: Sequence[EpisodeRef]) -> bool:
-    """Whether one of these episodes was drawn at a choice of its frames only."""
-    for file in dict.fromkeys(ref.file for ref in refs):
-        with _open(file) as handle:
-            if any(f"{ref.group}/{FRAMES}" in handle for ref in refs if ref.file == file):
-                return True
-    return False
+            for group in (ref.group for ref in refs if ref.file == file):
+                poses = [name for name in poses if f"{group}/timestep_0/{POSE_ACTIONS[name]}" in handle]
+                tool_pose &= f"{group}/timestep_0/obs/{POSE_STATE}" in handle
+                choices &= all(f"{group}/{name}" in handle for name in CHOICES)
+                partly |= f"{group}/{FRAMES}" in handle
+    return {"poses": tuple(poses), "tool_pose": tool_pose, "choices": choices, "partly": partly}
 
 
 @contextmanager

@@ -112,11 +112,6 @@ def _materialise(policy: Policy, mesh: DeviceMesh) -> None:
             distributed.broadcast(buffer, 0)
 
 
-def is_sharded(module: nn.Module) -> bool:
-    """Whether a module's weights are shared (`shard`)."""
-    return isinstance(module, FSDPModule)
-
-
 def full_state(policy: Policy) -> dict[str, Tensor]:
     """All of a sharded policy's tensors on the first process's CPU; elsewhere nothing. All processes call it."""
     full = cast(dict[str, Tensor], get_model_state_dict(policy, options=FULL_STATE))

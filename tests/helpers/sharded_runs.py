@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from accelerate import Accelerator
 from torch import Tensor, distributed
+from torch.distributed.fsdp import FSDPModule
 
 from helpers.trainings import RECIPE, Samples, collate, policy
 from mme_vla.policy.base import Policy
@@ -30,7 +31,7 @@ from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.optim import clip_gradients, make_optimizer
 from mme_vla.training.order import Validation
-from mme_vla.training.parallel import ParallelSettings, full_value, gathered, is_sharded, shard
+from mme_vla.training.parallel import ParallelSettings, full_value, gathered, shard
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import shard_files
@@ -76,7 +77,7 @@ def validation_losses(job: Trainer) -> dict[str, float]:
 def train(folder: Path) -> dict[str, Any]:
     """Train sharded to step 4, with a checkpoint at 2 and 4 that is written while it continues."""
     job = trainer(folder / "run", 4, **SHARDED)
-    assert finish_run(job) and is_sharded(job.policy)
+    assert finish_run(job) and isinstance(job.policy, FSDPModule)
     held = sum(p.to_local().numel() for p in trainable(job.policy).values())
     whole = sum(p.numel() for p in trainable(job.policy).values())
     return {"held": held / whole, **validation_losses(job)}
