@@ -16,34 +16,15 @@ if TYPE_CHECKING:
     from mme_vla.subgoal.qwenvl import QwenVL
 
 _MODULES = {
-    "BackgroundPredictor": "background",
-    "Gemini": "gemini",
-    "Memer": "memer",
-    "NotebookPredictor": "notebook",
-    "OpenAI": "gemini",
-    "Oracle": "oracle",
-    "QwenVL": "qwenvl",
-    "Subgoal": "base",
-    "SubgoalEpisode": "base",
-    "SubgoalPredictor": "base",
-    "Usage": "base",
-    "build_predictor": "base",
-}
+    "BackgroundPredictor": "background", "Gemini": "gemini", "Memer": "memer", "NotebookPredictor": "notebook",
+    "OpenAI": "gemini", "Oracle": "oracle", "QwenVL": "qwenvl", "Subgoal": "base", "SubgoalEpisode": "base",
+    "SubgoalPredictor": "base", "Usage": "base", "build_predictor": "base",
+}  # fmt: skip
 
 __all__ = [
-    "BackgroundPredictor",
-    "Gemini",
-    "Memer",
-    "NotebookPredictor",
-    "OpenAI",
-    "Oracle",
-    "QwenVL",
-    "Subgoal",
-    "SubgoalEpisode",
-    "SubgoalPredictor",
-    "Usage",
-    "build_predictor",
-]
+    "BackgroundPredictor", "Gemini", "Memer", "NotebookPredictor", "OpenAI", "Oracle", "QwenVL", "Subgoal",
+    "SubgoalEpisode", "SubgoalPredictor", "Usage", "build_predictor",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

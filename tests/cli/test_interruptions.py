@@ -65,7 +65,7 @@ def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sente
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("room", ["play", "nano", "envs", "serving", "data.cache"])
+@pytest.mark.parametrize("room", ["cli", "play", "nano", "envs", "serving", "subgoal"])
 def test_nothing_slow_is_imported_before_a_command_can_be_stopped(room: str) -> None:
     """`python -m mme_vla.<room>…` imports the package first, and only then what turns signals into a sentence."""
     script = f"import sys, mme_vla.{room}; sys.exit('torch' in sys.modules)"

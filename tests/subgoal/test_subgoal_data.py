@@ -236,12 +236,13 @@ def test_settings_that_cannot_work_are_named(tmp_path):
     listed = tmp_path / "list.json"
     listed.write_text("[1]")
     for word, said in (
-        ("episodes=2", "episodes=2 must be a list of whole numbers"),
-        ("episodes=[a]", "must be a list of whole numbers"),
-        ("noise=[a,b]", "must be a list of whole numbers"),
-        ("noise=3", "noise=3 must be a list"),
-        ("noise=[1,0]", "noise"),
-        ("sets=simple", "sets=simple must be a list of words"),
+        ("episodes=2", "episodes=2 must be a list, each a whole number, 0 or more"),
+        ("episodes=[a]", "must be a list, each a whole number"),
+        ("noise=[a,b]", "must be a list of 2 values: a whole number"),
+        ("noise=3", "noise=3 must be a list of 2"),
+        ("noise=[1,0]", r"noise=\[1, 0\] must be \[lowest, highest\]"),
+        ("sets=simple", "sets='simple' must be a list, each simple or grounded"),
+        ("sets=[simpel]", "sets=.*simpel.* must be a list, each simple or grounded"),
         ("seed=-1", "seed=-1"),
     ):
         with pytest.raises(UserError, match=said):

@@ -87,7 +87,7 @@ def test_notes_change_only_as_their_kind_does(before: Any, after: Any, finished:
 def test_a_route_is_no_longer_than_its_steps_and_a_notebook_has_an_end() -> None:
     with pytest.raises(MalformedReply, match="2 of 1 steps"):
         Notebook().with_entries([("way", Route(("a",), 2))], None)
-    with pytest.raises(MalformedReply, match="room for 16"):
+    with pytest.raises(MalformedReply, match="takes 16"):
         Notebook().with_entries([(str(i), Count(0)) for i in range(17)], None)
 
 

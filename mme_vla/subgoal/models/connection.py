@@ -174,7 +174,7 @@ class OpenAISettings(Settings):
 
     model: str = "gpt-5-mini"
     key_variable: str | None = "OPENAI_API_KEY"
-    temperature: float | None = None
+    temperature: NonNegative | None = None
     input_price: NonNegative = 0.0
     output_price: NonNegative = 0.0
     base_url: str | None = None
