@@ -112,8 +112,8 @@ def test_an_episode_of_each_suite_is_drawn_to_its_success(task: str, difficulty:
     env.close()
     assert success
     assert len(snapshots) >= 3
-    assert all(shot.picture.shape == (256, 256, 3) and shot.picture.std() > 10 for shot in snapshots)
-    changed = [np.abs(a.picture.astype(int) - b.picture).mean() for a, b in pairwise(snapshots)]
+    assert all(shot.image.shape == (256, 256, 3) and shot.image.std() > 10 for shot in snapshots)
+    changed = [np.abs(a.image.astype(int) - b.image).mean() for a, b in pairwise(snapshots)]
     assert max(changed) > 1, "nothing moves"
     assert show.strip(snapshots, tiles=4).width == 2 * MARGIN + 4 * (TILE + GAP) - GAP
 

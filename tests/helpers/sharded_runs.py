@@ -92,7 +92,7 @@ class Interrupted(ProgressLine):
 
 def stop(folder: Path) -> dict[str, Any]:
     job = trainer(folder / "stopped", 4, **SHARDED)
-    finished = finish_run(job, Interrupted(4, 0, shown=False))
+    finished = finish_run(job, Interrupted(4, 0, visible=False))
     return {"finished": finished, "signal": job.stopped_by}
 
 
@@ -103,7 +103,7 @@ class Killed(ProgressLine):
 
 
 def die(folder: Path) -> None:
-    finish_run(trainer(folder / "killed", 4, **SHARDED), Killed(4, 0, shown=False))
+    finish_run(trainer(folder / "killed", 4, **SHARDED), Killed(4, 0, visible=False))
 
 
 def update_of(model: Policy, batch: Any, draws: dict[str, Tensor]) -> tuple[float, float, float]:
