@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mme_vla.config.help import COMMANDS, heading, keys
+from mme_vla.cli.help import COMMANDS, heading, keys
 
 ROOT = Path(__file__).resolve().parent.parent
 CONFIGS, PAGE = ROOT / "configs", ROOT / "docs" / "configuration.md"

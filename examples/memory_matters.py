@@ -1,4 +1,4 @@
-"""Does the memory work? A stream whose answer was visible only in the conditioning video.
+"""Does the memory work? A stream whose target was visible only in the conditioning video.
 
     python examples/memory_matters.py                         # every neural variant and pi05, two at a time
     python examples/memory_matters.py framesamp_modul --seconds 60
@@ -9,7 +9,7 @@ action depends on its colour alone. The current view, the goal and the state say
 only guess: `pi05` is always trained beside what is named. Prints the open-loop error of each policy on episodes it has
 not seen, and draws it.
 
-The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp look at every 4th
+The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp read every 4th
 frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and
 every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
 takes in, and what all slots have in common is learned late.
@@ -32,7 +32,8 @@ import numpy as np
 import torch
 
 from mme_vla import build_policy
-from mme_vla.config.composition import compose, print_user_errors
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.config.composition import compose
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
@@ -109,7 +110,7 @@ def make_streams(policy: MMEPolicy, count: int, seed: int) -> list[Stream]:
 
 
 def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generator, size: int) -> Batch:
-    """Random execution steps of random episodes, with the action their colour asks for."""
+    """Random execution steps of random episodes, with the action of their colour."""
     processor, config = policy.require_processor(), policy.backbone.config
     selected = [streams[i] for i in rng.integers(len(streams), size=size)]
     steps = rng.integers(VIDEO, LENGTH, size=size)
@@ -120,7 +121,9 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
     history = None
     if policy.memory is not None:
         memory = policy.memory
-        recalled = [memory.recall(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history]
+        recalled = [
+            memory.gather_selection(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history
+        ]
         history = stack_history(recalled)
     return Batch(
         images=processor.images([views, views])[:, :1],  # one camera says it all
@@ -135,7 +138,7 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
 
 def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
     """Past views of the one camera, where the memory gives the vision tower any."""
-    past_spec = None if policy.memory is None else policy.memory.past_view_spec
+    past_spec = past_view_spec(policy.memory)
     if past_spec is None:
         return None
     prepare = policy.require_processor().images
@@ -169,12 +172,12 @@ def learn(
     every: int = 100,
     enough: float = 0.08,
 ) -> dict[str, Any]:
-    """Train one policy until it answers for the episodes it trains on; its error on others, and what it took.
+    """Train one policy until it fits the episodes it trains on; its error on others, and what it took.
 
     Args:
         seconds: most CPU time, encoding included. steps: most updates. episodes: to learn from.
         backbone: keys of the tiny backbone to change. config_dir: YAML files of your own.
-        every: updates between two looks at the error on what it trains on. enough: error that it stops at.
+        every: updates between two measurements of the error on what it trains on. enough: error that it stops at.
     """
     wall, start = time.perf_counter(), time.process_time()
     torch.manual_seed(seed)

@@ -3,7 +3,7 @@
 import sys
 
 from mme_vla.cli import COMMANDS, run
-from mme_vla.config.errors import print_user_errors
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.errors import did_you_mean
 
 

@@ -331,7 +331,9 @@ def probe_figures(folder: Path) -> list[str]:
 
 def dataset_figures(folder: Path, name: str) -> list[str]:
     """What `inspect` counts in a dataset, whose checksums it compares, with the side file of first frames."""
-    return numbers(command("inspect", f"dataset={folder / name}", f"exec_starts={folder / 'exec_starts.json'}"))
+    printed = command("inspect", f"dataset={folder / name}", f"exec_starts={folder / 'exec_starts.json'}")
+    # Names of the numbers of states and actions are printed by later versions.
+    return numbers("\n".join(line for line in printed.splitlines() if not line.startswith(("state: ", "action: "))))
 
 
 def nano_tower() -> str:

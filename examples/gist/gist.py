@@ -12,7 +12,7 @@ from mme_vla.integration.base import required
 
 @register("integration", "gist")
 class Gist(Integration):
-    """Mean of the memory → condition of every action norm; all of it → tokens that the actions may look at."""
+    """Mean of the memory → condition of every action norm; all of it → tokens that the actions attend to."""
 
     def __init__(self, backbone: Any) -> None:
         super().__init__(backbone)

@@ -1,4 +1,4 @@
-"""Attention behind one function, so that the kernel is chosen in one place."""
+"""Attention: masks and the one function that chooses the kernel."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -9,15 +9,15 @@ from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
 from mme_vla.backbone.blocks import MaskLayout
-from mme_vla.backbone.sparse_attention import FlexMask, PackedMask, attend_by_blocks, attend_packed
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.speed.sparse_attention import FlexMask, PackedMask, attend_by_blocks, attend_packed
 
 BACKENDS = ("auto", "sdpa", "flex", "varlen")
-"""`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the sight, skips what nobody sees.
-`varlen`: flash attention over keys packed for each run of queries. `auto`: see `look`."""
+"""`sdpa`: fused kernels with an additive mask, the reference. `flex`: compiled from the layout, skips hidden keys.
+`varlen`: flash attention over keys packed for each run of queries. `auto`: see `build_mask`."""
 
 AttentionMask = Tensor | FlexMask | PackedMask | None
-"""What `attend` reads of who may see whom: a mask [b, 1, q, k], what another backend makes of a sight, or all."""
+"""The mask of `attend`: additive [b, 1, q, k], the form of another backend, or None (all keys are visible)."""
 
 BIG_NEGATIVE = -1e30
 """Far below any logit, and still finite where kernels count in base 2 (times 1.44): no row becomes NaN."""
@@ -38,7 +38,7 @@ def additive_mask(mask: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def layout_mask(layout: MaskLayout, dtype: torch.dtype) -> Tensor:
-    """The same from who may see whom: [b, 1, n, k]."""
+    """The additive mask [b, 1, n, k] of a layout."""
     return layout.expand(_padded(layout.visible, dtype))[..., : layout.visible.shape[-1]].unsqueeze(1)
 
 
@@ -56,8 +56,16 @@ def check_backend(name: str) -> str:
     return name
 
 
+class HasAttentionBackends:
+    """Capability of a backbone: it can compute attention with each of `BACKENDS`."""
+
+    def set_attention_backend(self, name: str) -> None:
+        """Use another backend than `auto`."""
+        raise NotImplementedError
+
+
 def build_mask(layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: bool) -> AttentionMask:
-    """Who may see whom as one backend reads it, made once per forward and shared by all layers.
+    """The mask of one backend, built once per forward and shared by all layers.
 
     `auto` is `flex` for training on a GPU where layers are `compiled`, so that it is part of their code; else `sdpa`.
     """
@@ -69,15 +77,15 @@ def build_mask(layout: MaskLayout, dtype: torch.dtype, backend: str, compiled: b
 
 
 def select_rows(mask: AttentionMask, rows: Sequence[slice], dtype: torch.dtype) -> Tensor:
-    """What some of the queries see, for the last layer: they are few, so that it is a mask whatever the backend."""
+    """The additive mask of some of the queries, for the last layer: they are few, whatever the backend."""
     if isinstance(mask, Tensor):
         return torch.cat([mask[:, :, at] for at in rows], 2)
     assert mask is not None
     return layout_mask(mask.layout.part(rows), dtype)
 
 
-def our_kernels(x: Tensor) -> AbstractContextManager[object]:
-    """The context of every attention on a GPU: kernels we choose, never PyTorch by its own order."""
+def fused_kernels(x: Tensor) -> AbstractContextManager[object]:
+    """The context of every attention on a GPU: the kernels of `KERNELS` alone."""
     return sdpa_kernel(KERNELS) if x.is_cuda else nullcontext()
 
 
@@ -86,7 +94,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
 
     Args:
         q: [b, q, N, h]; k, v: [b, k, K, h].
-        mask: as `look` makes it; or additive [b, 1, q, k] in q's dtype; or bool, if every row sees a key; or None.
+        mask: of `build_mask`; or additive [b, 1, q, k] in q's dtype; or bool with a key in every row; or None.
 
     Returns:
         [b, q, N·h].
@@ -100,5 +108,5 @@ def attend(q: Tensor, k: Tensor, v: Tensor, mask: AttentionMask) -> Tensor:
     if groups > 1:
         # One shared key head broadcasts without a copy; several are repeated.
         k, v = ((x.expand(-1, groups, -1, -1) if x.shape[1] == 1 else x.repeat_interleave(groups, 1)) for x in (k, v))
-    with our_kernels(q):
+    with fused_kernels(q):
         return functional.scaled_dot_product_attention(q, k, v, attn_mask=mask).transpose(1, 2).flatten(2)

@@ -4,7 +4,7 @@ import os
 import sys
 from importlib import import_module
 
-from mme_vla.config.errors import print_user_errors
+from mme_vla.cli.errors import print_user_errors
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train a policy"),
@@ -17,7 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "harness": ("harness", "put a policy behind AI2's vla-evaluation-harness"),
     "play": ("play", "play the tasks yourself, or let a model play"),
     "convert": ("convert", "official HDF5 demonstrations to one LeRobot dataset"),
-    "exec-starts": ("exec_starts", "where the conditioning videos of a dataset end, for one that does not say"),
+    "exec-starts": ("exec_starts", "where the conditioning videos of a dataset end, if it has no such column"),
     "cache": ("cache", "the vision tokens of a dataset, computed once"),
     "nano": ("nano", "from nothing to a page of results on one task, on two cores"),
     "vision-pretrain": ("vision_pretrain", "the vision tower of the nano backbone, from renders of the tasks"),
@@ -27,9 +27,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "subgoal-build": ("subgoal_build", "training data of the subgoal predictors"),
     "subgoal-train": ("subgoal_train", "fine-tune a subgoal predictor"),
     "sample": ("sample", "the dataset that the package ships, from a full one"),
-    "train-tokenizer": ("train_tokenizer", "the small tokenizer that the package ships"),
+    "train-tokenizer": ("train_tokenizer", "the small tokenizer of the package"),
 }
-"""Name on the command line → module of this room, and what it does in a line."""
+"""Name on the command line → module of this package, and a line of help."""
 
 
 _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}
@@ -37,7 +37,7 @@ _WITHOUT_PYTORCH = {"-h", "--help", "--hydra-help", "-c", "--cfg"}
 
 
 def run(module: str) -> None:
-    """Run the command in a module of this package, importing it first: Ctrl-C ends that with a sentence as well.
+    """Run the command in a module of this package, importing it first: Ctrl-C ends the import with a message, too.
 
     A terminal gets a line at once, since imports take seconds. Logs and pipes stay as they are.
     """

@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mme_vla.config.composition import print_user_errors
-from mme_vla.config.help import argument_parser
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_plugins, trust_as_flag
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.utils import safe_name
@@ -107,7 +107,7 @@ def recurrence(args: argparse.Namespace) -> None:
 
     policy, source, name = _subject(args)
     numbers = range(len(source)) if args.episodes is None else args.episodes
-    with _rerun(args) as log:  # before the replays: a file that cannot be written is told at once
+    with _rerun(args) as log:  # before the replays: a file that cannot be written is an error at once
         episode_curves = [recurrence_curves(policy, source, episode, args.stride) for episode in numbers]
         if log is not None:
             for curves in episode_curves:
@@ -208,7 +208,7 @@ def _rerun(args: argparse.Namespace) -> "Iterator[RerunLog | None]":
 
 
 def _subject(args: argparse.Namespace) -> "tuple[MMEPolicy, EpisodeSource, str]":
-    """The policy to look at, the episodes to show it, and its name."""
+    """The policy, the episodes it replays, and its name."""
     from mme_vla.data.episodes import EpisodeSource
     from mme_vla.policy.build import build_policy
     from mme_vla.policy.mme import MMEPolicy, mme_of

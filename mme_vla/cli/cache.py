@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock
@@ -22,6 +22,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.data.cache_building import build_cache, clear_cache, estimate, process_rank
     from mme_vla.data.sources import open_sources
     from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.capabilities import with_vision_memory
     from mme_vla.training.runs import start_from, weights_to_start_from
 
     if cfg.rebuild and int(os.environ.get("WORLD_SIZE", "1")) > 1:
@@ -34,13 +35,14 @@ def main(cfg: DictConfig) -> None:
     memory = policy.to(device).memory
     if memory is None:
         raise UserError(f"model={cfg.name} has no memory: there is nothing to cache.")
-    encoder, dtype = policy.vision_fingerprint(), str(policy.history_dtype).removeprefix("torch.")
+    encoder = with_vision_memory(policy)
+    tower, dtype = encoder.vision_fingerprint(), str(encoder.history_dtype).removeprefix("torch.")
     root = Path(cfg.data.cache.root) if cfg.data.cache.root else default_cache_root()
     for source in open_sources(cfg.data.sources, policy.embodiment):
-        expected = fingerprint(source, memory.storage, encoder, dtype)
+        expected = fingerprint(source, memory.storage, tower, dtype)
         folder = cache_folder(root, source, expected)
         if cfg.dry_run:
-            plan = estimate(source, memory, policy.encode_frames, dtype, cfg.data.cache.batch_size)
+            plan = estimate(source, memory, encoder.encode_frames, dtype, cfg.data.cache.batch_size)
             print(
                 f"{source.name}: {plan.frames} of {int(source.lengths.sum())} frames to encode, "
                 f"{plan.bytes / 1e9:.3g} GB at {folder}, about {plan.seconds:.0f} s in one process on {device}"
@@ -54,7 +56,7 @@ def main(cfg: DictConfig) -> None:
             if cfg.rebuild:
                 clear_cache(folder)
             batch_size = cfg.data.cache.batch_size
-            n_encoded = build_cache(source, memory, policy.encode_frames, folder, expected, batch_size=batch_size)
+            n_encoded = build_cache(source, memory, encoder.encode_frames, folder, expected, batch_size=batch_size)
         print(f"{source.name}: {n_encoded} episodes encoded, {len(source)} in all, at {folder}")
 
 

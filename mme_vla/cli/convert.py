@@ -4,7 +4,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.sections import read_section
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes

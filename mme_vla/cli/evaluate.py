@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling, words_of
-from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.saving import composition_digest
@@ -133,7 +133,7 @@ def choose_subgoals(
     if mode not in SUBGOAL_MODES:
         raise UserError(f"subgoal_mode={mode!r}. {did_you_mean(mode, SUBGOAL_MODES)}")
     if section is None:
-        if policy.require_processor().reads_subgoal:
+        if policy.require_processor().prompt_spec.reads_subgoal:
             logger.warning("this policy reads a subgoal and subgoal=none: it gets the plain prompt, as released")
         return None
     kind = subgoal_kind(policy)

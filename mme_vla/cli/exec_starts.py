@@ -4,7 +4,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.data.exec_starts import annotated_episodes, first_frames
 from mme_vla.errors import UserError
 from mme_vla.utils import write_json

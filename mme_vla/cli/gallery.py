@@ -35,10 +35,10 @@ class Snapshot:
 
 
 def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snapshot], bool]:
-    """Demonstrate a task and look at it every few steps; also returns whether it succeeded."""
+    """Demonstrate a task, with an image every few steps; also returns whether it succeeded."""
     from mme_vla.envs.observations import Include, Observer
     from mme_vla.envs.recording.recorder import demonstrate
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
     from mme_vla.envs.subtasks import NO_RECORD
 
     observer = Observer(task, Include(), render=True)
@@ -53,11 +53,11 @@ def demonstrate_with_images(task: "Task", every: int = EVERY) -> tuple[list[Snap
 
     task.reset()
     observer.start()
-    task.observe = capture
+    task.on_frame = capture
     try:
         success = demonstrate(task, Demonstrator(task, lambda action: task.step(np.asarray(action, np.float32))))
     finally:
-        task.observe = None
+        task.on_frame = None
     return snapshots, success
 
 
@@ -77,7 +77,7 @@ def page(entries: Sequence[tuple[str, str, str]]) -> str:
         "# The sixteen tasks",
         "",
         "One demonstrated episode each, front camera; images with a red border belong to the conditioning video.",
-        "Drawn by `mme-vla gallery`.",
+        "Rendered by `mme-vla gallery`.",
         "",
     ]
     for task, goal, image in entries:
@@ -127,6 +127,6 @@ def _demonstrated(spec: metadata.EpisodeSpec) -> tuple["Task", list[Snapshot]]:
 
 def main() -> None:
     """Run `mme-vla gallery`."""
-    from mme_vla.config.composition import cli
+    from mme_vla.cli.command import cli
 
     cli("show")(run)()

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.errors import UserError, printable
+from mme_vla.memory.base import make_scorer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -67,7 +68,7 @@ def show_checkpoint(folder: Path, console: "Console", trust_plugins: bool = Fals
     settings = _table("configuration", "section", "values")
     for name, section in policy.config.items():
         settings.add_row(name, _summary(section))
-    settings.add_row("words", printable(policy.require_processor().words_from))
+    settings.add_row("words", printable(policy.require_processor().prompt_spec.encoder))
     if (folder / STATE).is_file():
         state = read_state(folder)
         settings.add_row("trained for", f"{state['step']} steps; weights here are averages, raw ones beside them")
@@ -157,7 +158,7 @@ def build_memory(cfg: DictConfig) -> "Memory":
 
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     backbone = shape_of(config["backbone"])
-    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.token_width)
+    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.vision_width)
 
 
 def draw_memory(
@@ -174,7 +175,7 @@ def draw_memory(
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
-    history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
+    history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
     stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
     history.append(frames, _no_tokens(len(stored), patches))
     selected = memory.select(history, step)
@@ -195,14 +196,14 @@ def draw_memory(
 def _no_tokens(frames: int, patches: int) -> Any:
     import torch
 
-    return torch.zeros(frames, patches, 1)  # selections never look at tokens
+    return torch.zeros(frames, patches, 1)  # selections do not read tokens
 
 
 def _parts(policy: "Policy") -> dict[str, list[Any]]:
-    """Parameters by the parts that fine-tuning speaks of, in the policy's order."""
+    """Parameters by the parts of fine-tuning, in the policy's order."""
     groups: dict[str, list[Any]] = {}
     for name, parameter in policy.named_parameters():
-        groups.setdefault(policy.component_of(name), []).append(parameter)
+        groups.setdefault(policy.finetune_spec.component_of(name), []).append(parameter)
     return groups
 
 

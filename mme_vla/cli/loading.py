@@ -82,13 +82,20 @@ SAMPLING = ("auto", "eager", "graph", "compiled")
 
 def prepare_sampling(policy: "Policy", sampling: str, logger: logging.Logger) -> None:
     """Compile the policy's sampler as the configuration asks; `auto`: one CUDA graph a chunk where there is a GPU."""
+    from mme_vla.policy.capabilities import CompilesSampling
+
     if sampling not in SAMPLING:
         raise UserError(f"sampling={sampling!r}. {did_you_mean(str(sampling), SAMPLING)}")
     on_gpu = policy.device.type == "cuda"
     if sampling == "graph" and not on_gpu:
         raise UserError(f"sampling=graph needs a GPU, and the policy is on {policy.device}: leave sampling=auto.")
-    if sampling == "eager" or (sampling == "auto" and not (on_gpu and policy.compiles_sampling)):
+    compiles = isinstance(policy, CompilesSampling)
+    if sampling == "eager" or (sampling == "auto" and not (on_gpu and compiles and policy.compiles_sampling)):
         return
+    if not isinstance(policy, CompilesSampling):
+        raise UserError(
+            f"sampling={sampling}: {type(policy).__name__} has no sampler that can be compiled. Set sampling=eager."
+        )
     begun = time.perf_counter()
     policy.compile_sampling(layers=sampling == "compiled")
     logger.info("sampler compiled in %.1f s (sampling=%s)", time.perf_counter() - begun, sampling)

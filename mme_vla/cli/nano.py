@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli, command_trees, config_dir
+from mme_vla.cli.command import cli
+from mme_vla.config.composition import command_trees, config_dir
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.utils import read_json, write_json
 
@@ -178,7 +179,7 @@ def record_all(
 def demonstrate(
     scenes: "Iterator[Scene]", count: int, workers: int = 1, advance: Callable[[int], None] = lambda _: None
 ) -> list[Path]:
-    """The files of the first demonstrations of these scenes that succeed; what is there is not made again, nor tried."""
+    """The files of the first demonstrations of these scenes that succeed; existing ones are not made again."""
     from mme_vla.cli.record import carry_out
     from mme_vla.nano.demonstrations import demonstrated
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli, log_to_terminal
+from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.envs.episodes import named_tasks
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.records import EpisodeRecord

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.evaluate import choose_device, choose_subgoals, report_usage
 from mme_vla.cli.loading import load_policy
-from mme_vla.config.composition import cli, log_to_terminal
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:

@@ -1,5 +1,6 @@
 """`mme-vla record`: demonstrate episodes of the benchmark and keep them as a dataset."""
 
+import gc
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
-from mme_vla.envs.vector.processes import begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.utils import FolderLock, claim_plan, drop_plan, read_json, write_json
 from mme_vla.utils.processes import end_with_parent, signals_deferred
@@ -34,8 +35,8 @@ FAILED = "the demonstration did not end in success"
 def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict[str, Any]:
     """Demonstrate an episode into `<folder>/<name>.h5`; seeds that fail are skipped.
 
-    Where which frames are drawn depends on the demonstration, it is made twice: once without a look, which says what
-    these frames are, and again with images of them.
+    Where the rendered frames depend on the demonstration, it is made twice: first without images, to choose the frames,
+    and again with images of them.
 
     Returns:
         Task, episode, the seed that succeeded, steps, stored steps, video steps, and the failed seeds with reasons.
@@ -68,7 +69,7 @@ def record_episode(job: Job, folder: Path, previews: Path | None = None) -> dict
             writer.close()
             task.close()
         if blind is not None and (blind.steps, blind.stored) != (result.steps, result.stored):
-            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when drawn.")
+            raise RuntimeError(f"{job.name}: seed {seed} took {blind.steps} steps, and {result.steps} when rendered.")
         if result.success:
             draft.rename(folder / f"{job.name}.h5")
             if previews is not None:
@@ -154,8 +155,9 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
         work: importable by name, or a partial of such, where there are several processes.
     """
     if workers == 1 or len(jobs) < 2:
-        import mme_vla.envs.vector.preloaded  # noqa: F401 - scenes are built faster from here on
+        import mme_vla.envs.task  # noqa: F401
 
+        gc.freeze()  # scenes are built faster when no collection walks through the simulator's modules
         yield from map(work, jobs)
         return
     with _pool(workers) as pool:
@@ -166,7 +168,7 @@ def carry_out[J, R](jobs: Sequence[J], work: Callable[[J], R], workers: int) -> 
                 yield future.result()
         except BaseException as error:
             pool.shutdown(wait=False, cancel_futures=True)
-            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: nobody waits for it
+            if isinstance(error, KeyboardInterrupt):  # an episode takes minutes: it is not awaited
                 for worker in multiprocessing.active_children():
                     worker.terminate()
             raise
@@ -239,7 +241,7 @@ def run(cfg: "DictConfig") -> None:
 
 
 def _throughput(episodes: int, steps: int, seconds: float, workers: int) -> str:
-    """How fast it went, in words; of a recording that was continued, what was new in it."""
+    """A line on the speed; of a resumed recording, on what was added."""
     hours = max(seconds, 1e-9) / 3600
     named = f"{workers} worker{'s'[: workers > 1]}"
     return (
@@ -259,6 +261,6 @@ def _claim(work: Path, jobs: Sequence[Job]) -> None:
 
 def main() -> None:
     """Run `mme-vla record`."""
-    from mme_vla.config.composition import cli
+    from mme_vla.cli.command import cli
 
     cli("record")(run)()

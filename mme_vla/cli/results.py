@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from mme_vla.config.composition import print_user_errors
-from mme_vla.config.help import argument_parser
+from mme_vla.cli.errors import print_user_errors
+from mme_vla.cli.help import argument_parser
 from mme_vla.envs.metadata import FURTHER_SPLITS
 from mme_vla.errors import UserError, printable
 from mme_vla.evaluation.records import EpisodeRecord

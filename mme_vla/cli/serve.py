@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 
 from omegaconf import DictConfig, OmegaConf
 
+from mme_vla.cli.command import cli, log_to_terminal
 from mme_vla.cli.loading import load_policy, prepare_sampling
-from mme_vla.config.composition import cli, log_to_terminal
 
 if TYPE_CHECKING:
     from mme_vla.serving.server import PolicyServer
@@ -22,7 +22,7 @@ logger = logging.getLogger("mme_vla.serving")
 
 @cli("serve")
 def main(cfg: DictConfig) -> None:
-    """Serve `checkpoint`, or a fresh `model`, until it is told to stop."""
+    """Serve `checkpoint`, or a fresh `model`, until SIGTERM or Ctrl-C."""
     from mme_vla.serving.server import PolicyServer
     from mme_vla.serving.settings import ServeSettings
 
@@ -34,7 +34,7 @@ def main(cfg: DictConfig) -> None:
     prepare_sampling(policy, cfg.sampling, logger)
     server = PolicyServer(policy, settings, name=name, trained=cfg.checkpoint is not None)
     if not settings.local_only and settings.api_key is None:
-        logger.warning("host=%s without api_key: whoever reaches this port can use it", settings.host)
+        logger.warning("host=%s without api_key: every client that reaches this port can use it", settings.host)
     if server.metadata["subgoal"] is not None:
         logger.info("reads the key %r of each request; without it, the goal alone", server.metadata["subgoal"])
     asyncio.run(run(server))

@@ -5,7 +5,7 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError
 from mme_vla.subgoal.finetuning.collecting import build, open_input

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.subgoal.finetuning.training import fine_tune
 
 

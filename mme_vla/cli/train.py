@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli
+from mme_vla.cli.command import cli
 from mme_vla.config.devices import find_device
 from mme_vla.errors import UserError
 from mme_vla.utils import remove_drafts, write_atomically
@@ -94,21 +94,22 @@ def _train(
     from accelerate.utils import broadcast_object_list
 
     from mme_vla.policy.build import build_from_config
+    from mme_vla.policy.capabilities import with_vision_memory
     from mme_vla.policy.finetune import apply_finetuning, cast_frozen
     from mme_vla.policy.tensor_files import take_memory
     from mme_vla.training.checkpoint import check_disk, load_policy
     from mme_vla.training.data import check_frozen, prepare_data
     from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
     from mme_vla.training.loop import Trainer, finish
+    from mme_vla.training.order import Validation
     from mme_vla.training.runs import CONFIG, check_content, start_from, weights_to_start_from
-    from mme_vla.training.validation import Validation
 
     first = accelerator.is_main_process
     # Of processes that share the weights, one a machine holds them until they are shared: it may have to build a cache.
     sharded = settings.parallel.shards(accelerator.device)
     holds = accelerator.is_local_main_process or not sharded
     line = ProgressLine(settings.steps, run.step, visible=first)
-    # A backbone whose weights are about to be replaced is not drawn first.
+    # A backbone whose weights are about to be replaced is not initialised first.
     init_from = None if run.checkpoint is not None else weights_to_start_from(config["init_from"])
     with nullcontext() if holds else torch.device("meta"):
         policy = build_from_config(cfg, fresh_backbone=run.checkpoint is None and init_from is None)
@@ -126,7 +127,9 @@ def _train(
     policy.config["card"] = {"data": config["data"]["name"], "recipe": recipe}
     if holds:
         take_memory(policy.to(accelerator.device))
-    encoder = broadcast_object_list([policy.vision_fingerprint() if first and policy.memory is not None else None])
+    encoder = broadcast_object_list(
+        [with_vision_memory(policy).vision_fingerprint() if first and policy.memory else None]
+    )
     local = config["data"]["cache"].get("local", False)
     with accelerator.local_main_process_first() if local else accelerator.main_process_first():
         of_run = (config["data"], config["seed"], run.checkpoint, cache_command(), line.say)
@@ -141,7 +144,7 @@ def _train(
         validation = Validation(data.val, collate, settings.val_samples, max(batch_size, 1), settings.seed)
     trainer = Trainer(policy, data.train, collate, validation, settings, run, config, accelerator)
     line.say(trainer.describe())
-    loggers = open_loggers(run.folder, config, run.step) if first else Loggers([])
+    loggers = open_loggers(run.folder, config, run.step) if first else Loggers()
     if first:
         remove_drafts(run.folder)
         with write_atomically(run.folder / CONFIG) as draft:

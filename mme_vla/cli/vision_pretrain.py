@@ -8,7 +8,8 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from mme_vla.config.composition import cli, compose, log_to_terminal
+from mme_vla.cli.command import cli, log_to_terminal
+from mme_vla.config.composition import compose
 from mme_vla.errors import UserError
 
 logger = logging.getLogger("mme_vla.nano")
@@ -18,7 +19,7 @@ LEVELS = ("easy", "medium", "hard")
 
 @cli("vision_pretrain")
 def main(cfg: DictConfig) -> None:
-    """Draw what is not drawn, train what is not trained."""
+    """Render the scenes that are missing, then train the tower."""
     from mme_vla.envs.make import require_simulator
 
     require_simulator()

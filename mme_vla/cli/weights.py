@@ -15,17 +15,17 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from mme_vla.config.help import argument_parser
+from mme_vla.cli.help import argument_parser
 from mme_vla.config.plugins import TRUST_FLAG, import_trusted, trust_as_flag
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
-from mme_vla.policy.saving import CONFIG, policy_class
+from mme_vla.policy.saving import CONFIG, build_saved, check_processor, policy_class
 from mme_vla.policy.tensor_files import DTYPES, assign_tensors, dtype_of
-from mme_vla.weights.load import ADAPTERS, read_as
+from mme_vla.weights.load import adapter_of, read_as
 from mme_vla.weights.source import FORMATS, Source, open_source
 from mme_vla.weights.statistics import read_stats
 from mme_vla.weights.tables import Adapter
-from mme_vla.weights.writers import WRITERS, check_target
+from mme_vla.weights.writers import check_target, write_policy
 
 
 def print_mapping(policy: Policy, source: Source, to: str, console: Console | None = None) -> None:
@@ -33,11 +33,11 @@ def print_mapping(policy: Policy, source: Source, to: str, console: Console | No
     console = console or Console(width=None if sys.stdout.isatty() else 200)
     read, target_format = f"{source.folder} ({FORMATS[source.format]})", FORMATS[to]
     console.print(f"{read} → {target_format}; every tensor fits.", soft_wrap=True)
-    sides = {ADAPTERS[fmt]: title for fmt, title in ((to, "written"), (source.format, "read")) if fmt != "ours"}
+    sides = {fmt: title for fmt, title in ((source.format, "read"), (to, "written")) if fmt != "ours"}
     if not sides:
         console.print("Both sides have the same names.")
-    for make, title in reversed(sides.items()):
-        _print_adapter(console, make(policy), policy, title)
+    for fmt, title in sides.items():
+        _print_adapter(console, adapter_of(fmt, policy), policy, title)
 
 
 def _print_adapter(console: Console, adapter: Adapter, policy: Policy, title: str) -> None:
@@ -115,7 +115,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--dry-run", action="store_true", help="check the source and print the mapping, write nothing")
     parser.add_argument(TRUST_FLAG, action="store_true", help="import the plugins that the checkpoint names: its code")
     args = parser.parse_intermixed_args(trust_as_flag(sys.argv[1:] if arguments is None else arguments))
-    from mme_vla.config.composition import print_user_errors
+    from mme_vla.cli.errors import print_user_errors
 
     with print_user_errors():
         convert(
@@ -139,7 +139,7 @@ def convert(
 ) -> None:
     """Convert a checkpoint; the destination appears whole or not at all.
 
-    With `trust_plugins` the modules that a checkpoint names are imported: code of whoever wrote it.
+    With `trust_plugins` the modules that a checkpoint names are imported: its author's code.
     """
     target, kind = Path(destination).expanduser(), dtype_of(dtype)
     if not dry_run and target.exists():
@@ -164,7 +164,7 @@ def convert(
     shutil.rmtree(draft, ignore_errors=True)
     draft.mkdir(parents=True)
     try:
-        WRITERS[to](policy, draft, kind, stats)
+        write_policy(policy, draft, to, kind, stats)
         draft.rename(target)
     finally:
         shutil.rmtree(draft, ignore_errors=True)
@@ -182,9 +182,9 @@ def _policy(opened: Source, overrides: Sequence[str], trust_plugins: bool) -> Po
         if "backbone" not in config:
             raise UserError(f"{opened.folder} holds our weights but no config.json that describes them.")
         import_trusted(config, str(opened.folder), trust_plugins)
-        policy: Policy = policy_class(config).from_saved(config, str(opened.folder / CONFIG))
+        policy: Policy = build_saved(policy_class(config), config, str(opened.folder / CONFIG))
         policy.processor = load_processor(opened.folder)
-        policy.check_processor(str(opened.folder))
+        check_processor(policy, str(opened.folder))
         return policy
     words, declared = list(overrides), opened.model
     named = [word.partition("=")[2] for word in words if word.startswith("model=")]

@@ -1,6 +1,5 @@
 """The name of a composition, found among the models of the tree it is composed from."""
 
-import functools
 import hashlib
 import json
 import re
@@ -10,10 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, ListConfig, OmegaConf
-
-from mme_vla.config.errors import COMPOSITION_ERRORS, ConfigTree
-from mme_vla.config.hydra_engine import is_fixed, local_hydra, parse
-from mme_vla.errors import UserError
 
 JOINED = "joined"
 """The memory that several memories make (`mme_vla.memory.joined`, configs/memory/joined.yaml)."""
@@ -96,7 +91,7 @@ def decisive(cfg: DictConfig) -> Sections:
 
 
 def may_be_of(model: Path, sections: Sections) -> bool:
-    """Whether a model may compose to this memory and integration: a look at its files, where composing takes 60 ms."""
+    """Whether a model may compose to this memory and integration: reads its files, where composing takes 60 ms."""
     described = _read(model)
     if not isinstance(described, dict):
         return True
@@ -122,7 +117,7 @@ def _read(file: Path) -> Any:
 
 @lru_cache(maxsize=256)
 def _parsed(file: Path, changed: int) -> Any:
-    """A YAML file as it was when it was last changed; every name with differences asks for all models."""
+    """A YAML file as it was when it was last changed; a name with differences compares all models."""
     return OmegaConf.to_container(OmegaConf.load(file))
 
 
@@ -191,7 +186,7 @@ def _differences(base: Sections, sections: Sections) -> Sections:
 
 
 def _suffix(differences: Sections, words: bool = True) -> str:
-    """The differences in words where these are short, else a digest of them."""
+    """The differences spelt out where these are short, else a digest of them."""
     text = "-".join(f"{key.rpartition('.')[2]}_{_word(value)}" for key, value in differences.items())
     return text if words and len(text) <= LONGEST else digest(differences, 6)
 
@@ -213,87 +208,3 @@ def flat(values: Mapping[str, Any], prefix: str = "") -> Sections:
     for key, value in values.items():
         result |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
     return result
-
-
-_names: dict[str, str] = {}
-"""Names of compositions of the library's own tree by what decides on them; finding one takes 60 ms a model."""
-
-
-def _what_names(cfg: DictConfig) -> str:
-    return json.dumps([str(cfg.name), decisive(cfg)], sort_keys=True, default=str)
-
-
-def store_name(cfg: DictConfig, tree: ConfigTree) -> None:
-    """Spare `true_name` the search where a composition is a model as its file says, whatever it is trained with."""
-    model = [str(choice.input_line) for choice in tree.choices] == [f"model={cfg.name}"]
-    values = {str(value.key_or_group).partition(".")[0] for value in tree.values}
-    if tree.fixed and model and not values & {*DECISIVE, "policy", "name"}:
-        _names[_what_names(cfg)] = str(cfg.name)
-
-
-def true_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    """What a composition is called (`mme_vla.config.naming`).
-
-    Args:
-        config_name: what was composed. trees: folders of YAML files, the library's first.
-    """
-    if isinstance(cfg.get("memory"), ListConfig):
-        cfg = join_memories(cfg.copy())
-    if not is_fixed(trees, ()):
-        return resolve_name(cfg, config_name, trees)
-    key = _what_names(cfg)
-    if key not in _names:
-        _names[key] = resolve_name(cfg, config_name, trees)
-    return _names[key]
-
-
-def resolve_name(cfg: DictConfig, config_name: str, trees: tuple[Path, ...]) -> str:
-    """`true_name`, found by comparing the models of these trees."""
-    configured_name = str(cfg.name)
-    config_name = "policy" if (trees[0] / "policy.yaml").is_file() else config_name  # the least that holds a model
-    mine = {file.stem for tree in trees[1:] for file in (tree / "model").glob("*.yaml")}
-    plugin_models = {file.stem for file in (trees[0] / "model").glob("*.yaml")} - mine
-
-    def composed(words: tuple[str, ...], searched: tuple[Path, ...]) -> tuple[str, Sections] | None:
-        return (_cached_sections if is_fixed(searched, words) else _composed_sections)(config_name, words, searched)
-
-    def parts() -> Sections | None:
-        groups = {group: cfg[group] for group in ("memory", "integration") if group in cfg}
-        for group, section in groups.items():
-            if section and not section.get("name"):
-                raise UserError(
-                    f"The section `{group}` has no name, only {', '.join(section)}. Choose one: {group}=<name>; its "
-                    f"keys are set beside it, {group}.<key>=<value>."
-                )
-        words = [f"{group}={section.name if section else 'none'}" for group, section in groups.items()]
-        if POLICY in decisive(cfg):  # another kind of policy has its own processor beside its parts
-            words.insert(0, f"model={configured_name}")
-        if "members" in (groups.get("memory") or {}):
-            words.append(f"memory.members={literal(OmegaConf.to_container(groups['memory'].members, resolve=True))}")
-        result = composed(tuple(words), trees)
-        return None if result is None else result[1]
-
-    sections = decisive(cfg)
-
-    def reference(model: str) -> tuple[str, Sections] | None:
-        if model in plugin_models and not may_be_of(trees[0] / "model" / f"{model}.yaml", sections):
-            return None
-        return composed((f"model={model}",), trees[:1] if model in plugin_models else trees)
-
-    return variant_name(str(cfg.name), sections, mine | plugin_models, reference, parts)
-
-
-def _composed_sections(
-    config_name: str, overrides: tuple[str, ...], trees: tuple[Path, ...]
-) -> tuple[str, Sections] | None:
-    """Name and decisive keys of a composition; None where these words do not compose."""
-    with local_hydra(trees[0], trees[1:]) as engine:
-        try:
-            tree = ConfigTree(engine.config_loader, config_name, parse(overrides), is_fixed(trees, overrides))
-            cfg = join_memories(tree.composed(overrides))
-            return str(cfg.name), decisive(cfg)
-        except (*COMPOSITION_ERRORS, UserError):
-            return None
-
-
-_cached_sections = functools.cache(_composed_sections)

@@ -2,8 +2,10 @@
 
 import logging
 import os
+import queue
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from io import BytesIO
@@ -15,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.data.ahead import ahead
 from mme_vla.data.cache import (
     COMMAND,
     DTYPES,
@@ -34,7 +35,7 @@ from mme_vla.data.cache import (
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, frames_scored, make_scorer
 from mme_vla.utils import draft_of, remove_drafts, sum_line, write_atomically, write_json
 
 PAGE = 4096  # bytes
@@ -145,8 +146,8 @@ class _Chunk:
 
 
 def _chunks(source: EpisodeSource, episode: int, memory: Memory, batch_size: int) -> Iterator[_Chunk]:
-    spec, length, scorer = memory.storage, int(source.lengths[episode]), memory.make_scorer()
-    stored, scored = stored_frames(source, episode, memory.storage), memory.frames_scored(length)
+    spec, length, scorer = memory.storage, int(source.lengths[episode]), make_scorer(memory)
+    stored, scored = stored_frames(source, episode, memory.storage), frames_scored(memory, length)
     span = batch_size * spec.keep_every  # so that about `batch_size` frames of a chunk are kept
     for start in range(0, length, span):
         stop = min(start + span, length)
@@ -255,10 +256,11 @@ def ensure_cache(
         command: that command, for messages.
     """
     coded = source.lossy.get(source.robot.memory_camera)
-    if coded is not None and memory.make_scorer() is not None:
+    if coded is not None and make_scorer(memory) is not None:
         log.warning(
             "%s: its videos are coded as %s, and this memory scores patches by how little they change: what "
-            "compression moves passes for motion. Convert the recordings with lossless videos, or choose another memory.",
+            "compression changes passes for motion. Convert the recordings with lossless videos, or choose another "
+            "memory.",
             source.name, coded,
         )  # fmt: skip
     expected = fingerprint(source, memory.storage, encoder, dtype)
@@ -275,3 +277,47 @@ def ensure_cache(
     # All of it here, also under torchrun, where training has its first process prepare the data for the others.
     build_cache(source, memory, encode, folder, expected, batch_size=batch_size, shard=(0, 1))
     return VisionCache(folder, source, expected, command)
+
+
+_END = object()
+
+
+def ahead[T](things: Iterable[T], count: int) -> Generator[T, None, None]:
+    """The same things, made in a thread up to `count` ahead; what goes wrong there is raised where they are used.
+
+    Closing the generator ends the thread.
+    """
+    made: queue.Queue[Any] = queue.Queue(count)
+    closed = threading.Event()
+
+    def put(thing: Any) -> bool:
+        while not closed.is_set():
+            try:
+                made.put(thing, timeout=0.1)
+                return True
+            except queue.Full:
+                continue
+        return False
+
+    def make() -> None:
+        try:
+            for thing in things:
+                if not put((thing, None)):
+                    return
+            put((_END, None))
+        except BaseException as error:
+            put((_END, error))
+
+    thread = threading.Thread(target=make, name="ahead", daemon=True)
+    thread.start()
+    try:
+        while True:
+            thing, error = made.get()
+            if error is not None:
+                raise error
+            if thing is _END:
+                return
+            yield thing
+    finally:
+        closed.set()
+        thread.join()

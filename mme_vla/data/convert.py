@@ -17,8 +17,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.data.console import progress, quiet_libraries
-from mme_vla.data.hdf5 import all_have_choices, all_have_poses, any_selected_frames, open_episode, pose_columns
-from mme_vla.data.hdf5_episode import POSE_STATE, SUBGOALS, EpisodeRef, RawEpisode, RawFrame
+from mme_vla.data.hdf5 import (
+    POSE_STATE,
+    SUBGOALS,
+    EpisodeRef,
+    RawEpisode,
+    RawFrame,
+    all_have_choices,
+    all_have_poses,
+    any_selected_frames,
+    open_episode,
+    pose_columns,
+)
 from mme_vla.data.keyframes import file_of, write_keyframes
 from mme_vla.data.lerobot_files import NAMES, RENDERED_SUFFIX
 from mme_vla.data.waypoints import CHOICE_ACTIONS, CHOICE_NUMBERS

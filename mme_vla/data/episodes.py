@@ -14,20 +14,24 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5_episode import SUBGOALS
+from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.data.lerobot_files import (
+    REMEDY,
     RENDERED_SUFFIX,
     SAMPLE,
+    check_vectors,
     content_fingerprint,
     find_columns,
     lossy_coding,
     names_of,
+    open_table,
+    read_episode_table,
     read_exec_starts,
     read_info,
     resolve_root,
+    video_file,
     width_of,
 )
-from mme_vla.data.tables import REMEDY, check_vectors, open_table, read_episode_table, video_file
 from mme_vla.data.video import VideoReader
 from mme_vla.data.waypoints import Motions, find_choices, find_motions
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment, Option

@@ -33,7 +33,7 @@ class AnnotatedEpisode:
 
 
 def annotated_episodes(inputs: Sequence[str | Path]) -> list[AnnotatedEpisode]:
-    """All episodes, in order, of official HDF5 files or folders of them, and of LeRobot datasets that mark the video."""
+    """All episodes, in order, of official HDF5 files or their folders, and of LeRobot datasets that mark the video."""
     episodes: list[AnnotatedEpisode] = []
     for path in inputs:
         annotated = _of_dataset(Path(path)) if (Path(path) / "meta").is_dir() else _of_files(path)

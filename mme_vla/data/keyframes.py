@@ -10,18 +10,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from torch.utils.data import Dataset
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5_episode import RawEpisode
+from mme_vla.data.hdf5 import RawEpisode
 from mme_vla.data.waypoints import Motions, find_motions
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.errors import UserError
 from mme_vla.methods.sam2act.processor import Shot
+from mme_vla.processing.base import PolicyProcessor
 from mme_vla.utils import require_file, write_atomically
 
 FOLDER = "keyframes"
@@ -178,12 +179,6 @@ class KeyframeSample:
     targets: np.ndarray
 
 
-class KeyframeReader(Protocol):
-    """What turns samples into what a policy learns from."""
-
-    def keyframe_item(self, sample: KeyframeSample) -> dict[str, Any]: ...
-
-
 class KeyframeDataset(Dataset[dict[str, Any]]):
     """Runs of keyframes from the chains of several datasets' episodes.
 
@@ -196,7 +191,7 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
     def __init__(
         self,
         sources: Sequence[EpisodeSource],
-        processor: KeyframeReader,
+        processor: PolicyProcessor,
         length: int,
         *,
         episodes: Sequence[np.ndarray] | None = None,
@@ -271,5 +266,5 @@ class KeyframeDataset(Dataset[dict[str, Any]]):
             places=np.array([link.place for link in links]),
             targets=keyframes.motions.targets[[link.motion for link in links]],
         )
-        item = self.processor.keyframe_item(sample)
+        item = self.processor.item(sample)
         return item | {"goal": sample.goal, "subgoals": {}, "place": (number, episode, frames[0])}

@@ -1,7 +1,12 @@
-"""Is this folder a dataset we can read? Checked before LeRobot is asked, which would otherwise look on the hub."""
+"""A LeRobot v3.0 dataset's files: description, columns, tables. All of them are checked when they are opened.
+
+LeRobot's own reader is not used: it downloads a file from the hub that it cannot open here.
+"""
 
 import math
+import string
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -9,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from mme_vla.data.hdf5_episode import SUBGOALS
+from mme_vla.data.hdf5 import SUBGOALS
 from mme_vla.embodiment import Camera, Embodiment
 from mme_vla.embodiment.action_space import POSE_WIDTH
 from mme_vla.errors import UserError, brief, listed
@@ -163,7 +168,7 @@ def resolve_root(root: str | Path) -> Path:
 
 
 def read_info(root: Path) -> dict[str, Any]:
-    """Return `meta/info.json`: features with a `dtype` and a `shape` of whole numbers, frames per second, and others."""
+    """Return `meta/info.json`: features with a `dtype` and a `shape`, frames per second, and others."""
     path = root / "meta" / "info.json"
     info = read_json(path, "a dataset's description")
     features = info.get("features")
@@ -176,7 +181,7 @@ def read_info(root: Path) -> dict[str, Any]:
 
 
 def lossy_coding(feature: dict[str, Any]) -> str | None:
-    """How a video was coded if something was lost by it, such as `av1 at crf 30`; None where not, or where nothing says.
+    """The lossy codec of a video, such as `av1 at crf 30`; None for a lossless one, or without information.
 
     LeRobot writes what is known under `info`; its default before it wrote the quality was AV1 at crf 30.
     """
@@ -244,3 +249,132 @@ def content_fingerprint(root: Path, parts: Sequence[str] = ("data", "videos", "m
                     handle.seek(offset)
                     digest.update(handle.read(65536))
     return digest.hexdigest()[:16]
+
+
+REMEDY = "Copy, download or convert the dataset again."
+_MOST_FRAMES = 2**40  # of a dataset; a larger number is damage
+_INTEGER_COLUMNS = ("episode_index", "is_demo", "exec_start_idx")
+_FIELDS = {"video_key": ("",), "chunk_index": ("", "d", "03d"), "file_index": ("", "d", "03d")}
+
+
+def parquet_files(root: Path, folder: str) -> list[Path]:
+    """The parquet files of `folder`, two levels down as in LeRobot v3.0, in order."""
+    return [require_file(path, "a parquet table") for path in sorted((root / folder).glob("*/*.parquet"))]
+
+
+def read_episode_table(root: Path, video_views: Sequence[str]) -> dict[str, np.ndarray | list[str]]:
+    """Read and check `meta/episodes`.
+
+    Returns:
+        `starts` and `lengths`, [e] int64 rows of the tables; `goals`, [e] texts, lower-case; and for every view
+        `<view>/chunk_index`, `<view>/file_index` [e] int64 and `<view>/from_timestamp` [e] float64, seconds.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    files = [f"{view}/{key}" for view in video_views for key in ("chunk_index", "file_index")]
+    times = [f"{view}/from_timestamp" for view in video_views]
+    integers = ["episode_index", "dataset_from_index", "dataset_to_index", *(f"videos/{name}" for name in files)]
+    fields = [(name, pa.int64()) for name in integers] + [(f"videos/{name}", pa.float64()) for name in times]
+    schema, meta = pa.schema([*fields, ("tasks", pa.list_(pa.string()))]), root / "meta" / "episodes"
+    with decoding(meta, "tables of episodes", REMEDY):
+        parts = [pq.ParquetFile(file).read(schema.names) for file in parquet_files(root, "meta/episodes")]
+        table = pa.concat_tables([part.select(schema.names).cast(schema) for part in parts])
+        empty = [name for name in schema.names if table[name].null_count]
+        columns = {name: table[name].to_numpy() for name, _ in fields}
+        tasks = [texts[0] if texts else None for texts in table["tasks"].to_pylist()]
+    if empty or not table.num_rows:
+        raise UserError(
+            f"{meta} describes {table.num_rows} episodes; empty cells in: {listed(empty) or 'none'}. {REMEDY}"
+        )
+    starts, stops = columns["dataset_from_index"], columns["dataset_to_index"]
+    checks = {
+        "episode_index": (columns["episode_index"] == np.arange(len(starts)), "0, 1, 2, …"),
+        "dataset_from_index": (starts == np.concatenate([[0], stops[:-1]]), "the row after the episode before"),
+        "dataset_to_index": ((stops > starts) & (stops <= _MOST_FRAMES), "at least one row"),
+        "tasks": (np.array([isinstance(task, str) for task in tasks]), "a text"),
+        **{f"videos/{n}": (((v := columns[f"videos/{n}"]) >= 0) & (v <= _MOST_FRAMES), "a number") for n in files},
+        **{f"videos/{n}": (np.isfinite(v := columns[f"videos/{n}"]) & (v >= 0), "seconds from 0") for n in times},
+    }
+    for name, (valid, expected) in checks.items():
+        if not valid.all():
+            episode = int(np.argmin(valid))
+            value = brief(columns[name][episode].item() if name in columns else tasks[episode])
+            raise UserError(f"{meta}: {name} of episode {episode} is {value}; expected {expected}. {REMEDY}")
+    named = {name: columns[f"videos/{name}"] for name in (*files, *times)}
+    return {"starts": starts, "lengths": stops - starts, "goals": [str(task).lower() for task in tasks], **named}
+
+
+def open_table(root: Path, columns: Sequence[str], features: dict[str, Any]) -> Any:
+    """Memory-map these columns of all tables, as LeRobot does, through the cache folder of the `datasets` library."""
+    from lerobot.utils.utils import SuppressProgressBars
+
+    from datasets import Dataset, Features
+
+    for name in _INTEGER_COLUMNS:
+        if name in columns and not features[name]["dtype"].startswith(("int", "uint", "bool")):
+            raise UserError(f"{root}: {name} is {brief(features[name]['dtype'])}; expected whole numbers. {REMEDY}")
+    with decoding(root / "meta" / "info.json", "a description of features", REMEDY):
+        target = Features({name: _kind(**features[name]) for name in columns})
+    large = any(features[name]["dtype"] == "image" for name in columns)
+    files = [str(file) for file in parquet_files(root, "data")]
+    with decoding(root / "data", "tables of frames", REMEDY), nullcontext() if large else SuppressProgressBars():
+        table = Dataset.from_parquet(files, columns=list(columns), features=target)
+    return table.with_format("arrow")
+
+
+def _kind(dtype: str, shape: tuple[int, ...], **_: Any) -> Any:
+    """What `datasets` calls such a feature. LeRobot could say it, at the price of four seconds for importing it."""
+    import datasets
+
+    if dtype == "image":
+        return datasets.Image()
+    if shape == (1,):
+        return datasets.Value(dtype)
+    if len(shape) == 1:
+        return datasets.List(datasets.Value(dtype), length=shape[0])
+    return getattr(datasets, f"Array{len(shape)}D")(shape=shape, dtype=dtype)
+
+
+def check_vectors(root: Path, table: Any, name: str, width: int) -> None:
+    """Make sure that every row of a column is `width` finite numbers; one alone may stand without a list around it."""
+    import pyarrow.compute as pc
+
+    first = 0
+    for chunk in table.data[name].chunks:
+        # Counting is not enough: rows of 7 and 9 numbers have 8 on average.
+        listed = _is_list(chunk.type)
+        lengths = pc.list_value_length(chunk).fill_null(-1).to_numpy(zero_copy_only=False) if listed else width
+        wrong = np.broadcast_to(lengths != width, len(chunk))
+        if not wrong.any():
+            numbers = chunk.flatten() if listed else chunk
+            values = numbers.to_numpy(zero_copy_only=False).reshape(-1, width)  # nulls become NaN
+            wrong = ~np.isfinite(values).all(axis=1)
+        if wrong.any():
+            row = int(np.flatnonzero(wrong)[0])
+            value = brief(chunk[row].as_py())
+            raise UserError(f"{root}: row {first + row} has {name} {value}; expected {width} finite numbers. {REMEDY}")
+        first += len(chunk)
+
+
+def video_file(root: Path, template: object, view: str, chunk: int, file: int) -> Path:
+    """The place of a video: `video_path` of meta/info.json, filled in."""
+    info = root / "meta" / "info.json"
+    try:
+        fields = [
+            (name, spec or "") for _, name, spec, _ in string.Formatter().parse(str(template)) if name is not None
+        ]
+    except ValueError:
+        fields = [("", "")]
+    if not isinstance(template, str) or any(spec not in _FIELDS.get(name, ()) for name, spec in fields):
+        raise UserError(
+            f"{info}: video_path is {brief(template)}; expected a path with the fields {{video_key}}, "
+            f"{{chunk_index:03d}} and {{file_index:03d}}. {REMEDY}"
+        )
+    return inside(root, template.format(video_key=view, chunk_index=chunk, file_index=file), "video")
+
+
+def _is_list(kind: Any) -> bool:
+    import pyarrow as pa
+
+    return pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)

@@ -10,7 +10,7 @@ import shutil
 from pathlib import Path
 
 from mme_vla.data.convert import ConvertOptions, convert
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.errors import UserError
 

@@ -1,4 +1,4 @@
-"""Which episodes a command is about: one grammar of `tasks=`, `episodes=` and `split=` for all of them."""
+"""The grammar of `tasks=`, `episodes=` and `split=`, the same for all commands."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -17,8 +17,8 @@ def choose_tasks(tasks: str | Sequence[str]) -> list[str]:
     """Names of tasks in the order they are named, each once.
 
     Args:
-        tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names; tasks of
-            one's own are named, after the plugin that registers them was imported.
+        tasks: `all` of the benchmark, a name, several in one text (`StopCube,BinFill`), or a list of names. The user's
+            tasks need the plugin that registers them.
     """
     names = tasks.split(",") if isinstance(tasks, str) else list(tasks)
     names = [str(name).strip() for name in names]
@@ -37,14 +37,14 @@ def choose_numbers(episodes: Any, count: int, what: str = "the split") -> list[i
     Args:
         episodes: None or `all` for all there are, a number for the first so many, a list of numbers, or text of
             numbers and ranges (`0-9`, `0-3,7`). `[3]` is episode number three alone, `3` the first three.
-        count: how many episodes there are. what: of what, for messages.
+        count: of episodes in `what`, which messages name.
     """
     if episodes is None or episodes == ALL:
         return list(range(count))
     if isinstance(episodes, int) and not isinstance(episodes, bool):
         if not 1 <= episodes <= count:
             alone = f" For number {episodes} alone write episodes=[{episodes}]." if 0 <= episodes < count else ""
-            raise UserError(f"episodes={episodes} asks for the first {episodes}; {what} has {count}.{alone}")
+            raise UserError(f"episodes={episodes} means the first {episodes}; {what} has {count}.{alone}")
         return list(range(episodes))
     ranges = spans(episodes, "episodes", GRAMMAR)
     for span in ranges:
@@ -66,11 +66,7 @@ def choose_episodes(tasks: str | Sequence[str] = ALL, episodes: Any = None, spli
 
 
 def named_tasks(config: Mapping[str, Any]) -> str | list[str]:
-    """What `tasks=` says, or `task=`, which means the same.
-
-    Args:
-        config: a command's; `tasks` is `all` by default where the command needs no tasks, else None.
-    """
+    """The value of `tasks=`, or of `task=`, which means the same."""
     tasks, task = (config.get(key) for key in ("tasks", "task"))
     if task is not None and tasks not in (None, ALL, task):
         raise UserError(f"tasks={tasks} and task={task} mean the same: give one of them.")
@@ -84,7 +80,7 @@ def spans(value: Any, key: str, grammar: str) -> list[range]:
     """Read numbers and ranges: text such as `0-9` or `0-3,7`, or a list of such.
 
     Args:
-        key: what they were given as, and `grammar` what may stand there, for messages.
+        key, grammar: for messages.
     """
     if isinstance(value, str):
         parts: list[Any] = value.split(",")

@@ -4,14 +4,17 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from mme_vla.envs import metadata
 from mme_vla.envs.metadata import TASK_NAMES, read_variant
+from mme_vla.envs.observations import Include
 from mme_vla.errors import UserError, did_you_mean, missing_extra
 from mme_vla.registry import TASKS
 
 if TYPE_CHECKING:
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.official import OfficialEnv
+
 
 ENVS = ("mme_vla", "official")
 ACTION_SPACES = ("joint_angle", "ee_pose", "waypoint", "multi_choice")
@@ -44,15 +47,14 @@ def make_env(
         action_space: `joint_angle`, `ee_pose`, `waypoint` or `multi_choice`.
         seed: builds the scene of this seed instead of an episode of the split.
         difficulty: with `seed`: `easy`, `medium` or `hard`; by default seed % 3 decides.
-        recovery: `z` or `xy`: draw what recovery demonstrations draw in addition, as train episodes 0-5 were recorded
-            (it changes the order of BinFill's colours); by default nothing, as in the official evaluation.
+        recovery: `z` or `xy`: sample as recovery demonstrations do, such as train episodes 0-5 (it changes the order of
+            BinFill's colours); by default nothing, as in the official evaluation.
         max_steps: control steps until the status becomes `timeout`.
         render: whether observations hold images; without it no Vulkan is needed and steps are about 80 times faster.
         reward: `none`, as in the benchmark: always 0. `sparse`: 1 with the step that succeeds. `subtask`: an equal
             share for each sub-task of the execution as it is done, 1 in all.
         env: `mme_vla`, or `official` for the installed package `robomme`.
-        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` asks for; an
-            environment alone has no memory to show them to.
+        sessions: unrelated episodes that the caller shows the policy first, as `split=stress:sessions=<n>` requires.
         include: `include_front_depth`, `include_wrist_depth`, `include_front_camera_extrinsic`,
             `include_wrist_camera_extrinsic`, `include_front_camera_intrinsic`, `include_wrist_camera_intrinsic`,
             `include_available_multi_choices`, `include_maniskill_obs`.
@@ -66,8 +68,6 @@ def make_env(
     check_names(task, env, action_space, difficulty, seed)
     check_sessions(split, sessions)
     if env == "official":
-        from mme_vla.envs.official import make_official_env
-
         if seed is not None or recovery is not None or not render or reward != "none":
             raise UserError(
                 'env="official" takes episodes of a split, renders and gives no reward: leave out seed, recovery, '
@@ -85,14 +85,14 @@ def make_env(
 
 
 def check_sessions(split: str, sessions: int) -> None:
-    """Refuse a split with sessions before each episode where nobody shows them."""
+    """Refuse a split with sessions before each episode unless the caller shows them."""
     variant = read_variant(split)
     required = 0 if variant is None else variant.sessions
     if required != sessions:
         raise UserError(
             f"split={split}: {required} unrelated episodes come before each, and {sessions} are shown. `python -m "
-            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; whoever shows them "
-            "otherwise says so: make_env(…, sessions=2)."
+            "mme_vla.evaluate split=stress:sessions=2 recordings=<dataset>` shows recorded ones; other "
+            "callers declare them: make_env(…, sessions=2)."
         )
 
 
@@ -152,10 +152,8 @@ def make_task(task: str, *, render: bool, obs_mode: str = "none", **options: Any
 def _make_library_env(
     task: str, space: str, max_steps: int, render: bool, reward: str, options: dict[str, Any], **scene: Any
 ) -> "RoboMMEEnv":
-    from mme_vla.envs.observations import Include
-
     if space == "multi_choice":
-        # Who chooses a pixel needs the front camera to know what it shows.
+        # A policy that chooses a pixel needs the front camera's matrices.
         options = options | {"include_front_camera_extrinsic": True, "include_front_camera_intrinsic": True}
     include = Include.from_options(options)
     obs_mode = "none"
@@ -166,3 +164,92 @@ def _make_library_env(
 
     built = make_task(task, render=render, obs_mode=obs_mode, **scene)
     return RoboMMEEnv(built, space, max_steps, include, render, reward)
+
+
+class OfficialEnv:
+    """One episode of the official package `robomme`; `reset`, `step`, `render`, `close` as in `RoboMMEEnv`.
+
+    The package needs a patched simulator, numpy < 2 and gymnasium 0.29, therefore an environment of its own.
+
+    Args:
+        env: what the official builder made.
+        max_steps: control steps after which the status becomes `timeout`.
+        include: what observations and infos hold beyond the standard keys.
+    """
+
+    def __init__(self, env: Any, max_steps: int, include: Include) -> None:
+        self._env: Any = env
+        self.max_steps = max_steps
+        self.include = include
+        self._newest: np.ndarray | None = None
+        self._started = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, list[Any]], dict[str, Any]]:
+        """Begin the episode; `seed` and `options` have no effect."""
+        observation, info = self._open().reset()
+        self._started = True
+        self._keep_newest(observation)
+        return observation, _flat(info)
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Perform one action."""
+        env = self._open()
+        if not self._started:
+            raise UserError("step() before reset(): call reset() first.")
+        observation, reward, terminated, truncated, info = env.step(action)
+        self._keep_newest(observation)
+        return observation, reward, terminated, truncated, _flat(info)
+
+    def render(self) -> np.ndarray | None:
+        """The newest front image [256, 256, 3], or None before the first reset."""
+        self._open()
+        return self._newest
+
+    def close(self) -> None:
+        """Free the simulator; closing twice is harmless."""
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+    def _open(self) -> Any:
+        if self._env is None:
+            raise UserError("The environment is closed; make a new one.")
+        return self._env
+
+    def _keep_newest(self, observation: Any) -> None:
+        if observation and observation.get("front_rgb_list"):
+            self._newest = np.asarray(observation["front_rgb_list"][-1])
+
+
+def make_official_env(
+    task: str, split: str, episode: int, action_space: str, max_steps: int, options: dict[str, Any]
+) -> OfficialEnv:
+    """Make an episode of the official package."""
+    include = Include.from_options(options)
+    if find_spec("robomme") is None:
+        raise UserError(
+            "The official package robomme is not installed. Install it from github.com/RoboMME/robomme_benchmark in an "
+            "environment of its own: it needs numpy < 2 and gymnasium 0.29. Or use env='mme_vla', which needs none."
+        )
+    if hasattr(import_module("robomme"), "STANDS_IN"):
+        raise UserError(
+            "The installed package robomme is this library's stand-in (plugins/robomme), whose environments are those "
+            "of env='mme_vla'. Uninstall it and install the official one, or leave out env='official'."
+        )
+    import_module("robomme.robomme_env")  # registers the tasks
+    builder = import_module("robomme.env_record_wrapper").BenchmarkEnvBuilder(
+        env_id=task, dataset=split, action_space=action_space, gui_render=False, max_steps=max_steps
+    )
+    count = builder.get_episode_num()
+    if not 0 <= episode < count:
+        raise UserError(f"Unknown episode {episode} of {task}, split {split!r}; expected 0 to {count - 1}.")
+    flags = {name: True for name, yes in include.options.items() if yes}
+    return OfficialEnv(builder.make_env_for_episode(episode, max_steps=max_steps, **flags), max_steps, include)
+
+
+def _flat(info: dict[str, Any]) -> dict[str, Any]:
+    """The info as one plain dict whose `task_goal` is a list."""
+    goal = info.get("task_goal")
+    return {**info, "task_goal": [goal]} if isinstance(goal, str) else dict(info)

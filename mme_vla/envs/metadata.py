@@ -1,9 +1,9 @@
-"""Which seed and difficulty every episode of the benchmark's splits has; importing this needs no simulator.
+"""Tasks, splits, and the seed and difficulty of every episode; importing this needs no simulator.
 
 The shipped tables are the benchmark's own. A seed follows from task, split and episode by a formula, except where the
-official demonstrator failed on it and the seed was raised until it succeeded (benchmarks/episode_seeds.py does the same
-with ours, and reports where it comes out elsewhere). With the official files at hand (the `robomme` package installed,
-or `MME_VLA_ROBOMME_METADATA` naming a folder with `train/`, `val/` and `test/`) theirs are used.
+official demonstrator failed on it and the seed was raised until it succeeded (see benchmarks/episode_seeds.py). The
+official files are preferred: the installed package `robomme`, or the folder with `train/`, `val/` and `test/` that
+`MME_VLA_ROBOMME_METADATA` names.
 """
 
 import csv
@@ -31,7 +31,6 @@ TASK_NAMES = (
 STICK_TASKS = ("PatternLock", "RouteStick")
 """Tasks whose robot holds a stick instead of a gripper."""
 
-
 BASE = "test"
 TWIN, STRESS = "twin", "stress"
 DIALS: dict[str, tuple[str, ...]] = {
@@ -45,11 +44,10 @@ DIALS: dict[str, tuple[str, ...]] = {
 """Dial → the tasks that have it.
 
 count: repetitions or visits more. containers: more, over nothing. swaps: more of them. delay: steps more between
-what is shown and the execution. path: discs more on the way. distractors: more objects that are not asked for.
+what is shown and the execution. path: discs more on the way. distractors: more objects that are not targets.
 """
 SESSIONS = "sessions"
-"""The dial that turns no scene: so many unrelated episodes come before one's own, in the same memory. All tasks have
-it; an evaluation shows them."""
+"""Unrelated episodes before the actual one, in the same memory: a dial of all tasks that leaves scenes unchanged."""
 _STRESS = re.compile(rf"{STRESS}:([a-z_]+)=(\d{{1,4}})")
 
 
@@ -63,7 +61,7 @@ class Variant:
 
     @property
     def options(self) -> dict[str, Any]:
-        """What a task is built with."""
+        """Keyword arguments of the task."""
         if self.twin:
             return {"in_view": True}
         return {"stress": {self.dial: self.turned}} if self.turned and self.dial != SESSIONS else {}
@@ -86,7 +84,7 @@ class Variant:
 
 
 def read_variant(split: str) -> Variant | None:
-    """What a split varies; None for one that varies nothing, or is none."""
+    """The variant that a split names; None for any other text."""
     if split == TWIN:
         return Variant(twin=True)
     if not str(split).startswith(STRESS):
@@ -106,7 +104,7 @@ SPLITS = {"train": 100, "val": 50, "test": 50}
 MORE = "more"
 """Episodes beyond the benchmark's, for recording at scale; their seeds are in none of its splits, nor is it a split."""
 FURTHER, FURTHER_EPISODES = "further", 100
-"""Episodes that continue where the test split's rule ends: for tests on scenes nobody has looked at; no split either."""
+"""Episodes that continue where the test split's rule ends, for tests on new scenes; no split either."""
 _CYCLE = ("easy", "easy", "medium", "hard")
 FURTHER_SPLITS = {FURTHER: FURTHER_EPISODES} | {f"{FURTHER}_{level}": 400 for level in ("easy", "medium", "hard")}
 """Episodes a task has in each of these; `further_hard` are the hard ones as the same rule continues, and so forth."""
@@ -118,7 +116,6 @@ _FIRST_SEED = {
     **dict.fromkeys(FURTHER_SPLITS, _TEST_SEED),
 }  # fmt: skip
 _RECOVERY = ("z", "z", "z", "xy", "xy", "xy")
-_PACKAGE_FOLDER = Path("env_metadata")
 
 
 @dataclass(frozen=True)
@@ -146,7 +143,7 @@ def formula(task: str, split: str, episode: int) -> tuple[int, str]:
 
 
 def _further_place(split: str, episode: int) -> int:
-    """Where in the rule of seeds and difficulties an episode beyond the test split stands."""
+    """Index, in the rule of seeds and difficulties, of an episode beyond the test split."""
     first, level = SPLITS["test"], split.removeprefix(FURTHER).removeprefix("_")
     if not level:
         return first + episode
@@ -185,7 +182,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
 
 def check_split(split: str) -> Variant | None:
-    """Make sure that a split exists; what it varies, where it is a variant of the test split."""
+    """Make sure that a split exists; returns its variant where it has one."""
     variant = read_variant(split)
     if variant is None and split not in _COUNTS:
         raise UserError(f"Unknown split {split!r}. {did_you_mean(str(split), [*_COUNTS, TWIN, STRESS])}")
@@ -213,8 +210,8 @@ def _table(split: str) -> dict[str, list[EpisodeSpec]]:
 
 def _installed_folder() -> Path | None:
     spec = find_spec("robomme")
-    places = (spec.submodule_search_locations or []) if spec is not None else []
-    return next((Path(place) / _PACKAGE_FOLDER for place in places), None)
+    folders = (spec.submodule_search_locations or []) if spec is not None else []
+    return next((Path(folder) / "env_metadata" for folder in folders), None)
 
 
 def _file(folder: Path, task: str, split: str) -> Path:

@@ -1,12 +1,4 @@
-"""The renderer, kept for the life of the process.
-
-ManiSkill makes a render system for each scene. All of them share SAPIEN's engine, in which shaders and pipelines are
-compiled when the first image is taken, half a second where software renders; it goes with the last render system
-that holds it. An episode that closes its scene before the next one opens so pays for it again. One more render system,
-never released, keeps it; scenes stay separate, and images the same.
-
-It also keeps one Vulkan device from being opened per environment, of which NVIDIA's driver bears some thirty only.
-"""
+"""The renderer: the device it runs on, its shaders, and the engine that is kept for the life of the process."""
 
 import hashlib
 import logging
@@ -18,116 +10,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
     import sapien
     from mani_skill.render import ShaderConfig
-
-
-CELL = 0.001
-"""Width of a cell, metres: less than a pixel covers from 0.13 metres on."""
-_HEADER_BYTES = 80
-_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-
-
-def coarsen(corners: np.ndarray, cell: float = CELL) -> np.ndarray:
-    """Merge corners that lie in one cell of a grid into their mean.
-
-    Args:
-        corners: of each triangle, float [n, 3, 3], metres.
-        cell: width of a cell, metres.
-
-    Returns:
-        Corners [m, 3, 3] float32, m <= n, of the triangles whose corners lie in three cells, each once and with its
-        side kept, in an order that depends on nothing else.
-    """
-    points = corners.reshape(-1, 3)
-    _, cells, counts = np.unique(
-        np.floor(points / cell).astype(np.int64), axis=0, return_inverse=True, return_counts=True
-    )
-    cells = cells.reshape(-1)
-    means = np.stack([np.bincount(cells, points[:, axis]) for axis in range(3)], 1) / counts[:, None]
-    triangles = cells.reshape(-1, 3)
-    different = (triangles != np.roll(triangles, 1, axis=1)).all(axis=1)
-    triangles = triangles[different]
-    # Turned, so that a triangle begins with its lowest corner whichever it began with.
-    rotation = (triangles.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    triangles = np.unique(np.take_along_axis(triangles, rotation, axis=1), axis=0)
-    return means[triangles].astype(np.float32)
-
-
-def read_stl(path: Path) -> np.ndarray:
-    """Corners [n, 3, 3] float32 of the triangles of a binary STL file."""
-    return np.frombuffer(path.read_bytes(), _TRIANGLE, offset=_HEADER_BYTES + 4)["corners"].copy()
-
-
-def stl_bytes(corners: np.ndarray) -> bytes:
-    """A binary STL file of triangles with corners [n, 3, 3], each with the normal of its side."""
-    triangles = np.zeros(len(corners), _TRIANGLE)
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    triangles["normal"] = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
-    triangles["corners"] = corners
-    return bytes(_HEADER_BYTES) + len(corners).to_bytes(4, "little") + triangles.tobytes()
-
-
-PACK = "minimal"
-"""ManiSkill's shaders of cameras that observe."""
-_TABLE = "samplerBRDFLUT"
-_DECLARED = re.compile(rf"^layout\(.*\) uniform sampler2D {_TABLE};$", re.MULTILINE)
-_READ = re.compile(rf"texture\({_TABLE}, vec2\([^()]*\)\)\.xy")
-
-
-def without_table(source: str) -> str:
-    """The text of a shader that neither declares nor reads the table; what it said of it is zero."""
-    return _DECLARED.sub("", _READ.sub("vec2(0)", source))
-
-
-def lean_shaders() -> "ShaderConfig | None":
-    """Shaders for cameras in scenes without an environment map; None where the installed ones are not as expected.
-
-    Sets the formats of images, which ManiSkill sets by the pack's name, so ask right before the cameras are made.
-    """
-    from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
-
-    folder = _pipeline_folder()
-    if folder is None:
-        return None
-    stock = PREBUILT_SHADER_CONFIGS[PACK]
-    set_shader_pack(stock)
-    return replace(stock, shader_pack=str(folder))
-
-
-@cache
-def _pipeline_folder() -> Path | None:
-    """The folder of changed shaders, made once for an installed SAPIEN."""
-    import sapien
-
-    from mme_vla.utils import user_cache, write_atomically
-
-    stock = Path(sapien.__file__).parent / "vulkan_shader"
-    shaders = {
-        file.relative_to(stock): file.read_text(encoding="utf-8")
-        for part in (PACK, "common")
-        for file in sorted((stock / part).glob("*"))
-        if file.is_file()
-    }
-    lean = {name: without_table(text) for name, text in shaders.items()}
-    if lean == shaders or any(_TABLE in text for text in lean.values()):
-        logging.getLogger(__name__).debug("these shaders are not known here, and are used as they are: %s", stock)
-        return None
-    key = hashlib.sha256(repr(sorted(lean.items())).encode()).hexdigest()[:16]
-    caches = user_cache("shaders") / key
-    for name, text in lean.items():
-        if not (caches / name).is_file():
-            (caches / name).parent.mkdir(parents=True, exist_ok=True)
-            with write_atomically(caches / name) as draft:
-                draft.write_text(text, encoding="utf-8")
-    return caches / PACK
-
 
 INSTALL_HINT = (
     "Rendering needs a Vulkan driver: an NVIDIA GPU's own, or, without one, Mesa's software driver, 24 or newer. "
@@ -183,7 +70,12 @@ _systems: dict[str, "sapien.render.RenderSystem"] = {}
 
 
 def keep_renderer(device: "sapien.Device") -> None:
-    """Hold the engine that renders on a device until the process ends; asking again does nothing."""
+    """Keep the engine that renders on a device until the process ends; further calls have no effect.
+
+    ManiSkill makes a render system for each scene, and all of them share SAPIEN's engine. Its shaders and pipelines are
+    compiled for the first image, which takes half a second on a CPU, and are freed with the last render system. An
+    additional render system keeps them, and a single Vulkan device, of which NVIDIA's driver supports some thirty.
+    """
     import sapien
 
     name = str(device.name)
@@ -192,10 +84,9 @@ def keep_renderer(device: "sapien.Device") -> None:
 
 
 def renderer_works() -> bool:
-    """Whether each renderer that is kept still takes images; true where none is kept.
+    """Whether each kept renderer still renders; true where none is kept.
 
-    A lost device or memory that ran out leaves a renderer behind that fails from then on, whatever is asked of it: only
-    another process helps.
+    After a lost device or exhausted memory a renderer fails until the process ends.
     """
     try:
         for system in _systems.values():
@@ -216,3 +107,57 @@ def _render_once(device: "sapien.Device") -> None:
     scene.update_render()
     camera.take_picture()
     camera.get_picture("Color")
+
+
+PACK = "minimal"
+"""ManiSkill's shaders of cameras that observe."""
+_TABLE = "samplerBRDFLUT"
+_DECLARED = re.compile(rf"^layout\(.*\) uniform sampler2D {_TABLE};$", re.MULTILINE)
+_READ = re.compile(rf"texture\({_TABLE}, vec2\([^()]*\)\)\.xy")
+
+
+def without_table(source: str) -> str:
+    """The text of a shader without the table; values read from it become zero."""
+    return _DECLARED.sub("", _READ.sub("vec2(0)", source))
+
+
+def lean_shaders() -> "ShaderConfig | None":
+    """Shaders for cameras in scenes without an environment map; None where the installed ones are not as expected.
+
+    Sets the formats of images, which ManiSkill sets by the pack's name, so call this right before the cameras are made.
+    """
+    from mani_skill.render.shaders import PREBUILT_SHADER_CONFIGS, set_shader_pack
+
+    folder = _pipeline_folder()
+    if folder is None:
+        return None
+    stock = PREBUILT_SHADER_CONFIGS[PACK]
+    set_shader_pack(stock)
+    return replace(stock, shader_pack=str(folder))
+
+
+@cache
+def _pipeline_folder() -> Path | None:
+    """The folder of changed shaders, made once for an installed SAPIEN."""
+    import sapien
+
+    from mme_vla.utils import user_cache, write_atomically
+
+    stock = Path(sapien.__file__).parent / "vulkan_shader"
+    shaders = {
+        file.relative_to(stock): file.read_text(encoding="utf-8")
+        for part in (PACK, "common")
+        for file in sorted((stock / part).glob("*"))
+        if file.is_file()
+    }
+    lean = {name: without_table(text) for name, text in shaders.items()}
+    if lean == shaders or any(_TABLE in text for text in lean.values()):
+        logging.getLogger(__name__).debug("unknown shaders are used unchanged: %s", stock)
+        return None
+    key = hashlib.sha256(repr(sorted(lean.items())).encode()).hexdigest()[:16]
+    caches = user_cache("shaders") / key
+    for name, text in lean.items():
+        if not (caches / name).is_file():
+            with write_atomically(caches / name) as draft:
+                draft.write_text(text, encoding="utf-8")
+    return caches / PACK

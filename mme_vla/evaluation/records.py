@@ -1,6 +1,5 @@
 """What is kept of an evaluated episode, and how records come together into runs."""
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
@@ -8,7 +7,7 @@ from types import NoneType
 from typing import Any, NamedTuple, Self
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.utils import parse_json, verified, with_checksum
+from mme_vla.utils import parse_json, to_line, verified
 
 _LARGEST = 2**63  # numbers from there on are damage
 OUTCOMES = ("success", "fail", "timeout", "error")
@@ -124,13 +123,17 @@ class EpisodeRecord:
 
     def to_json(self) -> str:
         """One line, without its end; a checksum in it tells damage."""
-        return json.dumps(with_checksum(asdict(self)), ensure_ascii=False, separators=(",", ":"))
+        return to_line(asdict(self))
 
     @classmethod
     def from_json(cls, line: str | bytes) -> Self:
         """Read a line."""
         # Not only finite numbers: a score that does not exist is kept as NaN in `extra`.
-        values = verified(parse_json(line, "an episode record", finite=False), "an episode record")
+        return cls.from_dict(verified(parse_json(line, "an episode record", finite=False), "an episode record"))
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Self:
+        """Read the object of a line, without its checksum."""
         known = {member.name for member in fields(cls)}
         unknown = sorted(set(values) - known)
         if unknown:

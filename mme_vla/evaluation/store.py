@@ -27,8 +27,8 @@ from mme_vla.utils import (
     draft_of,
     name_place,
     parse_json,
-    read_bytes,
     read_json,
+    read_lines,
     remove_drafts,
     to_json,
     verified,
@@ -140,8 +140,6 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 RECORDS = "episodes.jsonl"
 """Name of a run's file; its shards are called `episodes-<shard>.jsonl`."""
-LOG_LIMIT = 2**30
-"""Most bytes of one file."""
 
 
 class RecordLog:
@@ -201,20 +199,7 @@ class RecordLog:
 
 def read_records(path: Path) -> list[EpisodeRecord]:
     """Read a file of records; a half-written last line is ignored with a warning."""
-    content = read_bytes(path, "episode records", LOG_LIMIT)
-    *lines, last_line = content.split(b"\n")
-    records = []
-    for number, line in enumerate([*lines, last_line], 1):
-        if not line.strip():
-            continue
-        try:
-            records.append(EpisodeRecord.from_json(line))
-        except UserError as error:
-            if number > len(lines):
-                warnings.warn(f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2)
-                continue
-            raise UserError(f"{path}, line {number}, is not an episode record: {error}") from None
-    return records
+    return read_lines(path, EpisodeRecord.from_dict, "episode records", finite=False)
 
 
 def read_folders(paths: Iterable[Path]) -> list[EpisodeRecord]:

@@ -4,15 +4,20 @@ Both forms answer the same three questions: which frames are there (`len`), what
 (`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory cannot tell them apart.
 """
 
+import ast
+import hashlib
+import inspect
+import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
+from mme_vla.types import FrameBatch
 
 
 @dataclass(frozen=True)
@@ -20,10 +25,10 @@ class StorageSpec:
     """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
 
     grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are stored); it divides the
-        backbone's (`Memory.check_grid`).
+        backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
-    scorer: name of the frame scorer whose rows are stored beside the tokens; empty for none.
+    scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`); empty for none.
     """
 
     grid: int
@@ -52,12 +57,40 @@ class StorageSpec:
         return asdict(self)
 
 
-class FrameScorer(Protocol):
-    """Scores raw frames as they pass, for memories that choose by content. One instance per episode."""
+FORMER_KEYS: dict[str, str] = {}
+"""Digest of a scorer's code → the format of its key in caches that were built before keys had a digest."""
+
+
+class FrameScorer:
+    """Scores raw frames as they pass, for memories that choose by content. One instance per episode.
+
+    Subclasses are dataclasses: their fields are the options.
+    """
+
+    @classmethod
+    def digest(cls) -> str:
+        """A hash of the code of the class and its bases, without comments, docstrings and helper functions."""
+        code = []
+        for part in cls.__mro__[: cls.__mro__.index(FrameScorer)]:
+            tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
+            for node in ast.walk(tree):
+                if isinstance(node, ast.FunctionDef | ast.ClassDef) and ast.get_docstring(node) is not None:
+                    node.body = node.body[1:] or [ast.Pass()]
+            code.append(ast.unparse(tree))
+        return hashlib.sha256("\n".join(code).encode()).hexdigest()[:8]
+
+    @property
+    def key(self) -> str:
+        """The name of these scores in a cache: it follows from the class, its code and its options."""
+        options = {f.name: getattr(self, f.name) for f in fields(self) if f.init}  # type: ignore[arg-type]
+        digest = self.digest()
+        if digest in FORMER_KEYS:
+            return FORMER_KEYS[digest].format(**options)
+        return "-".join([type(self).__name__.lower(), *(f"{k}{v}" for k, v in options.items()), digest])
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²] or None."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass
@@ -81,7 +114,7 @@ class History:
     """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video).
 
     `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first `state_width` of
-    them its state; both are there for memories that say `reads_motion`.
+    them its state; both are there for a `ProprioMemory`.
     """
 
     motion: Callable[[np.ndarray], Tensor] | None = None
@@ -231,17 +264,10 @@ class OnlineHistory(History):
         self._scores.frames[self._scored], self._scores.values[self._scored] = frame, values
         self._scored += 1
 
-    def take(
-        self,
-        frames: np.ndarray,
-        encode: Callable[[np.ndarray], Tensor],
-        rendered: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, through `encode`: images [n, H, W, 3] → tokens [n, patches, d_vision]."""
-        offsets = self.to_encode(len(frames) if count is None else count, rendered)
-        places = offsets if rendered is None else np.searchsorted(rendered, offsets)
-        self.append(frames, encode(frames[places]), rendered, count)
+        stored = frames.select(self.to_encode(frames.length, frames.index))
+        self.append(frames.images, encode(stored), frames.index, frames.length)
 
     def _score(self, frames: Sequence[np.ndarray] | np.ndarray, numbers: np.ndarray) -> None:
         """Show the scorer the next frames that have an image; `numbers` says which they are."""
@@ -270,11 +296,11 @@ class OnlineHistory(History):
 
 
 class PromptConditionedHistory(History):
-    """A history whose tokens go through `mark` [n, d_vision] → [n, d_vision] as they are gathered."""
+    """A history whose tokens are changed by `condition` [n, d_vision] → [n, d_vision] as they are gathered."""
 
-    def __init__(self, source: History, mark: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
         super().__init__(source.spec, source.exec_start)
-        self._source, self._mark = source, mark
+        self._source, self._condition = source, condition
         self.motion, self.state_width = source.motion, source.state_width
 
     def __len__(self) -> int:
@@ -285,7 +311,7 @@ class PromptConditionedHistory(History):
         return self._source.scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._mark(self._source.gather(indices))
+        return self._condition(self._source.gather(indices))
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)
@@ -313,23 +339,18 @@ class LazyHistory(OnlineHistory):
         self._waiting: dict[int, np.ndarray] = {}
         self._encoded: dict[int, Tensor] = {}
 
-    def take(
-        self,
-        frames: np.ndarray,
-        encode: Callable[[np.ndarray], Tensor],
-        rendered: np.ndarray | None = None,
-        count: int | None = None,
-    ) -> None:
+    def take(self, frames: FrameBatch, encode: Callable[[np.ndarray], Tensor]) -> None:
         """Add frames in order, without encoding any."""
-        count = len(frames) if count is None else count
-        offsets = self.to_encode(count, rendered)
-        places = offsets if rendered is None else np.searchsorted(rendered, offsets)
+        offsets = self.to_encode(frames.length, frames.index)
         # Copies: a view would keep the whole message alive that a frame came in.
-        new = {int(frame): frames[at].copy() for frame, at in zip(offsets + self._length, places, strict=True)}
-        self._score(frames, np.arange(count) if rendered is None else rendered)
+        new = {
+            int(frame): image.copy()
+            for frame, image in zip(offsets + self._length, frames.select(offsets), strict=True)
+        }
+        self._score(frames.images, frames.index)
         self._waiting |= new
         self._stored_frames += new
-        self._length += count
+        self._length += frames.length
 
     def append(
         self,

@@ -1,7 +1,7 @@
-"""Demonstrations drawn only where somebody looks: at the decisions, and at the frames that memories remember there.
+"""Demonstrations rendered only at their decisions, and at the frames that memories read there.
 
-An episode of planned motions has a handful of decisions, known when it is over. Where everything stood is kept of every
-frame; then the frames that are wanted are put back and drawn. That takes a second where drawing all takes ten.
+An episode of planned motions has a handful of decisions, known when it is over. The poses of every frame are kept; then
+the required frames are restored and rendered. That takes a second where rendering all takes ten.
 """
 
 import json
@@ -14,8 +14,9 @@ import numpy as np
 
 from mme_vla.data.waypoints import Motions
 from mme_vla.embodiment.action_space import Option, read_options
-from mme_vla.embodiment.robomme import benchmark_action, benchmark_state
+from mme_vla.embodiment.robomme import CAMERAS, benchmark_action, benchmark_state
 from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import RenderRequest, capture, read_images
 from mme_vla.subgoal.oracle import online_subgoal
 from mme_vla.utils import parse_json, write_atomically
 
@@ -30,7 +31,7 @@ class Snapshots:
     """Snapshots of one task's scene, in the order they were taken; velocities are not part of them.
 
     A snapshot is read from the simulator's own objects: that takes a tenth of what `get_state_dict` takes, and brings
-    back marks and traces, which belong to no thing of the task, as they were drawn.
+    back marks and traces, which belong to no thing of the task.
     """
 
     def __init__(self, task: "Task") -> None:
@@ -67,7 +68,6 @@ class Snapshots:
 
 
 SUBGOALS = ("simple", "grounded")
-CAMERAS = {"front": "base_camera", "wrist": "hand_camera"}
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Demonstration:
 class Scene:
     """A scene to demonstrate, and the folder of what comes of it.
 
-    cameras: those that are drawn. choices: at which frames, for each memory that will train on it.
+    cameras: those that render. choices: at which frames, for each memory that will train on it.
     carried_out, acts: see `record`.
     """
 
@@ -144,7 +144,7 @@ class Scene:
 
     @property
     def tried(self) -> bool:
-        """Whether there is nothing left to do: it failed, or is there with every frame that is to be drawn."""
+        """Whether there is nothing left to do: it failed, or is there with every required frame."""
         return self.failed.is_file() or (self.path.is_file() and self._complete())
 
     def _complete(self) -> bool:
@@ -176,9 +176,9 @@ def record(
     """Demonstrate an episode; None where the demonstrator does not succeed.
 
     Args:
-        choices: what the memories that will train on it read; these cameras are drawn at the frames of all of them.
-        carried_out: show what is seen while the demonstration's motions are carried out one by one, as a policy's are;
-            None too where that does not succeed. The demonstrator does more between some of its motions.
+        choices: what the memories that will train on it read; these cameras render the frames of all of them.
+        carried_out: render the frames while the demonstration's motions are carried out one by one, as a policy's are;
+            None too where that does not succeed. The demonstrator makes more steps between some of its motions.
         acts: of the robot that will learn from it. Where it chooses among options, the choices stand in place of
             motions, and the options behind the goal; None: motions.
     """
@@ -208,8 +208,10 @@ def record(
         images: dict[str, dict[int, np.ndarray]] = {camera: {} for camera in cameras}
         for frame in sorted(set().union(*required.values())):
             taken.put_back(frame)
-            for camera, image in draw(env, [camera for camera in cameras if frame in required[camera]]):
-                images[camera][frame] = image
+            rendered = [camera for camera in cameras if frame in required[camera]]
+            capture(env, rendered)
+            for camera in rendered:
+                images[camera][frame] = read_images(env, camera, rgb=True)["rgb"]
         goal = (
             env.goals()[0].lower()
             if chooser is None
@@ -257,7 +259,6 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
     """The motions of a demonstration, or its choices, if it succeeds."""
     from mme_vla.envs.recording.frames import choices_of, motions_of
     from mme_vla.envs.recording.recorder import Recorder
-    from mme_vla.envs.render_request import RenderRequest
 
     steps: list[RecordedStep] = []
 
@@ -274,7 +275,6 @@ def _demonstrate(taken: _Taken, choosing: bool) -> Motions | None:
 def _carry_out(taken: _Taken, targets: np.ndarray, chooser: "ActionSpace | None") -> Motions | None:
     """Carry out motions [m, 7], or choices [m, 10], from the start to success; those it took, None if it fails."""
     from mme_vla.envs.interface import RoboMMEEnv
-    from mme_vla.envs.render_request import RenderRequest
 
     env = RoboMMEEnv(taken.env, "waypoint" if chooser is None else "multi_choice")
     env.render_request = RenderRequest(now=())
@@ -296,17 +296,3 @@ def _subgoal_texts(texts: Sequence[Mapping[str, Any]], kind: str) -> list[str]:
     for text in texts:
         result.append(online_subgoal(text, kind) or (result[-1] if result else ""))
     return result
-
-
-def draw(env: "Task", cameras: Sequence[str]) -> list[tuple[str, Any]]:
-    """The current image of each of these cameras."""
-    if not cameras:
-        return []
-    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    taken = []
-    for camera in cameras:
-        sensor = env.scene.sensors[CAMERAS[camera]]
-        sensor.capture()
-        images = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
-        taken.append((camera, np.ascontiguousarray(images["rgb"][0].cpu().numpy())))
-    return taken

@@ -30,7 +30,7 @@ class Replay:
 
 
 def replay(job: Replay) -> EpisodeRecord:
-    """Demonstrate an episode out of sight, and repeat the motions in the environment that policies meet."""
+    """Demonstrate an episode without images, and repeat the motions in the environment of the policies."""
     spec = job.spec
     motions = _planned(spec)
     env = make_env(spec.task, spec.split, spec.episode, ACTIONS, max_steps=job.max_steps, render=False)
@@ -42,7 +42,7 @@ def replay(job: Replay) -> EpisodeRecord:
             status = str(info["status"])
             if status != "ongoing":
                 break
-        steps = env.steps_counted  # type: ignore[union-attr]  # the official environment is not asked for
+        steps = env.steps_counted  # type: ignore[union-attr]  # never the official environment
     finally:
         env.close()
     return EpisodeRecord(
@@ -87,7 +87,7 @@ def run_episodes(
 ) -> list[EpisodeRecord]:
     """Run what `folder` has no record of yet, once for each seed of the policy's noise; all records.
 
-    A policy that reads subgoals is told the simulator's own.
+    A policy that reads subgoals gets the simulator's.
 
     Args:
         split, episodes, shard: as `evaluate` has them.
@@ -112,10 +112,10 @@ def run_episodes(
 
 
 def record_videos(checkpoint: Path, folder: Path, records: Sequence[EpisodeRecord]) -> list[Path]:
-    """Videos of the first success and the first failure of these records, run once more with every frame drawn.
+    """Videos of the first success and the first failure of these records, run once more with every frame rendered.
 
     Args:
-        folder: of the videos; what it has is not drawn again.
+        folder: of the videos; what it has is not rendered again.
     """
     for won in (True, False):
         record = next((record for record in records if record.success is won), None)

@@ -21,10 +21,10 @@ from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
 from mme_vla.training.logging import JsonLines, Loggers, ProgressLine
 from mme_vla.training.loop import Trainer
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import claim_run
 from mme_vla.training.settings import TrainSettings
-from mme_vla.training.validation import Validation
-from mme_vla.utils import read_json_lines, write_json
+from mme_vla.utils import read_lines, write_json
 
 DONE = "trained.json"
 HELD_OUT = 10
@@ -124,22 +124,18 @@ def prepared(
     learnt_file, val_file, stats_file = (
         folder / name for name in ("learnt.safetensors", "held_out.safetensors", STATS_FILE)
     )
+    options = {"oversample": learning["often"], "noise": learning["noise"], "token_noise": learning["blur"]}
     processor = policy.require_processor()
     if val_file.is_file():  # written last
         processor.stats = NormStats.load(stats_file)
-        size = {name: learning[name] for name in ("often", "noise", "blur")}
-        return Decisions.load(learnt_file, **size), Decisions.load(val_file)
+        return Decisions.load(learnt_file, **options), Decisions.load(val_file)
     learnt = [file for number, file in enumerate(files, 1) if number % HELD_OUT] if len(files) > 1 else files
     processor.stats = statistics((Demonstration.load(file, images=False) for file in learnt), policy)
     processor.stats.save(stats_file)
-    samples, val_set = (
-        Decisions.of(policy, map(Demonstration.load, learnt), **learning),
-        Decisions.of(
-            policy,
-            map(Demonstration.load, files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]),
-            elsewhere=learning["elsewhere"],
-        ),
-    )
+    distance = learning["elsewhere"]
+    samples = Decisions.of(policy, map(Demonstration.load, learnt), min_distance=distance, **options)
+    held_out = files[HELD_OUT - 1 :: HELD_OUT] or files[-1:]
+    val_set = Decisions.of(policy, map(Demonstration.load, held_out), min_distance=distance)
     samples.save(learnt_file)
     val_set.save(val_file)
     return samples, val_set
@@ -147,4 +143,4 @@ def prepared(
 
 def learning_curve(folder: Path) -> list[dict[str, float]]:
     """What the run logged, a dictionary a line."""
-    return [line for _, line in read_json_lines(folder / "metrics.jsonl", "the log of a run")]
+    return read_lines(folder / "metrics.jsonl", dict, "the log of a run")

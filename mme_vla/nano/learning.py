@@ -1,4 +1,4 @@
-"""Training on demonstrations of planned motions: every decision is a sample, and all its tokens are made beforehand."""
+"""Training on demonstrations of planned motions: every decision is a sample, and its tokens are computed beforehand."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.backbone.base import stack_draws
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
+from mme_vla.processing.base import motion_rows
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
-from mme_vla.types import Batch, HistoryTokens
+from mme_vla.types import Batch, HistoryTokens, stack_noise
 from mme_vla.utils import write_atomically
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
@@ -67,45 +67,46 @@ class Decisions(Dataset[int]):
 
     batch: every decision, or every so many where the robot executes more motions of a chunk than one; the tokens of
         the current images (`Batch.view_tokens`) stand in place of the images.
-    far: [n] bool; decisions on a motion to another place than the last one's. They are what is hard, and few: each is
-        an item `often` times.
+    distant: [n] bool; decisions on a motion to another place than the last one's, which are hard and few: each is
+        an item `oversample` times.
     noise: spread of what is added whenever a decision is learned, so that few demonstrations are learned by heart less:
         to each number of a token and, `JOINT_NOISE` of it, to each joint (radians).
-    blur: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
+    token_noise: the same for tokens alone, in standard deviations of what each of their numbers is over all decisions.
     """
 
-    def __init__(self, batch: Batch, distant: Tensor, often: int = 1, noise: float = 0.0, blur: float = 0.0) -> None:
-        self.batch, self.distant, self.noise, self.blur = batch, distant, noise, blur
-        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, often, 1))
+    def __init__(
+        self, batch: Batch, distant: Tensor, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0
+    ) -> None:
+        self.batch, self.distant, self.noise, self.token_noise = batch, distant, noise, token_noise
+        self._rows = torch.arange(len(batch.prompt)).repeat_interleave(torch.where(distant, oversample, 1))
 
     @classmethod
     def of(
         cls,
         policy: MMEPolicy,
         demonstrations: Iterable[Demonstration],
-        often: int = 1,
-        elsewhere: float = MIN_DISTANCE,
+        oversample: int = 1,
+        min_distance: float = MIN_DISTANCE,
         noise: float = 0.0,
-        blur: float = 0.0,
+        token_noise: float = 0.0,
     ) -> "Decisions":
         """Make all tokens, of one demonstration after the other: their images together are gigabytes.
 
         Args:
             policy: with the vision weights it trains with, and statistics.
-            often: how often a decision to go elsewhere is learned for every other. elsewhere: metres from where on it
-                is elsewhere. noise, blur: see the class.
+            min_distance: metres from which on a motion leads to another place. The others: see the class.
         """
         items: list[dict[str, Any]] = []
         distant: list[np.ndarray] = []
         for demonstration in demonstrations:
             items += _items(policy, demonstration)
-            distant.append(_distant(demonstration.motions.targets, elsewhere)[:: policy.embodiment.action.execute])
+            distant.append(_distant(demonstration.motions.targets, min_distance)[:: policy.embodiment.action.execute])
         if not items:
             raise UserError("The demonstrations hold no decision to learn from.")
-        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), often, noise, blur)
+        return cls(_stack(items), torch.from_numpy(np.concatenate(distant)), oversample, noise, token_noise)
 
     @classmethod
-    def load(cls, path: Path, often: int = 1, noise: float = 0.0, blur: float = 0.0) -> "Decisions":
+    def load(cls, path: Path, oversample: int = 1, noise: float = 0.0, token_noise: float = 0.0) -> "Decisions":
         """Read what `save` wrote."""
         from safetensors.torch import load_file
 
@@ -113,7 +114,8 @@ class Decisions(Dataset[int]):
         distant = tensors.pop("far")
         past = {name.removeprefix(_PAST): value for name, value in tensors.items() if name.startswith(_PAST)}
         now: dict[str, Any] = {name: value for name, value in tensors.items() if not name.startswith(_PAST)}
-        return cls(Batch(**now, history=HistoryTokens(**past) if past else None), distant, often, noise, blur)
+        batch = Batch(**now, history=HistoryTokens(**past) if past else None)
+        return cls(batch, distant, oversample, noise, token_noise)
 
     def save(self, path: Path) -> None:
         """Write one file of tensors, whole or not at all."""
@@ -137,7 +139,7 @@ class Decisions(Dataset[int]):
         """The batch of these decisions."""
         indices = torch.as_tensor(list(rows))
         batch = self.batch.rows(indices)
-        return self._noisy(batch, rows) if self.noise or self.blur else batch
+        return self._noisy(batch, rows) if self.noise or self.token_noise else batch
 
     def _noisy(self, batch: Batch, rows: Sequence[int]) -> Batch:
         generator = torch.Generator().manual_seed(hash(tuple(rows)))  # of numbers alone, so the same everywhere
@@ -146,7 +148,7 @@ class Decisions(Dataset[int]):
             return (values + size * torch.randn(values.shape, generator=generator)).to(values.dtype)
 
         assert batch.state is not None and batch.view_tokens is not None
-        size = {name: self.noise + self.blur * std for name, std in self._token_std.items()}
+        size = {name: self.noise + self.token_noise * std for name, std in self._token_std.items()}
         joints = perturbed(
             batch.state[:, :-1], JOINT_NOISE * self.noise
         )  # the last number is the gripper's, centimetres
@@ -165,10 +167,10 @@ class Decisions(Dataset[int]):
         return {name: t.float().flatten(0, -2).std(0) for name, t in features.items() if t is not None}
 
 
-def _distant(targets: np.ndarray, elsewhere: float) -> np.ndarray:
+def _distant(targets: np.ndarray, min_distance: float) -> np.ndarray:
     """Which of an episode's motions [m, 7] end that far above the table from the one before; the first does. [m]."""
     steps = np.linalg.norm(np.diff(targets[:, :2], axis=0), axis=1)
-    return np.concatenate([[True], steps > elsewhere])
+    return np.concatenate([[True], steps > min_distance])
 
 
 @torch.no_grad()
@@ -177,7 +179,7 @@ def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tens
     rows = val_set.distant.nonzero()[:, 0].tolist()
     batch, generator = val_set.collate(rows), torch.Generator().manual_seed(seed)
     assert batch.actions is not None and batch.state is not None
-    chunk = policy.sample_actions(batch, stack_draws([policy.sample_draws(generator) for _ in rows])).float()
+    chunk = policy.sample_actions(batch, stack_noise([policy.sampling_noise(generator) for _ in rows])).float()
     processor = policy.require_processor()
     predicted = processor.absolute_actions(chunk, batch.state)
     return (predicted - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
@@ -212,7 +214,7 @@ def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, An
     items = []
     for place, frame in enumerate(decisions):
         state = demonstration.states[frame]
-        chunk, recorded = demonstration.motions.chunk(frame, processor.horizon)
+        chunk, recorded = demonstration.motions.chunk(frame, processor.embodiment.action.horizon)
         prompt, prompt_mask = processor.prompt(demonstration.goal, subgoal=subgoals[place], state=state)
         item = {
             "view_tokens": view_tokens[place], "prompt": prompt, "prompt_mask": prompt_mask,
@@ -220,7 +222,7 @@ def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, An
             "action_mask": torch.from_numpy(recorded),
         }  # fmt: skip
         if history is not None:
-            item["history"] = policy.require_memory().recall(history, frame)
+            item["history"] = policy.require_memory().gather_selection(history, frame)
         items.append(item)
     return items
 
@@ -237,18 +239,21 @@ def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
         policy.memory.storage, demonstration.length, dict(zip(taken, tokens, strict=True)), demonstration.exec_start,
         _scores(policy.memory, taken),
     )  # fmt: skip
-    if policy.memory.reads_motion:  # an action is a motion of many frames here, so the states alone tell what was done
+    if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
         nothing = np.zeros((demonstration.length, policy.embodiment.action.width), np.float32)
-        motion = policy.require_processor().motion(
-            demonstration.states[: demonstration.length], nothing, np.zeros(demonstration.length, bool)
+        motion = motion_rows(
+            policy.require_processor(),
+            demonstration.states[: demonstration.length],
+            nothing,
+            np.zeros(demonstration.length, bool),
         )
         history.motion = motion.__getitem__
     return history
 
 
 def _scores(memory: Memory, images: Mapping[int, np.ndarray]) -> FrameScores:
-    """What the memory's scorer says of these frames, as it says it while an episode runs."""
-    scorer = memory.make_scorer()
+    """The scores of these frames by the memory's scorer, as in an episode."""
+    scorer = make_scorer(memory)
     scores = {} if scorer is None else {frame: scorer(frame, images[frame]) for frame in sorted(images)}
     rows = {frame: values for frame, values in scores.items() if values is not None}
     if not rows:
@@ -266,7 +271,6 @@ def _subgoals(policy: MMEPolicy, demonstration: Demonstration) -> Sequence[str |
 
 
 def _stack(items: Sequence[dict[str, Any]]) -> Batch:
-
     def stack(name: str) -> Tensor:
         return torch.stack([item[name] for item in items])
 

@@ -24,6 +24,7 @@ from mme_vla.nano.scenes import LABEL_SIDE
 from mme_vla.processing.images import to_unit_range
 from mme_vla.processing.tokenizer import SAMPLE, Tokenizer
 from mme_vla.utils import write_atomically
+from mme_vla.weights.torch_files import load_torch_file
 
 logger = logging.getLogger(__name__)
 SHIFT = 8  # pixels that an image is moved by at most
@@ -135,7 +136,7 @@ def pretrain(tower: ConvTower, grid: int, files: Sequence[Path], folder: Path, s
     optimizer = torch.optim.AdamW(tower.parameters(), lr=settings.lr, weight_decay=0.01)
     start = 0
     if draft.is_file():
-        state = torch.load(draft, weights_only=True)
+        state = load_torch_file(draft, "the draft of a vision tower")
         tower.load_state_dict(state["tower"])
         optimizer.load_state_dict(state["optimizer"])
         start = state["step"]

@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mme_vla.backbone.nano_vision import CLASSES
+from mme_vla.embodiment.robomme import CAMERAS
 from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import capture, read_images
 from mme_vla.processing.images import resize_with_pad_uint8
 from mme_vla.utils import write_atomically
 
@@ -47,9 +49,11 @@ def draw_scene(task: str, seed: int, difficulty: str, count: int, size: int) -> 
         images, labels = [], []
         for _ in range(count):
             _arrange(env, arm, rng)
-            for image, segments in _take(env):
-                images.append(resize_with_pad_uint8(image, size))
-                labels.append(_label(image, segments, owners))
+            capture(env, CAMERAS)
+            for camera in CAMERAS:
+                taken = read_images(env, camera, rgb=True, segmentation=True)
+                images.append(resize_with_pad_uint8(taken["rgb"], size))
+                labels.append(_label(taken["rgb"], taken["segmentation"][..., 0], owners))
         return np.stack(images), np.stack(labels)
     finally:
         env.close()
@@ -60,14 +64,13 @@ def record_scenes(folder: Path, task: str, seed: int, difficulty: str, count: in
     path = folder / f"{task}-{difficulty}-{seed}.npz"
     if not path.is_file():
         images, labels = draw_scene(task, seed, difficulty, count, size)
-        folder.mkdir(parents=True, exist_ok=True)
         with write_atomically(path) as draft, draft.open("wb") as file:
             np.savez_compressed(file, pictures=images, labels=labels)
     return path
 
 
 def _owners(env: "Task") -> dict[int, str]:
-    """Segmentation id → what the object is called, of everything that is not part of the room."""
+    """Segmentation id → what the object is called, of everything that is not background."""
     owners: dict[int, str] = {}
     for thing in env.things:
         for number in thing.segmentation_ids:
@@ -116,18 +119,6 @@ def _yaw_pose(yaw: float) -> Any:
 
 def _home_qpos(env: "Task") -> np.ndarray:
     return env.reset_action if env.stick else np.append(env.reset_action[:7], [0.04, 0.04])
-
-
-def _take(env: "Task") -> list[tuple[np.ndarray, np.ndarray]]:
-    """Image [H, W, 3] and segmentation [H, W] of both cameras."""
-    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    taken = []
-    for camera in ("base_camera", "hand_camera"):
-        sensor = env.scene.sensors[camera]
-        sensor.capture()
-        images = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=True)
-        taken.append((images["rgb"][0].cpu().numpy(), images["segmentation"][0, ..., 0].cpu().numpy()))
-    return taken
 
 
 def _label(image: np.ndarray, segments: np.ndarray, owners: dict[int, str]) -> np.ndarray:

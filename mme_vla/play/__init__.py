@@ -1,6 +1,6 @@
-"""The tasks as questions with a few answers: clips are shown, the next action is chosen, an oracle planner does it.
+"""The tasks as multiple choice: clips are shown, the next action is chosen, an oracle planner carries it out.
 
-Names are imported when they are used, so that `python -m mme_vla.play` can be stopped from its first moment on.
+Names are imported when they are used, so that `python -m mme_vla.play` can be interrupted at once.
 """
 
 from importlib import import_module

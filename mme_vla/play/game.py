@@ -19,7 +19,7 @@ from mme_vla.evaluation.records import OUTCOMES, EpisodeRecord, Seconds
 
 ONGOING = "ongoing"
 UNSEEN = np.zeros((SIDE, SIDE, 3), np.uint8)
-"""Stands for the frames of an environment that does not render."""
+"""Frame of an environment that does not render."""
 MAX_CHOICES = 60  # the longest episode of the benchmark needs fewer than 30
 
 
@@ -36,7 +36,7 @@ class EpisodeId:
 
 @dataclass(frozen=True)
 class Reveal:
-    """The frames that came to light at once.
+    """Frames that are shown together.
 
     title: what they show. frames: [256, 256, 3] uint8 each, maybe none. start: place of the first in the episode.
     """
@@ -52,7 +52,7 @@ class Decision:
 
     choice: letter. action: its text. point: pixel [y, x] of the front image, None where it needs none.
     frames: [first, stop) of what it revealed, in frames of the episode. status: after it.
-    seconds: from the moment the frames were there to the choice. note: whatever the player adds.
+    seconds: from the arrival of the frames to the choice. note: the player's addition.
     """
 
     choice: str
@@ -70,7 +70,7 @@ class ChoiceSession:
     Args:
         env: with `reset` and `step` of `mme_vla.envs` (or the official package's), in that action space.
         episode: which one it is.
-        images: whether the player looks at them; without, the environment need not render, and frames are black.
+        images: whether the player reads them; without, the environment need not render, and frames are black.
         max_choices: choices after which the episode counts as timed out; a choice may move nothing at all, so the
             environment's own limit on steps might never be reached.
         clock: seconds that only grow.

@@ -25,7 +25,7 @@ class Player:
 
     Attributes:
         model: what its records are filed under.
-        looks: whether it needs images; for one that does not, nothing is rendered, which is much faster.
+        needs_images: whether it reads images; for one that does not, nothing is rendered, which is much faster.
     """
 
     model = "player"

@@ -19,7 +19,7 @@ def make_session(episode: EpisodeId, env: str, max_steps: int, max_choices: int,
 
     Args:
         episode: which one. env: `mme_vla` or `official`. max_steps, max_choices: when it has timed out.
-        images: whether the player looks at them; the official environment renders in any case.
+        images: whether the player reads them; the official environment renders in any case.
     """
     from mme_vla.envs import make_env
 
@@ -49,7 +49,7 @@ class PlayRun:
 
     Args:
         folder: of `episodes.jsonl` and `run.json`.
-        wanted: episodes to play, in order. identity: whose.
+        episodes: to play, in order. identity: of the records.
         make: makes the session of an episode.
         retry_errors: play episodes again that ended in an error.
     """
@@ -133,6 +133,6 @@ class PlayRun:
 
 
 def choose_episodes(tasks: str | Sequence[str], episodes: Any, split: str) -> list[EpisodeId]:
-    """The episodes that the command line names, task by task, by the grammar of all commands (`mme_vla.envs.episodes`)."""
+    """The episodes that the command line names, by the grammar of `mme_vla.envs.episodes`."""
     specs = choose_specs(tasks, episodes, split)
     return [EpisodeId(spec.task, spec.split, spec.episode, spec.seed, spec.difficulty) for spec in specs]

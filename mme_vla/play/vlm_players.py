@@ -53,7 +53,7 @@ def full_question(goal: str, options: Sequence[Option], clips: Sequence[tuple[st
     Args:
         goal: the task in words.
         clips: what each clip that was shown is, in order, and whether it has frames.
-        complaint: why the last answer to the same question could not be used; empty the first time.
+        complaint: why the last reply to the same question could not be used; empty the first time.
     """
     lines = [f"The task: {goal}"]
     lines += [f"{title}: {VIDEO if frames else 'nothing moved.'}" for title, frames in clips]
@@ -81,7 +81,7 @@ def following(decision: Decision, options: Sequence[Option], changed: bool) -> s
 
 
 def retry_message(reason: str) -> str:
-    """What is said after an answer that cannot be used."""
+    """The message after a reply that cannot be used."""
     return (
         f"Your last answer could not be used: {reason}. Answer again, ending with one JSON object "
         '{"choice": "<letter>", "point": [row, column] or null}.'
@@ -95,7 +95,7 @@ def parse_choice(reply: str, options: Sequence[Option]) -> dict[str, Any]:
         {"choice": letter, "point": [y, x] in pixels or None}.
 
     Raises:
-        MalformedAnswer: no object, an unknown option, or a point that is missing or none.
+        MalformedReply: no object, an unknown option, or a point that is missing or none.
     """
     if not reply.strip():
         raise MalformedReply("the answer is empty")
@@ -136,16 +136,16 @@ def _last_object(reply: str) -> dict[str, Any]:
 
 
 class ModelPlayer(Player):
-    """A model that is asked for each choice, and asked again where its answer cannot be used.
+    """A model that makes each choice, with retries where its reply cannot be used.
 
     Args:
         model: its name.
-        tries: answers that may be unusable in a row; then the episode counts as failed.
+        tries: replies that may be unusable in a row; then the episode counts as failed.
     """
 
     def __init__(self, model: str, tries: int = 3) -> None:
         if isinstance(tries, bool) or not isinstance(tries, int) or tries < 1:
-            raise UserError(f"player.tries={tries!r} must be a positive number of answers.")
+            raise UserError(f"player.tries={tries!r} must be a positive number of replies.")
         self.model, self.tries = model, tries
         self.usage = Usage()
         self._before = Usage()
@@ -156,33 +156,33 @@ class ModelPlayer(Player):
 
     def choose(self, session: ChoiceSession) -> tuple[dict[str, Any], dict[str, Any]]:
         """See `Player`."""
-        answers: list[str] = []
+        replies: list[str] = []
         complaint = ""
         for _ in range(self.tries):
             reply = self.ask(session, complaint)
-            answers.append(reply)
+            replies.append(reply)
             try:
                 action = parse_choice(reply, session.options)
             except MalformedReply as error:
                 self.usage.problems["malformed" if reply.strip() else "empty"] += 1
                 complaint = retry_message(str(error))
             else:
-                return action, {"answers": answers}
-        raise NoChoiceError("fail", f"{self.tries} answers in a row could not be used; the last one: {answers[-1]!r}")
+                return action, {"answers": replies}
+        raise NoChoiceError("fail", f"{self.tries} replies in a row could not be used; the last one: {replies[-1]!r}")
 
     def ask(self, session: ChoiceSession, complaint: str) -> str:
-        """The model's answer to the present question, word for word.
+        """The model's reply to the present question, verbatim.
 
         Args:
-            complaint: why its last answer to the same question could not be used; empty the first time.
+            complaint: why its last reply to the same question could not be used; empty the first time.
 
         Raises:
-            NoChoiceError: there is no answer to be had.
+            NoChoiceError: the model sent no reply.
         """
         raise NotImplementedError
 
     def notes(self) -> dict[str, Any]:
-        """Calls, tokens, cost and unusable answers of the episode."""
+        """Calls, tokens, cost and unusable replies of the episode."""
         now, before = self.usage, self._before
         used = {name: getattr(now, name) - getattr(before, name) for name in vars(now)}
         used |= {name: round(used[name], 6) for name in ("seconds", "cost")}
@@ -195,8 +195,8 @@ class QwenPlayer(ModelPlayer):
 
     Args:
         model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
-        tries: answers that may be unusable in a row. max_new_tokens: longest answer.
-        clip_frames: most frames of a clip that the model looks at.
+        tries: replies that may be unusable in a row. max_new_tokens: longest reply.
+        clip_frames: most frames of a clip that the model reads.
         device, dtype: where and how it runs. vlm: a model that is loaded already, instead of all these.
     """
 
@@ -216,7 +216,7 @@ class QwenPlayer(ModelPlayer):
             raise UserError(f"player.clip_frames={clip_frames} must be even and at least 2: frames are read in pairs.")
         self.max_new_tokens, self.clip_frames = max_new_tokens, clip_frames
         self.vlm = vlm or VLM.load(model, adapter, device=device, dtype=dtype, batch_size=1)
-        # The processor would shrink the frames of a clip that has more of them than the subgoal predictors look at.
+        # The processor would shrink the frames of a clip that has more of them than the subgoal predictors read.
         area = TOKEN_SIDE**2
         most = clip_frames * VIDEO_TOKENS * area
         self.vlm.processor.video_processor.size = {"shortest_edge": 4 * area, "longest_edge": most}
@@ -253,16 +253,16 @@ class GeminiPlayer(ModelPlayer):
     """One conversation an episode: each turn brings the frames since the last decision.
 
     Args:
-        tries: answers that may be unusable in a row.
+        tries: replies that may be unusable in a row.
         client: an object with google-genai's `client.models.generate_content`; None makes one.
         settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
 
-    speaks = "gemini"
+    provider = "gemini"
 
     def __init__(self, tries: int = 3, client: Any = None, **settings: Any) -> None:
         super().__init__("", tries)
-        self.api = make_api(self.speaks, settings, "player", self.usage, client)
+        self.api = make_api(self.provider, settings, "player", self.usage, client)
         self.model = self.api.settings.model
         self._conversation: list[tuple[str, list[Any]]] = []
 
@@ -278,7 +278,7 @@ class GeminiPlayer(ModelPlayer):
             reply = self.api.ask(SYSTEM, [*self._conversation, message])
         except ApiFailure as failure:
             self.usage.problems[failure.problem] += 1
-            # A refusal is the model's answer, and counts; a network that fails is nobody's (`retry_errors` repeats it).
+            # A refusal counts as a failure of the model; an episode with a network error is repeated by `retry_errors`.
             outcome = "error" if failure.problem == "failed" else "fail"
             raise NoChoiceError(outcome, f"no answer ({failure.problem}): {failure}") from None
         self._conversation += [message, ("model", [reply.text])]
@@ -296,13 +296,13 @@ class GeminiPlayer(ModelPlayer):
 
 @PLAYERS.register("openai")
 class OpenAIPlayer(GeminiPlayer):
-    """The same conversation with any endpoint that speaks OpenAI's chat completions; videos are shown as images.
+    """The same conversation with any endpoint of OpenAI's chat completions; videos are shown as images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
-    settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.
+    settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.
     """
 
-    speaks = "openai"
+    provider = "openai"
 
 
 def _clip(frames: Any) -> list[np.ndarray]:

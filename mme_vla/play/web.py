@@ -37,7 +37,7 @@ def make_app(desk: Desk, local: bool = True) -> Any:
     """The ASGI application; the desk begins when it starts.
 
     Args:
-        local: answer only requests that name this machine as their host, so that no foreign page a browser has open can
+        local: accept only requests that name this machine as their host, so that no foreign page a browser has open can
             reach the desk under a name of its own.
     """
     require_page()
@@ -68,7 +68,7 @@ def make_app(desk: Desk, local: bool = True) -> Any:
         return Response(packed, media_type="application/octet-stream")
 
     async def body(request: Request) -> Any:
-        # A foreign page cannot send this kind without being asked first, and it is not answered then.
+        # A foreign page cannot send this type without a preflight request, which fails.
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             raise UserError("Send JSON, as application/json.")
         content = bytearray()
@@ -194,7 +194,7 @@ def serve(desk: Desk, host: str, port: int) -> None:
     with listen(host, port) as bound:
         display_host = f"[{host}]" if ":" in host else host
         if not is_local(host):
-            log.warning("host=%s: whoever reaches this port can play", host)
+            log.warning("host=%s: every client that reaches this port can play", host)
         desk.address = f"http://{display_host}:{bound.getsockname()[1]}"
         log.info("open %s in a browser; Ctrl-C ends", desk.address)
         with suppress(KeyboardInterrupt):  # uvicorn raises it again when all is closed

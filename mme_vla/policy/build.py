@@ -8,11 +8,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.backbone.config import shapes_only
-from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.naming import words
+from mme_vla.config.plugins import import_plugins, plugins_of
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, check_grid, past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
@@ -28,7 +28,7 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
         d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
     """
     memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
-    memory.check_grid(grid)
+    check_grid(memory, grid)
     return memory
 
 
@@ -53,7 +53,7 @@ def check_integrated(
 
 def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
     """Make sure that a memory that gives past views has a backbone whose vision tower looks at them."""
-    if memory.past_view_spec is not None and "past" not in supports:
+    if past_view_spec(memory) is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
             f"and the tower of the backbone {config['backbone']['name']!r} sees one image at a time. Take another "
@@ -109,6 +109,8 @@ def build_policy(
 
     >>> policy = build_policy("framesamp_modul", memory={"budget": 256})  # doctest: +SKIP
     """
+    from mme_vla.config.composition import compose  # Hydra; a policy built in Python does without
+
     extra = [] if config_dir is None else [Path(config_dir)]
     config = compose("policy", policy_words(name, overrides), extra_dirs=extra)
     return build_from_config(config, device=device, seed=seed)
@@ -131,7 +133,7 @@ def build_from_config(
     Args:
         fresh_backbone: False where a checkpoint is loaded next: π0.5's own weights are then not drawn.
     """
-    import_plugins(config)
+    import_plugins(plugins_of(config, "the configuration"))
     container = OmegaConf.to_container(config, resolve=True)
     assert isinstance(container, dict)
     sections = {key: container[key] for key in SECTIONS if key in container}

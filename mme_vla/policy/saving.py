@@ -1,4 +1,4 @@
-"""What a policy needs to write itself to a folder or the hub, and to come back."""
+"""Save a policy to a folder or the hub, and load it."""
 
 import inspect
 import json
@@ -6,10 +6,10 @@ import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from mme_vla.backbone.config import shapes_only
 from mme_vla.config.naming import DECISIVE, digest, flat, of_policy
@@ -25,7 +25,7 @@ from mme_vla.registry import POLICIES
 from mme_vla.utils import check_sums, inside, read_json, write_sums
 
 if TYPE_CHECKING:
-    from mme_vla.processing.base import PolicyProcessor
+    from mme_vla.policy.base import Policy
 
 
 def composition_digest(config: Mapping[str, Any]) -> str:
@@ -174,173 +174,153 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
-class Saved(nn.Module):
-    """A module that is built from a configuration and keeps a processor beside it."""
+def save_policy(
+    policy: "Policy", folder: Path, *, dtype: str = "float32", card: Mapping[str, Any] | None = None
+) -> None:
+    """Write a policy to a folder; see `Policy.save_pretrained`."""
+    kind = dtype_of(dtype)
+    if card is not None:
+        policy.config["card"] = {**policy.config.get("card", {}), **card}
+    save_tensors(policy.state_dict(), folder, dtype=kind)
+    settings = save_settings(policy, folder)
+    write_sums(folder, [*settings, *list_weight_files(folder)])  # without the card, which people edit
 
-    config: dict[str, Any]
-    processor: "PolicyProcessor | None"
-    acts_in_bfloat16: ClassVar[bool] = False
-    """Whether `dtype="auto"` rounds its weights to bfloat16 on a GPU."""
 
-    @classmethod
-    def from_config(
-        cls, config: Mapping[str, Any], processor: "PolicyProcessor | None" = None, *, fresh_backbone: bool = True
-    ) -> Self:
-        """Build from plain sections."""
-        raise NotImplementedError
+def save_settings(policy: "Policy", folder: Path) -> list[str]:
+    """Write all files of a checkpoint but the weights; return the names of those that get checksums."""
+    (folder / CONFIG).write_text(json.dumps(policy.config, indent=2, ensure_ascii=False) + "\n")
+    (folder / CARD_FILE).write_text(model_card(policy, policy.config))
+    return [CONFIG, *(policy.processor.save(folder) if policy.processor is not None else [])]
 
-    def save_pretrained(
-        self, folder: str | Path, *, dtype: str = "float32", card: Mapping[str, Any] | None = None
-    ) -> None:
-        """Write weights, configuration, normalisation statistics and tokenizer; `from_pretrained` needs no more.
 
-        `SHA256SUMS` beside them holds a checksum of each, which loading compares.
+def push_to_hub(
+    policy: "Policy",
+    repo_id: str,
+    *,
+    dtype: str = "float32",
+    card: Mapping[str, Any] | None = None,
+    **options: Any,
+) -> str:
+    """Store a policy on the hub; see `Policy.push_to_hub`."""
+    with tempfile.TemporaryDirectory() as folder:
+        save_policy(policy, Path(folder), dtype=dtype, card=card)
+        return push_folder(Path(folder), repo_id, **options)
 
-        Args:
-            dtype: what the weights are stored in: `float32`, or `bfloat16` at half the size and eight bits of mantissa.
-            card: facts for the model card, kept in the configuration: `data` (words), `recipe`, `results` (tables),
-                `license`, `base_model`, `datasets` (ids on the hub).
-        """
-        kind, folder = dtype_of(dtype), Path(folder)
-        if card is not None:
-            self.config["card"] = {**self.config.get("card", {}), **card}
-        save_tensors(self.state_dict(), folder, dtype=kind)
-        about = self.save_about(folder)
-        write_sums(folder, [*about, *list_weight_files(folder)])  # not of the card, which people edit
 
-    def save_about(self, folder: Path) -> list[str]:
-        """Write all that `save_pretrained` writes beside the weights; return the names of what has checksums."""
-        (folder / CONFIG).write_text(json.dumps(self.config, indent=2, ensure_ascii=False) + "\n")
-        (folder / CARD_FILE).write_text(model_card(self, self.config))
-        return [CONFIG, *(self.processor.save(folder) if self.processor is not None else [])]
+def load_policy[P: "Policy"](
+    requested: type[P],
+    source: str | Path,
+    *,
+    device: str | torch.device = "cpu",
+    dtype: str = "float32",
+    revision: str | None = None,
+    token: str | None = None,
+    trust_plugins: bool = False,
+    tokenizer: str | Path | None = None,
+    options: Mapping[str, Any] | None = None,
+) -> P:
+    """Load a policy of the class `requested`, or of a subclass; see `Policy.from_pretrained`.
 
-    @classmethod
-    def from_pretrained(
-        cls,
-        source: str | Path,
-        *,
-        device: str | torch.device = "cpu",
-        dtype: str = "float32",
-        revision: str | None = None,
-        token: str | None = None,
-        trust_plugins: bool = False,
-        tokenizer: str | Path | None = None,
-        **policy: Any,
-    ) -> Self:
-        """Load what `save_pretrained` wrote; of a training checkpoint, the EMA weights. No weight is drawn first.
+    Args:
+        options: overrides of the section `policy`.
+    """
+    from mme_vla.processing.base import load_processor
 
-        `Policy.from_pretrained` loads every kind of policy, a subclass its own.
+    target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
+    if not (folder / CONFIG).is_file():
+        raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
+    config = read_config(folder)
+    if "backbone" not in config:
+        raise UserError(
+            f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
+            "are read by mme_vla.weights.load_weights() and converted by mme-vla weights."
+        )
+    import_trusted(config, str(source), trust_plugins)
+    policy_type = policy_class_for(requested, config, str(source))
+    on_gpu = torch.device(device).type == "cuda"
+    rounds = getattr(policy_type, "acts_in_bfloat16", False)  # a network that is made for it
+    kind = target_dtype or (torch.bfloat16 if on_gpu and rounds else torch.float32)
+    settings = {"compute_dtype": "bfloat16"} if kind == torch.bfloat16 else {}
+    policy = build_saved(policy_type, config, str(folder / CONFIG), {**settings, **(options or {})})
+    assign_tensors(policy, load_tensors(folder), str(source), kind)
+    recompute_buffers(policy)
+    policy.processor = load_processor(folder, tokenizer)
+    check_processor(policy, str(source))
+    if kind == torch.bfloat16:
+        policy.requires_grad_(False)
+    return policy.to(device).eval()
 
-        Args:
-            source: a folder on disk (of a checkpoint, or of a run: then its newest; `…/latest`: of the newest run), or
-                `owner/name` of a hub repository.
-            device: where to put the weights.
-            dtype: what the weights become. `bfloat16` halves the memory, for inference: compute is then bfloat16 too,
-                and no weight asks for a gradient. `auto`: bfloat16 on a GPU if the policy is made for it, else float32.
-            revision: branch, tag or commit of the repository. token: for private repositories.
-            trust_plugins: import the modules that the checkpoint names under `plugins`: code of whoever wrote it.
-            tokenizer: in place of the one the checkpoint names, which is fetched from the hub only if it is π0.5's own.
-            policy: overrides of the `policy` section, such as `compute_dtype="bfloat16"`.
-        """
-        from mme_vla.processing.base import load_processor
 
-        target_dtype, folder = None if dtype == "auto" else dtype_of(dtype), local_folder(source, revision, token)
-        if not (folder / CONFIG).is_file():
-            raise UserError(f"No policy at {source}: expected a folder with {CONFIG}, as save_pretrained() writes.")
-        config = read_config(folder)
-        if "backbone" not in config:
+def build_saved[P: "Policy"](
+    kind: type[P], config: dict[str, Any], source: str, options: Mapping[str, Any] | None = None
+) -> P:
+    """Build what the configuration of a checkpoint describes, on meta, adapters included.
+
+    Args:
+        config: plain sections. source: where they are from, for messages. options: overrides of the section `policy`.
+    """
+    section = config.get("policy", {})
+    if not isinstance(section, dict):
+        raise UserError(f"{source}: policy={brief(section)} must be a section.")
+    config = {**config, "policy": {**section, **(options or {})}}
+    try:
+        with shapes_only():
+            built = kind.from_config(config)
+            if config.get("adapters"):
+                add_adapters(built, **config["adapters"])
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from error
+    except Exception as error:
+        if config.get("plugins"):
+            raise  # it may be in the user's own code
+        reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
+        raise UserError(
+            f"{source} describes no policy that can be built ({reason}). It is damaged, or of a newer version."
+        ) from error
+    return built
+
+
+def recompute_buffers(policy: "Policy") -> None:
+    """Compute the tensors of a policy built on meta that constructors make and no file holds.
+
+    These are buffers registered with `persistent=False`, and tensors kept as plain attributes. A module with
+    `reset_buffers()` computes its own; for the others the policy is built a second time.
+    """
+    for module in policy.modules():
+        if callable(reset := getattr(module, "reset_buffers", None)):
+            reset()
+    unsaved = [
+        (path, name)
+        for path, module in policy.named_modules()
+        for name, value in [*module.named_buffers(recurse=False), *vars(module).items()]
+        if isinstance(value, Tensor) and value.is_meta
+    ]
+    if not unsaved:
+        return
+    fresh = any(path.startswith("backbone") for path, _ in unsaved)
+    with torch.random.fork_rng(devices=[]):
+        real = type(policy).from_config(policy.config, fresh_backbone=fresh)
+    for path, name in unsaved:
+        value = getattr(real.get_submodule(path), name)
+        setattr(policy.get_submodule(path), name, value)
+
+
+def check_processor(policy: "Policy", source: str) -> None:
+    """Make sure that a policy and its processor have the same robot and sizes."""
+    from mme_vla.policy.network import NetworkPolicy
+
+    processor = policy.require_processor()
+    robot = embodiment_of(policy.config)
+    if policy.config.get("embodiment") is not None and robot != processor.embodiment:
+        raise UserError(
+            f"{source}: the processor is of the robot {brief(processor.embodiment.name)} and the configuration of "
+            f"{brief(robot.name)}, or they describe it differently. The files are from two checkpoints, or one was "
+            "changed."
+        )
+    sizes = policy.processor_sizes() if isinstance(policy, NetworkPolicy) else {}
+    for name, (actual, expected) in sizes.items():
+        if actual != expected:
             raise UserError(
-                f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
-                "are read by mme_vla.weights.load_weights() and converted by python -m mme_vla.weights.convert."
+                f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
+                "from two checkpoints, or one was changed."
             )
-        import_trusted(config, str(source), trust_plugins)
-        policy_type = policy_class_for(cls, config, str(source))
-        on_gpu = torch.device(device).type == "cuda"
-        kind = target_dtype or (torch.bfloat16 if on_gpu and policy_type.acts_in_bfloat16 else torch.float32)
-        if kind == torch.bfloat16:
-            policy = {"compute_dtype": "bfloat16", **policy}
-        loaded = policy_type.from_saved(config, str(folder / CONFIG), policy)
-        assign_tensors(loaded, load_tensors(folder), str(source), kind)
-        loaded.compute_unsaved()
-        loaded.processor = load_processor(folder, tokenizer)
-        loaded.check_processor(str(source))
-        if kind == torch.bfloat16:
-            loaded.requires_grad_(False)
-        return loaded.to(device).eval()
-
-    @classmethod
-    def from_saved(cls, config: dict[str, Any], source: str, policy: Mapping[str, Any] | None = None) -> Self:
-        """Build what a checkpoint's configuration describes, on meta, adapters included.
-
-        Args:
-            config: plain sections. source: where they are from, for messages.
-            policy: overrides of its section `policy`.
-        """
-        options = config.get("policy", {})
-        if not isinstance(options, dict):
-            raise UserError(f"{source}: policy={brief(options)} must be a section.")
-        config = {**config, "policy": {**options, **(policy or {})}}
-        try:
-            with shapes_only():
-                built = cls.from_config(config)
-                if config.get("adapters"):
-                    add_adapters(built, **config["adapters"])  # type: ignore[arg-type]  # whoever is saved is a Policy
-        except UserError as error:
-            raise UserError(f"{source}: {error}") from error
-        except Exception as error:
-            if config.get("plugins"):
-                raise  # it may be in the user's own code
-            reason = brief(f"{type(error).__name__}: {error}", 300, quote=False)
-            raise UserError(
-                f"{source} describes no policy that can be built ({reason}). It is damaged, or of a newer version."
-            ) from error
-        return built
-
-    def compute_unsaved(self) -> None:
-        """Give tensors that constructors compute, and no file holds, their values, where they were built on meta.
-
-        Such are buffers registered with `persistent=False`, and tensors kept as plain attributes.
-        """
-        places = [
-            (path, name)
-            for path, module in self.named_modules()
-            for name, value in [*module.named_buffers(recurse=False), *vars(module).items()]
-            if isinstance(value, Tensor) and value.is_meta
-        ]
-        if not places:
-            return
-        fresh = any(path.startswith("backbone") for path, _ in places)
-        with torch.random.fork_rng(devices=[]):
-            real = type(self).from_config(self.config, fresh_backbone=fresh)
-        for path, name in places:
-            value = getattr(real.get_submodule(path), name)
-            setattr(self.get_submodule(path), name, value)
-
-    def check_processor(self, source: str) -> None:
-        """Make sure that the network and its processor speak of the same sizes."""
-        raise NotImplementedError
-
-    def push_to_hub(
-        self,
-        repo_id: str,
-        *,
-        private: bool = False,
-        token: str | None = None,
-        revision: str | None = None,
-        message: str = "Upload policy",
-        dtype: str = "float32",
-        card: Mapping[str, Any] | None = None,
-    ) -> str:
-        """Store the policy on the Hugging Face Hub, as `save_pretrained` writes it.
-
-        Args:
-            repo_id: `owner/name`; created if it does not exist. private: only if it is created now.
-            token: a write token; the one stored by `hf auth login` by default.
-            revision: the branch to commit to. message: of the commit. dtype, card: as for `save_pretrained`.
-
-        Returns:
-            The repository's address.
-        """
-        with tempfile.TemporaryDirectory() as folder:
-            self.save_pretrained(folder, dtype=dtype, card=card)
-            return push_folder(Path(folder), repo_id, private=private, token=token, revision=revision, message=message)

@@ -126,7 +126,7 @@ def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boun
         "choice": channel.chooses,
         "clock": channel.clock is not None,
         "pauses": channel.sees_pauses,
-        "subgoal": policy.require_processor().reads_subgoal,
+        "subgoal": policy.require_processor().prompt_spec.reads_subgoal,
         "recordings": recordings > 0 and not robot.readings,
         "boundaries": boundaries,
     }

@@ -14,7 +14,8 @@ from torch import Tensor
 from mme_vla.memory.base import stack_history
 from mme_vla.memory.history import FrameScores, History
 from mme_vla.policy.base import Policy
-from mme_vla.policy.episode import Episode, WritableMemory
+from mme_vla.policy.capabilities import WritableMemory, with_vision_memory
+from mme_vla.policy.episode import Episode
 from mme_vla.types import HistoryTokens
 
 
@@ -186,7 +187,7 @@ class SelectionChannel(Channel):
     """
 
     def __init__(self, policy: Policy) -> None:
-        self._policy, self._memory = policy, policy.require_memory()
+        self._policy, self._memory = policy, with_vision_memory(policy).require_memory()
 
     def read(self, episode: Episode, step: int | None = None, only: np.ndarray | None = None) -> MemorySnapshot:
         full = episode.required_history()
@@ -204,7 +205,7 @@ class SelectionChannel(Channel):
         view, at, frames = snapshot.source
         slots = dict(zip(frames, stores[0].entries, strict=True))
         places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
-        tokens = self._memory.recall(Exchanged(view, places), at)
+        tokens = self._memory.gather_selection(Exchanged(view, places), at)
         positions, mask = tokens.positions.clone(), tokens.mask.clone()
         for frame, entry in slots.items():
             its = tokens.mask & (tokens.positions[:, 0] == frame)

@@ -9,15 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, stack_draws
 from mme_vla.errors import UserError
+from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, frames_read, with_vision_memory
 from mme_vla.policy.episode import Episode, Host
 from mme_vla.probing.arms import UNPROBED, Arm, options_of
 from mme_vla.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.probing.interventions import Moment
 from mme_vla.probing.recordings import SUBGOAL, Recording, others, stored_frames
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.types import Noise, stack_noise
 
 
 class Prober(Host, Protocol):
@@ -54,7 +56,7 @@ class ProbedEpisode(Episode):
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
-        drawn: Mapping[str, np.ndarray] | None = None,
+        rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames as `Episode.observe` does."""
         self.inner.goal = self.goal
@@ -65,7 +67,7 @@ class ProbedEpisode(Episode):
             self._show_sessions()
         if self.exec_start is None and video < count:
             self.exec_start = self.n_observed_frames + video
-        chunk = _Frames(frames, np.asarray(states), demo, actions, drawn, self._robot.action.frames is None)
+        chunk = _Frames(frames, np.asarray(states), demo, actions, rendered, self._robot.action.frames is None)
         if feed.video:
             chunk.show(self.inner, 0, video)
         pause = -1 if self.exec_start is None else self.exec_start + feed.at - self.n_observed_frames
@@ -100,7 +102,7 @@ class ProbedEpisode(Episode):
     def acted(self, chunk: np.ndarray) -> None:
         self.inner.acted(chunk)
 
-    def remember(
+    def add_frames(
         self,
         frames: np.ndarray,
         is_demo: bool | np.ndarray = False,
@@ -108,11 +110,11 @@ class ProbedEpisode(Episode):
         states: np.ndarray | None = None,
     ) -> None:
         """Not offered: an arm decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
+        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
 
-    def look(self, images: Mapping[str, np.ndarray], state: np.ndarray) -> None:
+    def set_view(self, images: Mapping[str, np.ndarray], state: np.ndarray) -> None:
         """Not offered: an arm decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not remember() and look().")
+        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
 
 
 class _Frames:
@@ -124,11 +126,11 @@ class _Frames:
         states: np.ndarray,
         demo: np.ndarray,
         actions: np.ndarray | None,
-        drawn: Mapping[str, np.ndarray] | None,
+        rendered: Mapping[str, np.ndarray] | None,
         motions: bool,
     ) -> None:
         self._frames, self._states, self._demo = frames, states, demo
-        self._actions, self._rendered, self._motions = actions, drawn, motions
+        self._actions, self._rendered, self._motions = actions, rendered, motions
         self._video, self._has_motions = int(demo.sum()), False
 
     def show(self, episode: Episode, start: int, stop: int) -> None:
@@ -151,7 +153,9 @@ class _Frames:
         views = {name: np.repeat(view, count, 0) for name, view in views.items()}
         if rendered:
             rendered = {
-                "drawn": {n: np.arange(count) if len(views[n]) else places for n, places in rendered["drawn"].items()}
+                "rendered": {
+                    n: np.arange(count) if len(views[n]) else places for n, places in rendered["rendered"].items()
+                }
             }
         led = self._actions
         if led is not None:
@@ -166,7 +170,7 @@ class _Frames:
         views = {
             name: view[inside[name]] if name in inside else view[start:stop] for name, view in self._frames.items()
         }
-        return views, {"drawn": {name: places[name][inside[name]] - start for name in places}}
+        return views, {"rendered": {name: places[name][inside[name]] - start for name in places}}
 
 
 ALIKE = 3  # of the other episodes, so many with the most similar goals lend
@@ -254,9 +258,9 @@ class ProbedPolicy(Policy):
         self.inner, self.arm, self.channel = inner, arm, channel_of(inner)
         self.memory, self.processor = inner.memory, inner.processor
         self.config = {**inner.config, **({"probe": [arm.name, options_of(arm)]} if arm.parts else {})}
-        self.history_dtype, self.horizon, self.n_past_steps = inner.history_dtype, inner.horizon, inner.n_past_steps
-        self.sample_steps, self.action_dim = inner.sample_steps, inner.action_dim
-        self.max_actions = inner.max_actions
+        self.horizon, self.action_dim = inner.horizon, inner.action_dim
+        self.sample_steps = inner.sample_steps if isinstance(inner, SamplesInSteps) else 1
+        self.max_actions = inner.max_actions if isinstance(inner, LimitsActions) else None
         self.sessions, self.donors = list(sessions)[: arm.feed.sessions], donors
         self.n_distractor_episodes = len(self.sessions) if of_split else 0  # those of an arm are the probe's own
 
@@ -269,23 +273,30 @@ class ProbedPolicy(Policy):
         """Begin an episode, with the sessions that come before it."""
         return ProbedEpisode(self, goal, seed)
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
-        return self.inner.sample_draws(generator)
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        return self.inner.sampling_noise(generator)
 
     def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
         return self.inner.sample_actions(batch, draws, steps)
 
-    def encode_frames(self, frames: np.ndarray) -> Tensor:
-        return self.inner.encode_frames(frames)
+    @property
+    def history_dtype(self) -> torch.dtype:
+        return with_vision_memory(self.inner).history_dtype
+
+    def require_memory(self) -> Memory:
+        return with_vision_memory(self.inner).require_memory()
 
     def vision_fingerprint(self) -> str:
-        return self.inner.vision_fingerprint()
+        return with_vision_memory(self.inner).vision_fingerprint()
+
+    def encode_frames(self, frames: np.ndarray) -> Tensor:
+        return with_vision_memory(self.inner).encode_frames(frames)
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """The episode's own frames that are looked at, through what the arm makes of them."""
         feed, before = self.arm.feed, self.before
         displayed = feed.displayed(steps, exec_start, before)
-        reads = self.inner.frames_read(displayed, feed.first_executed(exec_start, before))
+        reads = frames_read(self.inner, displayed, feed.first_executed(exec_start, before))
         if reads is None:
             return None
         if "choice" in self.arm.needs and len(displayed):  # which frames are left to choose from, only then is known
@@ -316,7 +327,7 @@ class ProbedPolicy(Policy):
             self.channel.commit(episode.inner, its)
         return chunk
 
-    def snapshot(self, episode: ProbedEpisode, sampled: Draws | None = None) -> tuple[MemorySnapshot, list[Remembered]]:
+    def snapshot(self, episode: ProbedEpisode, sampled: Noise | None = None) -> tuple[MemorySnapshot, list[Remembered]]:
         """What is remembered among the frames that may be, and what the arm makes of it."""
         moment = self.moment(episode)
         snapshot = self.channel.read(episode.inner, only=self.arm.only(moment))
@@ -338,7 +349,7 @@ class ProbedPolicy(Policy):
         return Moment(rng, now, stored, episode.boundaries, episode.subgoals, weigh=weigh, **known)
 
     def _weigh(
-        self, episode: ProbedEpisode, snapshot: MemorySnapshot, place: int, sampled: Draws, store: Remembered
+        self, episode: ProbedEpisode, snapshot: MemorySnapshot, place: int, sampled: Noise, store: Remembered
     ) -> np.ndarray:
         """By how much a chunk changes without each slot of a store."""
         slots = store.occupied
@@ -355,7 +366,7 @@ class ProbedPolicy(Policy):
         episode: ProbedEpisode,
         snapshot: MemorySnapshot,
         variants: Sequence[Sequence[Remembered]],
-        draws: Sequence[Draws],
+        draws: Sequence[Noise],
         steps: int | None = None,
         batch: int = 64,
     ) -> Tensor:
@@ -371,13 +382,14 @@ class ProbedPolicy(Policy):
         for start in range(0, len(pairs), batch):
             part = pairs[start : start + batch]
             observation = self.inner.observation([episode.inner] * len(part))
-            stacked = stack_draws([sampled for _, sampled in part])
+            stacked = stack_noise([sampled for _, sampled in part])
             chunks.append(
                 self.channel.answer(observation, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu()
             )
         action = self.embodiment.action
         stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))
-        return stacked_chunks[:, :, self.n_past_steps : self.n_past_steps + action.execute, : action.width]
+        first = self.inner.require_processor().samples.window - 1
+        return stacked_chunks[:, :, first : first + action.execute, : action.width]
 
 
 def _probed(episode: Episode) -> ProbedEpisode:

@@ -1,10 +1,10 @@
-"""What every processor is asked: images, words, states and actions in the network's form, batches, and back."""
+"""`PolicyProcessor`: the interface between raw data and one kind of network."""
 
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
@@ -44,14 +44,50 @@ class Sample:
 
 
 @dataclass(frozen=True)
-class Counted:
-    """What normalisation statistics are made of.
+class SampleSpec:
+    """What a training sample and an observation consist of.
 
-    horizon: chunk steps of each observation that count, relative where the embodiment says so; None for the chunk's.
-    every: every execution step once, in the data's order; else in shuffled batches of which an incomplete last one is
-        left out, as the released code of π0.5 does.
-    extremes: keep the smallest and the largest value too. exact: quantiles of all rows at once, not of their histogram.
-    video: the conditioning video's steps count as well.
+    kind: `steps` of an execution, or `keyframes` with depth.
+    window: frames of an observation, the current one last; before the episode's start its first frame is repeated.
+    consecutive: the frames of the window follow each other; else they are those at which the policy acted.
+    full_chunks_only: leave out steps with fewer recorded actions ahead than a chunk has.
+    group_size: steps of one episode in a sample; more than 1 for policies that train on sequences.
+    cameras: whose images an item holds, in the embodiment's order; None for all.
+    """
+
+    kind: str = "steps"
+    window: int = 1
+    consecutive: bool = True
+    full_chunks_only: bool = False
+    group_size: int = 1
+    cameras: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True)
+class PromptSpec:
+    """What a processor's prompts consist of.
+
+    encoder: what turns text into numbers, for reports. name: of the prompt format, for messages.
+    reads_subgoal: whether the prompt has a subgoal. past_actions: executed actions in it.
+    fingerprint: equal for two processors only if text means the same numbers to both; None if that needs no check.
+    """
+
+    encoder: str
+    name: str = "plain"
+    reads_subgoal: bool = False
+    past_actions: int = 0
+    fingerprint: str | None = None
+
+
+@dataclass(frozen=True)
+class StatsSpec:
+    """What normalisation statistics are computed from.
+
+    horizon: chunk steps of each observation, relative where the embodiment says so; None for the full chunk.
+    every: every execution step once, in the data's order; else shuffled batches without an incomplete last one, as the
+        released code of π0.5 does.
+    extremes: keep the smallest and largest values too. exact: quantiles of all rows, not of a histogram.
+    video: include the steps of the conditioning video.
     """
 
     horizon: int | None = None
@@ -62,52 +98,21 @@ class Counted:
 
 
 class PolicyProcessor:
-    """Everything between raw data and one kind of policy's network, saved with every checkpoint.
+    """Everything between raw data and one kind of network, saved with every checkpoint.
 
-    Training, evaluation and serving share one such object, so they cannot differ. A subclass registers in `PROCESSORS`,
-    sets `embodiment` (then `stats`), and implements what raises NotImplementedError.
+    Training, evaluation and serving share it. A subclass registers in `PROCESSORS`, sets `embodiment` (then `stats`),
+    and implements what raises NotImplementedError.
     """
 
     embodiment: Embodiment
-    window: int = 1
-    """Frames an observation consists of, the current one last; clamped at the episode's start."""
-    full_chunks_only: bool = False
-    """Whether steps with fewer recorded actions ahead of them than a chunk has are left out of training."""
-    group_size: int = 1
-    """Steps of one episode that a training sample holds: more than 1 for policies that are trained on sequences."""
-    consecutive: bool = True
-    """Whether the frames of the window follow each other in an episode; else they are those at which it was asked."""
-    prompt_name: str = "plain"
-    """How the goal becomes words, for messages."""
-    counted: Counted = Counted()
-    samples: str = "steps"
-    """What a training sample is: `steps` of an execution, or `keyframes` with depth."""
+    samples: SampleSpec = SampleSpec()
+    stats_spec: StatsSpec = StatsSpec()
     _stats: NormStats | None = None
 
     @classmethod
     def from_sections(cls, sections: Mapping[str, Any]) -> Self:
         """Build the processor of a composed configuration, at its backbone's sizes."""
         raise NotImplementedError
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """The cameras whose images an item is made of, in the embodiment's order."""
-        return self.embodiment.camera_names
-
-    @property
-    def reads_subgoal(self) -> bool:
-        """Whether the words of an observation hold a subgoal."""
-        return False
-
-    @property
-    def past_actions(self) -> int:
-        """Executed actions that the words of an observation hold."""
-        return 0
-
-    @property
-    def horizon(self) -> int:
-        """h; steps in a chunk."""
-        return self.embodiment.action.horizon
 
     @property
     def stats(self) -> NormStats | None:
@@ -143,8 +148,9 @@ class PolicyProcessor:
         """
         raise NotImplementedError
 
-    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
-        """Memory frames [n, H, W, 3] uint8 as the vision tower takes them, on `device` if one is given."""
+    @property
+    def prompt_spec(self) -> PromptSpec:
+        """What the prompts consist of."""
         raise NotImplementedError
 
     def prompt(
@@ -154,59 +160,23 @@ class PolicyProcessor:
         state: np.ndarray | Tensor | None = None,
         past_actions: np.ndarray | Tensor | None = None,
     ) -> Any:
-        """What the network reads of the words, in a form of the processor's own, without a batch axis."""
+        """Encode the text as the network reads it, without a batch axis."""
         raise NotImplementedError
-
-    @property
-    def words_from(self) -> str:
-        """What turns words into numbers, for reports."""
-        raise NotImplementedError
-
-    @property
-    def memory_image_format(self) -> str:
-        """What a setting lets memory images go through besides, which a cache of their tokens depends on."""
-        return ""
-
-    @property
-    def words_fingerprint(self) -> str | None:
-        """Equal for two processors exactly if words mean the same numbers to both; None where that needs no check."""
-        return None
 
     # Actions
 
     def actions(self, chunk: np.ndarray | Tensor, state: np.ndarray | Tensor) -> Tensor:
-        """Recorded actions [h, w] at a raw state [s] as the network should answer."""
+        """Recorded actions [h, w] at a raw state [s] as targets of the network."""
         raise NotImplementedError
 
     def absolute_actions(self, chunk: Tensor, state: Tensor) -> Tensor:
-        """The network's answer [..., h, a] at raw states [..., s] as actions [..., h, w] that the robot takes."""
+        """The network's chunk [..., h, a] at raw states [..., s] as actions [..., h, w] that the robot executes."""
         raise NotImplementedError
-
-    def motion(self, states: np.ndarray, actions: np.ndarray, known: np.ndarray) -> Tensor:
-        """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
-
-        Args:
-            states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False
-                where none of the robot's own did; what is in `actions` there does not matter.
-
-        Returns:
-            [state | action relative to it | known], normalised; actions are 0 where they are not known.
-        """
-        stats = self.require_stats()
-        proprio = torch.from_numpy(np.asarray(states, np.float32))
-        done = torch.from_numpy(np.asarray(actions, np.float32))
-        is_known = torch.from_numpy(np.asarray(known, np.float32))[:, None]
-        relative = self.embodiment.action.to_relative(done[:, None], proprio)[:, 0]
-        return torch.cat([normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known], 1)
 
     # Batches
 
-    def item(self, sample: Sample) -> dict[str, Any]:
-        """One training step without a batch axis, for `collate`."""
-        raise NotImplementedError
-
-    def keyframe_item(self, sample: Any) -> dict[str, Any]:
-        """The same of a run of keyframes with depth (`mme_vla.data.keyframes`), where samples are such."""
+    def item(self, sample: Any) -> dict[str, Any]:
+        """One training sample without a batch axis, for `collate`: of a `Sample`, or of a run of keyframes."""
         raise NotImplementedError
 
     def collate(self, items: Sequence[dict[str, Any]]) -> Any:
@@ -241,6 +211,33 @@ class PolicyProcessor:
             tokenizer: in place of the one that `processor.json` names.
         """
         raise NotImplementedError
+
+
+@runtime_checkable
+class HasMemoryImages(Protocol):
+    """A processor for networks whose memory stores vision tokens."""
+
+    def memory_images(self, frames: np.ndarray | Tensor, device: torch.device | str | None = None) -> Tensor:
+        """Resize memory frames [n, H, W, 3] uint8 for the vision tower, on `device` if one is given."""
+        ...
+
+
+def motion_rows(processor: PolicyProcessor, states: np.ndarray, actions: np.ndarray, known: np.ndarray) -> Tensor:
+    """What a memory of the robot's own motion reads of t frames: [t, s + w + 1] float32.
+
+    Args:
+        states: [t, s] raw. actions: [t, w] absolute, each the one that led to its frame. known: bool [t], False where
+            no action of the robot led to the frame; the values in `actions` are ignored there.
+
+    Returns:
+        [state | action relative to it | known], normalised; actions are 0 where they are not known.
+    """
+    stats = processor.require_stats()
+    proprio = torch.from_numpy(np.asarray(states, np.float32))
+    done = torch.from_numpy(np.asarray(actions, np.float32))
+    is_known = torch.from_numpy(np.asarray(known, np.float32))[:, None]
+    relative = processor.embodiment.action.to_relative(done[:, None], proprio)[:, 0]
+    return torch.cat([normalize(proprio, stats.state), normalize(relative, stats.actions) * is_known, is_known], 1)
 
 
 def read_settings(folder: Path) -> dict[str, Any]:

@@ -13,7 +13,16 @@ from mme_vla.backbone.config import shape_of
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.processing.base import CONFIG_FILE, STATS_FILE, PolicyProcessor, Sample, collate, pad_width, read_settings
+from mme_vla.processing.base import (
+    CONFIG_FILE,
+    STATS_FILE,
+    PolicyProcessor,
+    PromptSpec,
+    Sample,
+    collate,
+    pad_width,
+    read_settings,
+)
 from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.normalise import NormStats, normalize, unnormalize
 from mme_vla.processing.prompt import PROMPTS, PromptInput, encode_prompt, shorten
@@ -146,7 +155,7 @@ class Processor(PolicyProcessor):
         self.subgoal_length = subgoal_length
         self.action_dim = action_dim
         self.embodiment = embodiment if horizon is None else embodiment.with_horizon(horizon)
-        self.embodiment.check_network(action_dim, self.horizon)
+        self.embodiment.check_network(action_dim, self.embodiment.action.horizon)
         self.stats = stats
 
     @classmethod
@@ -156,7 +165,7 @@ class Processor(PolicyProcessor):
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
         processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
-        vocab_size = backbone.vocab_size
+        vocab_size = sections["backbone"].get("vocab_size")
         if vocab_size is not None and processor.tokenizer.vocab_size > vocab_size:
             raise UserError(
                 f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "
@@ -165,29 +174,16 @@ class Processor(PolicyProcessor):
         return processor
 
     @property
-    def reads_subgoal(self) -> bool:
-        """Whether the prompt holds a subgoal."""
-        return self.prompt_format.reads_subgoal
-
-    @property
-    def past_actions(self) -> int:
-        """Executed actions in the prompt."""
-        return self.prompt_format.past_actions
+    def prompt_spec(self) -> PromptSpec:
+        kind, tokenizer = self.prompt_format, self.tokenizer
+        return PromptSpec(
+            tokenizer.spec, self.prompt_name, kind.reads_subgoal, kind.past_actions, tokenizer.fingerprint
+        )
 
     @property
     def longest_prompt(self) -> int:
         """Tokens of a prompt: `prompt_length`, and what the robot's options have."""
         return self.prompt_length + self.embodiment.action.options_length
-
-    @property
-    def words_from(self) -> str:
-        """The tokenizer."""
-        return self.tokenizer.spec
-
-    @property
-    def words_fingerprint(self) -> str | None:
-        """The tokenizer's."""
-        return self.tokenizer.fingerprint
 
     def images(self, views: Sequence[np.ndarray | Tensor]) -> Tensor:
         """Resize the current images of all cameras with Pillow, as released.
@@ -256,9 +252,10 @@ class Processor(PolicyProcessor):
         """
         stats = self.require_stats()
         chunk, state = _float(chunk), _float(state)
-        if chunk.shape != (self.horizon, len(stats.actions)) or state.shape != (len(stats.state),):
+        horizon = self.embodiment.action.horizon
+        if chunk.shape != (horizon, len(stats.actions)) or state.shape != (len(stats.state),):
             raise UserError(
-                f"Expected actions [{self.horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
+                f"Expected actions [{horizon}, {len(stats.actions)}] and a state [{len(stats.state)}], "
                 f"got {list(chunk.shape)} and {list(state.shape)}."
             )
         relative = self.embodiment.action.to_relative(chunk, state)

@@ -288,7 +288,7 @@ def subgoal_kind(policy: Any) -> str | None:
     Args:
         policy: anything with a policy's processor and configuration.
     """
-    if not policy.require_processor().reads_subgoal:
+    if not policy.require_processor().prompt_spec.reads_subgoal:
         return None
     kind = (policy.config.get("subgoal_text") or {}).get("kind")
     return None if kind is None else str(kind)

@@ -4,8 +4,8 @@ import asyncio
 import hmac
 import logging
 import time
-from collections.abc import AsyncIterator, Awaitable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Awaitable
+from contextlib import suppress
 from typing import Any
 
 from starlette.applications import Starlette
@@ -28,14 +28,14 @@ logger = logging.getLogger("mme_vla.serving")
 
 
 class ServedConnection:
-    """Speaks first (`metadata`, packed), then answers one request after the other.
+    """Sends `metadata` (packed), then responds to one request after the other.
 
-    Reading continues while the policy computes, so that pings are answered and a client that goes is noticed.
+    Reading continues while the policy computes, so that pings are served and a client that leaves is noticed.
     """
 
     def __init__(self, socket: WebSocket, engine: Engine, settings: ServeSettings, metadata: bytes) -> None:
         self._socket, self._engine, self._settings, self._metadata = socket, engine, settings, metadata
-        self._connection: Connection = socket.state.connection
+        self._connection: Connection = socket.scope["connection"]
         self._peer = f"{socket.client.host}:{socket.client.port}" if socket.client else "client"
         self._coming: asyncio.Future[Any] | None = None
 
@@ -47,7 +47,7 @@ class ServedConnection:
             await self._socket.send_bytes(self._metadata)
             self._await_request()
             while (message := await self._next()) is not None:
-                self._connection.work(busy=True)
+                self._connection.set_busy(True)
                 if not await self._serve_one(session, message):
                     return
                 del message  # hundreds of megabytes that need not wait for the next request
@@ -58,14 +58,14 @@ class ServedConnection:
                 self._engine.stats.count("refused")
                 logger.info("%s: message too large (limits.message_mib)", self._peer)
         finally:
-            self._connection.work(busy=False)
+            self._connection.set_busy(False)
             if self._coming is not None:
                 self._coming.cancel()
 
     def _await_request(self) -> None:
-        self._connection.work(busy=False)
+        self._connection.set_busy(False)
         if not self._connection.dismissed.done():
-            self._connection.wait(self._settings.limits.idle_s)
+            self._connection.expire_in(self._settings.limits.idle_s)
 
     async def _next(self) -> Any:
         """The next message; None when the connection is to end."""
@@ -125,25 +125,21 @@ class ServedConnection:
                 await doing
 
     async def _close(self, code: int, reason: str) -> None:
-        short = reason.encode()[:120].decode(errors="ignore")  # a close frame has room for no more
+        short = reason.encode()[:120].decode(errors="ignore")  # a close frame takes no more
         await self._socket.close(code, short)
 
 
-logger = logging.getLogger("mme_vla.serving")
 MSGPACK = "application/msgpack"
 METHODS = {"/healthz": "GET", "/metadata": "GET", "/stats": "GET", "/reset": "POST", "/infer": "POST"}
-OPEN = ("/healthz", "/metadata")  # need no key: the challenge's client asks for the metadata without one
-LINGER_S = 5  # seconds in which what is left of a refused body may come, so that the client gets to read the answer
+OPEN = ("/healthz", "/metadata")  # need no key: the challenge's client requests the metadata without one
+MIN_BYTES_S = 2**16  # bytes a second of a body, beside limits.receive_s
+LINGER_S = 5  # seconds for the remaining body of a refused request, so that the client can read the response
 
 
 def make_app(
     engine: Engine, settings: ServeSettings, metadata: bytes, connections: Connections, sessions: HttpSessions
 ) -> ASGIApp:
-    """The ASGI application; to run under the protocols of `connections`.
-
-    Args:
-        metadata: packed.
-    """
+    """The ASGI application, under uvicorn with `timed_protocol(connections)`; `metadata` is packed."""
 
     async def healthz(_: Request) -> Response:
         return PlainTextResponse("OK\n")
@@ -157,6 +153,7 @@ def make_app(
     async def infer(request: Request) -> Response:
         name = (request.client.host if request.client else "", request.headers.get("x-session", ""))
         body = await read_body(request, settings)
+        request.scope["connection"].set_busy(True)
         begun = time.perf_counter()
         try:
             try:
@@ -192,10 +189,6 @@ def make_app(
     async def websocket(socket: WebSocket) -> None:
         await ServedConnection(socket, engine, settings, metadata).run()
 
-    @asynccontextmanager
-    async def lifespan(_: Starlette) -> AsyncIterator[dict[str, Any]]:
-        yield {"connections": connections}
-
     handlers = {"/healthz": healthz, "/metadata": describe, "/stats": stats, "/reset": infer, "/infer": infer}
     app = Starlette(
         routes=[
@@ -203,7 +196,6 @@ def make_app(
             WebSocketRoute("/{path:path}", websocket),
         ],
         exception_handlers={HTTPException: refuse},
-        lifespan=lifespan,
     )
     return RequestGuard(app, settings, connections, engine)
 
@@ -212,23 +204,25 @@ async def read_body(request: Request, settings: ServeSettings) -> bytearray:
     """The body that Content-Length announces.
 
     Raises:
-        HTTPException: none, of unknown length, too long, cut short or stalled.
+        HTTPException: no body, of unknown length, too long, cut short, stalled or too slow.
     """
     limits = settings.limits
     if "transfer-encoding" in request.headers:
         raise HTTPException(411, "Send the body in one piece, with Content-Length.")
-    length = int(request.headers.get("content-length", "0"))  # digits: h11 sees to that
+    length = int(request.headers.get("content-length", "0"))  # digits: h11 checks that
     if length == 0:
         raise HTTPException(400, "The body is empty: send a packed request.")
     if length > limits.message_bytes:
         what = f"The message has {length} bytes; this server takes {limits.message_bytes} (limits.message_mib)."
         raise HTTPException(413, what)
-    body = bytearray()
+    body, last = bytearray(), time.monotonic() + limits.receive_s + length / MIN_BYTES_S
     while len(body) < length:
         try:
-            message = await asyncio.wait_for(request.receive(), limits.receive_s)
+            seconds = min(limits.receive_s, last - time.monotonic())
+            message = await asyncio.wait_for(request.receive(), seconds)
         except TimeoutError:
-            raise HTTPException(408, f"No byte of the body came for {limits.receive_s:g} s.") from None
+            what = f"No byte of the body came for {limits.receive_s:g} s, or less than {MIN_BYTES_S} of them a second."
+            raise HTTPException(408, what) from None
         if message["type"] == "http.disconnect":
             raise HTTPException(400, "The body was cut short.")
         body += message["body"]
@@ -236,27 +230,29 @@ async def read_body(request: Request, settings: ServeSettings) -> bytearray:
 
 
 class RequestGuard:
-    """Decides who comes in before anything is read, and ends connections whose body nobody wanted."""
+    """Checks key and place of a request before anything of its body is read."""
 
     def __init__(self, app: ASGIApp, settings: ServeSettings, connections: Connections, engine: Engine) -> None:
         self._app, self._settings, self._connections, self._stats = app, settings, connections, engine.stats
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a request on, or answer it here."""
-        if scope["type"] == "lifespan":
-            return await self._app(scope, receive, send)
-        refusal = self._refusal(scope)
-        if refusal is not None:
-            self._stats.count("refused")
-        if scope["type"] == "http":
-            return await self._http(refusal or self._app, scope, receive, send)
-        if refusal is not None:
-            return await WebSocket(scope, receive, send).send_denial_response(refusal)
+        """Pass a request on, or refuse it."""
+        connection = self._connections.open.get(scope.get("client"))
+        if connection is None:  # a client that has left already
+            return
+        self._connections.begin(connection, scope["type"] == "websocket")
+        scope["connection"] = connection
         try:
-            await self._app(scope, receive, send)
+            if (refusal := self._refusal(scope)) is not None:
+                self._stats.count("refused")
+            if scope["type"] == "http":
+                await self._http(refusal or self._app, scope, receive, send)
+            elif refusal is not None:
+                await WebSocket(scope, receive, send).send_denial_response(refusal)
+            else:
+                await self._app(scope, receive, send)
         finally:
-            self._connections.leave(scope["state"]["connection"])
-        return None
+            self._connections.end(connection)
 
     def _refusal(self, scope: Scope) -> Response | None:
         headers = Headers(scope=scope)
@@ -268,13 +264,12 @@ class RequestGuard:
         tokens = headers.getlist("authorization")
         if not self._allowed(tokens[0] if len(tokens) == 1 else ""):
             return PlainTextResponse("Send the header Authorization: Api-Key <key>.\n", 401)
-        connection: Connection = scope["state"]["connection"]
-        if not self._connections.admit(connection):
+        if not self._connections.admit(scope["connection"]):
             return PlainTextResponse("The server is full or stopping.\n", 503)
         return None
 
     def _allowed(self, authorization: str) -> bool:
-        """Whether this key opens; takes the same time for every wrong one."""
+        """Whether the key is right; takes the same time for every wrong one."""
         if self._settings.api_key is None:
             return True
         scheme, _, key = authorization.partition(" ")
@@ -282,7 +277,7 @@ class RequestGuard:
         return right and scheme.lower() == "api-key"
 
     async def _http(self, app: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer; where the body was not read whole, throw the rest away for a moment and hang up."""
+        """Respond; after a response that precedes the end of the body, discard the body for `LINGER_S` and close."""
         headers = Headers(scope=scope)
         unread = "transfer-encoding" in headers or headers.get("content-length", "0").strip("0") != ""
 
@@ -295,18 +290,13 @@ class RequestGuard:
         async def sending(message: Message) -> None:
             if message["type"] == "http.response.start" and (unread or self._connections.stopping):
                 message = {**message, "headers": [*message["headers"], (b"connection", b"close")]}
-            elif message["type"] == "http.response.body" and unread and not message.get("more_body", False):
+            elif message["type"] == "http.response.body" and unread:
                 await send({**message, "more_body": True})
-                await self._throw_away(reading, lambda: unread)
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(LINGER_S):
+                        while unread:
+                            await reading()
                 message = {"type": "http.response.body", "body": b""}
             await send(message)
 
         await app(scope, reading, sending)
-
-    async def _throw_away(self, reading: Receive, more: Any) -> None:
-        try:
-            async with asyncio.timeout(LINGER_S):
-                while more():
-                    await reading()
-        except TimeoutError:
-            return

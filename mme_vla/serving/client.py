@@ -25,13 +25,13 @@ class Client:
 
     Args:
         url: `ws://host:port`.
-        api_key: what the server asks for, if it does.
+        api_key: of the server, if it has one.
         timeout: seconds to wait for an answer; a first request of 1,000 frames may take minutes on a CPU.
         open_timeout: seconds to wait for the connection and the server's metadata.
 
     Raises:
         UserError: not an address of a server, or the key is refused.
-        ConnectionError: nobody answers there.
+        ConnectionError: there is no server.
 
     >>> with Client("ws://127.0.0.1:8001") as client:  # doctest: +SKIP
     ...     client.reset()
@@ -51,7 +51,7 @@ class Client:
         self._socket: Any = None
         self._ends = ExitStack()
         self.metadata: dict[str, Any] = {}
-        """What the server said of itself when this client connected."""
+        """Description of the server, its first message."""
         self.reconnect()
 
     def reconnect(self) -> None:
@@ -96,7 +96,7 @@ class Client:
         return self.request({"add_buffer": True, "images": images, "state": states, "exec_start_idx": exec_start})
 
     def infer(self, observation: Mapping[str, Any]) -> dict[str, Any]:
-        """Ask for the next chunk.
+        """Request the next chunk.
 
         Args:
             observation: of either schema: `observation/image`, `observation/wrist_image`, `observation/state` and
@@ -117,7 +117,7 @@ class Client:
         data = pack(message)
         if self._socket is None:
             raise ConnectionError("This client is closed: call reconnect().")
-        with suppress(ConnectionClosed):  # the server may have said why before it closed
+        with suppress(ConnectionClosed):  # the reason may have arrived before the close
             self._socket.send(data)
         return self._receive(self.timeout)
 

@@ -44,7 +44,7 @@ def unpack(data: bytes | bytearray | memoryview) -> Any:
         )
     except UserError:
         raise
-    except Exception as error:  # msgpack answers damage with many kinds of exception
+    except Exception as error:  # msgpack raises many kinds of exception
         raise UserError(f"This is not a msgpack message ({type(error).__name__}: {error}).") from error
 
 

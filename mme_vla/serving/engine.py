@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import PreparesChunks
 from mme_vla.policy.episode import Episode
 from mme_vla.policy.scheduler import Act, Read, Scheduler
 
@@ -73,9 +74,9 @@ logger = logging.getLogger("mme_vla.serving")
 
 @dataclass(eq=False)
 class _Waiting[T]:
-    """A piece of work and who waits for it; a future that is done already belongs to a client that has gone.
+    """A piece of work and its future, which is done already if the client has left.
 
-    pieces: those still to be run; 0 once it is done or nobody waits.
+    pieces: those still to be run; 0 once it is done or its client has left.
     """
 
     work: T
@@ -122,7 +123,7 @@ class Engine:
         await asyncio.to_thread(self._thread.shutdown)
 
     async def act(self, episode: Episode) -> np.ndarray:
-        """The next chunk [h, w] of an episode, chosen in one batch with whoever waits at the same time."""
+        """The next chunk [h, w] of an episode, in one batch with all episodes that wait at the same time."""
         chunk: np.ndarray = await self._join(self.scheduler.acting, episode)
         return chunk
 
@@ -155,7 +156,7 @@ class Engine:
         for step in self.scheduler.next_steps():
             if isinstance(step, Read):
                 await self._piece(step.work)
-                await asyncio.sleep(0)  # those whose frames are in now ask for actions
+                await asyncio.sleep(0)  # clients whose frames are in request actions now
             elif isinstance(step, Act):
                 await self._batch([waiting for waiting in step.batch if not waiting.future.done()])
             else:
@@ -177,10 +178,12 @@ class Engine:
 
     async def _prepare(self, episode: Episode) -> None:
         """A piece of what a client's next request will need, while its robot moves."""
+        if not isinstance(policy := self.policy, PreparesChunks):
+            return
         try:
-            left = await self.call(lambda: self.policy.prepare(episode))
+            left = await self.call(lambda: policy.prepare(episode))
         except Exception:
-            logger.exception("preparing an episode's next chunk failed; it will be computed when it is asked for")
+            logger.exception("preparing an episode's next chunk failed; it will be computed on request")
             return
         if left:
             self.scheduler.later[episode] = None

@@ -53,7 +53,7 @@ class MMEVLAModelServer(PredictModelServer):
         execute: actions of a chunk that are executed; by default the embodiment's.
         flow_steps: of an iterative head; by default its own.
         seed: of every episode's noise.
-        trust_plugins: import the modules that the checkpoint names: code of whoever wrote it.
+        trust_plugins: import the modules that the checkpoint names: their authors' code.
         max_batch_size: most sessions that act together. max_wait_time: seconds to wait for more of them.
     """
 
@@ -83,11 +83,11 @@ class MMEVLAModelServer(PredictModelServer):
             )
         if robot.action.of_pose:
             raise UserError(
-                f"This policy answers with differences to poses ({robot.action.answers}), which the harness does not "
+                f"This policy returns differences to poses ({robot.action.answers}), which the harness does not "
                 "execute: it cannot be served to it. Evaluate it with python -m mme_vla.evaluate."
             )
         settings = ServeSettings(execute=execute, flow_steps=flow_steps, seed=seed)
-        settings.check_robot(robot, self.policy.require_processor().past_actions)
+        settings.check_robot(robot, self.policy.require_processor().prompt_spec.past_actions)
         self.flow_steps, self.seed, self.subgoal = flow_steps, seed, subgoal_kind(self.policy)
         self.sessions: dict[str, Running] = {}
         super().__init__(
@@ -134,7 +134,7 @@ class MMEVLAModelServer(PredictModelServer):
         if lacking or state is None:
             raise UserError(
                 f"the observation lacks {', '.join([*lacking, *(['states'] if state is None else [])])}: the "
-                "environment failed, or the benchmark does not send what get_observation_params() asks for."
+                "environment failed, or the benchmark does not send what get_observation_params() lists."
             )
         running.images.append({name: np.asarray(images[VIEWS[name]]) for name in names})
         running.states.append(np.asarray(state, np.float32))
@@ -155,7 +155,7 @@ class MMEVLAModelServer(PredictModelServer):
         episode.goal, episode.subgoal = str(obs["task_description"]), obs.get("subgoal") or None
         video = obs.get("video_history")
         if video is not None and len(video):
-            episode.remember(np.stack(video), is_demo=True)
+            episode.add_frames(np.stack(video), is_demo=True)
         episode.observe({name: np.stack([p[name] for p in images]) for name in images[0]}, np.stack(states))
         return episode
 
@@ -181,5 +181,5 @@ def run_server(arguments: Sequence[str] | None = None) -> None:
         host, port = name or host, int(number)
     server = MMEVLAModelServer(**options.args.as_dict())
     if not is_local(host):
-        logger.warning("host=%s: whoever reaches this port can use it, the harness has no key", host)
+        logger.warning("host=%s: every client that reaches this port can use it, the harness has no key", host)
     serve(server, host=host, port=port)

@@ -132,18 +132,18 @@ def parse(message: Any, most_frames: int, robot: Embodiment = ROBOMME_JOINT) -> 
     """
     if not isinstance(message, dict):
         raise UserError(f"A request is a map, got {type(message).__name__}.")
-    answers = robot.action.answers
-    space = message.get("action_space", answers)
-    if space != answers:
-        raise UserError(f"action_space={str(space)[:40]!r}: this policy answers with {answers} only.")
+    space_name = robot.action.answers
+    space = message.get("action_space", space_name)
+    if space != space_name:
+        raise UserError(f"action_space={str(space)[:40]!r}: this policy returns {space_name} only.")
     if _flag(message, "reset"):
         return Reset()
     if _flag(message, "add_buffer"):
         return _add_buffer(message, most_frames, robot)
     if robot.action.of_pose and "action_space" not in message:
         raise UserError(
-            f"This policy answers with differences to the tool's pose at each step, which whoever executes them adds "
-            f"to where the tool is then: say action_space={answers!r} in the request to show that you do."
+            f"This policy returns differences to the tool's pose at each step, to be added to the pose at that step: "
+            f"send action_space={space_name!r} in the request to confirm it."
         )
     if "front_rgb_list" in message or "task_goal" in message:
         return _challenge(message, most_frames, robot)

@@ -44,7 +44,7 @@ try:
     import uvicorn
 
     from mme_vla.serving.app import make_app
-    from mme_vla.serving.connections import Connections, HttpProtocol, WebSocketProtocol
+    from mme_vla.serving.connections import Connections, timed_protocol
     from mme_vla.serving.session import HttpSessions
 except ImportError as error:
     raise missing_extra("Serving", "serve") from error
@@ -68,7 +68,7 @@ class PolicyServer:
 
     def __init__(self, policy: Policy, settings: ServeSettings, *, name: str = "", trained: bool = True) -> None:
         policy.require_processor().require_stats()
-        settings.check_robot(policy.embodiment, policy.require_processor().past_actions)
+        settings.check_robot(policy.embodiment, policy.require_processor().prompt_spec.past_actions)
         self.settings, self.stats = settings, ServerStats()
         self.engine = Engine(policy, settings.max_batch, settings.flow_steps, self.stats)
         self.metadata = _metadata(policy, settings, name, trained)
@@ -88,8 +88,7 @@ class PolicyServer:
         config = self._config()
         config.load()
         self._uvicorn = uvicorn.Server(config)
-        # `serve()` would take the process's signals; they belong to whoever started this server.
-        self._uvicorn.lifespan = config.lifespan_class(config)
+        self._uvicorn.lifespan = config.lifespan_class(config)  # `serve()` would take over the signals of the process
         await self._uvicorn.startup(sockets=[bound])
         self.port = bound.getsockname()[1]
         for work in (self._log_regularly(), self.connections.watch(), self.sessions.forget_silent()):
@@ -99,25 +98,25 @@ class PolicyServer:
         limits = self.settings.limits
         return uvicorn.Config(
             make_app(self.engine, self.settings, pack(self.metadata), self.connections, self.sessions),
-            http=HttpProtocol,
-            ws=WebSocketProtocol,
+            http=timed_protocol(self.connections),
+            ws="websockets-sansio",
             ws_max_size=limits.message_bytes,
             ws_per_message_deflate=False,
             ws_ping_timeout=limits.pong_s,
             h11_max_incomplete_event_size=HEAD,
             timeout_keep_alive=int(limits.idle_s) + 60,  # `Connections` is stricter
             timeout_graceful_shutdown=1,
-            lifespan="on",
+            lifespan="off",
             log_config=None,
-            log_level=logging.CRITICAL + 1,  # a failed handshake is the client's affair, not worth a traceback
+            log_level=logging.CRITICAL + 1,  # failed handshakes of clients print no traceback
             access_log=False,
-            proxy_headers=False,  # a session belongs to the address that connects, whatever it says of itself
+            proxy_headers=False,  # a session belongs to the address that connects, not to a header
             server_header=False,
             date_header=False,
         )
 
     async def stop(self) -> None:
-        """Accept nobody, finish the requests that are running, close every connection with a reason."""
+        """Refuse new clients, finish the requests that are running, close every connection with a reason."""
         connections, server = self.connections, self._uvicorn
         connections.stopping = True
         for task in self._background:
@@ -128,10 +127,10 @@ class PolicyServer:
             connections.close_idle(1001, STOPPING)
             with suppress(TimeoutError):
                 async with asyncio.timeout(self.settings.limits.stop_s):
-                    while connections.open:
+                    while any(connection.is_open for connection in connections.open.values()):
                         await asyncio.sleep(0.02)
-            connections.abort()
             await server.shutdown()
+            connections.abort()
         self.sessions.entries.clear()
         await self.engine.stop()
 
@@ -145,7 +144,7 @@ class PolicyServer:
 
 
 def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool) -> dict[str, Any]:
-    """What a client is told when it connects."""
+    """The first message to a client."""
     limits = settings.limits
     return {
         "server": "mme_vla",
@@ -159,7 +158,7 @@ def _metadata(policy: Policy, settings: ServeSettings, name: str, trained: bool)
         "state_dim": policy.embodiment.state.width,
         "action_space": policy.embodiment.action.answers,
         "action_dim": policy.embodiment.action.width,
-        "horizon": policy.horizon - policy.n_past_steps,
+        "horizon": policy.horizon - policy.require_processor().samples.window + 1,
         "execute": settings.executed(policy.embodiment),
         "remembers_frames": policy.memory is not None,
         "subgoal": subgoal_kind(policy),

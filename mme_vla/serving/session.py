@@ -119,7 +119,7 @@ class Session:
         else:
             if request.frames is not None:
                 yield from self._add_frames(request.frames, request.states)
-            self.episode.look(request.images, request.state)
+            self.episode.set_view(request.images, request.state)
         _ = self.episode.prompt  # a goal that cannot be read fails here, and not in a batch with others
 
     def _add_frames(self, frames: Sequence[np.ndarray], states: np.ndarray | None) -> Iterator[None]:
@@ -131,7 +131,7 @@ class Session:
             taken = np.stack(frames[start : start + piece])
             demo = episode.n_observed_frames + np.arange(len(taken)) < self._exec_start
             proprio = None if states is None else states[start : start + piece]
-            episode.remember(taken, demo, states=proprio)
+            episode.add_frames(taken, demo, states=proprio)
 
     def _watch(self, frames: Mapping[str, np.ndarray], states: np.ndarray) -> Iterator[None]:
         """Take frames with what all cameras delivered, for a policy that reads more than images."""
@@ -162,7 +162,7 @@ class Session:
 
     @property
     def _reads_past_actions(self) -> bool:
-        return self._engine.policy.require_processor().past_actions > 0
+        return self._engine.policy.require_processor().prompt_spec.past_actions > 0
 
     def _subgoal(self, request: Infer) -> str | None:
         """The subgoal this policy was trained to read, of those the request brings."""

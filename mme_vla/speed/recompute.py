@@ -1,4 +1,4 @@
-"""Layers that keep no activations for the backward pass, or only those that are dear to compute again."""
+"""Activation checkpointing: layers that keep no activations for the backward pass, or only the expensive ones."""
 
 from collections.abc import Callable
 from functools import partial
@@ -32,3 +32,11 @@ def run_layer(layer: Callable[..., Any], *inputs: Any, how: Recompute) -> Any:
     if not how or not torch.is_grad_enabled():
         return layer(*inputs)
     return checkpoint(layer, *inputs, **checkpoint_options(how))
+
+
+class Recomputes:
+    """Capability of a backbone: it can compute activations again in the backward pass."""
+
+    def recompute(self, mode: Recompute) -> None:
+        """Set what to compute again; False keeps all activations."""
+        raise NotImplementedError

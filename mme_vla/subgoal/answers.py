@@ -1,4 +1,4 @@
-"""What a predictor remembers of its own answers: subgoals in words, keyframes, and when to hold on to an answer."""
+"""State that predictors keep of an episode: past subgoals, keyframes, and how long a subgoal is held."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,7 +13,7 @@ _HOLD_BY_SUBGOAL = {"ButtonUnmaskSwap": {"press the first button": 100, "press t
 class SubgoalHistory:
     """The subgoals so far, each once until another one comes.
 
-    Two answers are the same when their words are, whatever their points; the first answer's points are kept.
+    Replies with equal texts are the same, whatever their points; the first one's points are kept.
     """
 
     entries: list[str] = field(default_factory=list)

@@ -29,7 +29,7 @@ class Subgoal:
         policy's prompt is then the plain one).
     points: those points in order, (row, column).
     queried: whether a model was asked for this one; False for one that is kept.
-    reply: what the model said, word for word; empty if none was asked.
+    reply: of the model, unchanged; empty if none was asked.
     problem: why the answer could not be used (one of `PROBLEMS`), empty if it could. The last subgoal is then kept.
     """
 
@@ -44,8 +44,8 @@ class Subgoal:
 class Usage:
     """What a predictor has done so far, over all episodes.
 
-    calls: questions that were answered by a model (the cache's answers are counted apart). tokens: as the model counts
-    them. problems: unusable answers by kind. cost: US dollars.
+    calls: questions to a model (replies from the cache are counted apart). tokens: as the model counts
+    them. problems: unusable replies by kind. cost: US dollars.
     """
 
     calls: int = 0
@@ -82,9 +82,9 @@ class SubgoalEpisode:
         self._frame: np.ndarray | None = None
 
     def skip(self, count: int) -> None:
-        """Let execution frames pass that were not drawn, before the next `observe`.
+        """Count execution frames that were not rendered, before the next `observe`.
 
-        Only where nobody looks at them (`SubgoalPredictor.sees_passing`).
+        Only for predictors that do not read them (`SubgoalPredictor.sees_passing`).
         """
         self.n_observed_frames += count
 
@@ -186,7 +186,7 @@ class SubgoalPredictor:
 
 
 def problem_of(reply: str, error: MalformedReply) -> tuple[str, str]:
-    """Which of `PROBLEMS` an unusable answer is, and the reason in words."""
+    """Which of `PROBLEMS` an unusable reply is, and the reason."""
     return ("malformed" if reply.strip() else "empty"), str(error)
 
 

@@ -1,4 +1,4 @@
-"""Images and videos as models look at them: which frames of a video, out of memory or out of a file."""
+"""Images and videos as models read them: frames sampled from a video in memory or in a file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,9 +10,9 @@ from mme_vla.errors import UserError
 from mme_vla.utils import decoding, require_file
 from mme_vla.utils.media import FPS
 
-VIDEO_FRAMES = 10  # that a model looks at, at most
+VIDEO_FRAMES = 10  # of a video, at most
 ENCODING: dict[str, Any] = {"crf": 18, "preset": "medium"}
-"""How videos that models look at are compressed (`mme_vla.utils.media.Film`): finer than those for people."""
+"""Compression of videos for models (`mme_vla.utils.media`), finer than that of videos for people."""
 
 _REMEDY = "Build the training data again."
 
@@ -27,7 +27,7 @@ def read_image(path: Path) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Clip:
-    """What a Qwen model looks at of a video.
+    """Frames of a video that a Qwen model reads.
 
     frames: [n, H, W, 3] uint8. indices: [n] their places in the video. length: of the whole video, in frames.
     """
@@ -61,10 +61,10 @@ class Clip:
 def sample_video(
     length: int, fps: float = FPS, rate: float = 2.0, least: int = 4, most: int = VIDEO_FRAMES
 ) -> np.ndarray:
-    """Which frames of a video a Qwen model looks at: `rate` a second, within bounds, an even number of them.
+    """Indices of the frames of a video that a Qwen model reads: `rate` a second, within bounds, an even number of them.
 
     Args:
-        length: frames of the video. fps: of the video. rate: frames looked at a second.
+        length: frames of the video. fps: of the video. rate: frames a second.
         least, most: bounds of their number; a shorter video has fewer.
 
     Returns:

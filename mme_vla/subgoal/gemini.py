@@ -237,7 +237,7 @@ class Gemini(SubgoalPredictor):
         settings: keys of `mme_vla.subgoal.models.connection.Settings`.
     """
 
-    speaks = "gemini"
+    provider = "gemini"
 
     def __init__(
         self,
@@ -254,7 +254,7 @@ class Gemini(SubgoalPredictor):
         if wait < 0:
             raise UserError(f"wait={wait} must be a number of steps, 0 or more.")
         self.wait, self.workers = wait, workers
-        self.api = make_api(self.speaks, settings, "subgoal", self.usage, client)
+        self.api = make_api(self.provider, settings, "subgoal", self.usage, client)
         self._lock = threading.Lock()
 
     def start_episode(self, goal: str, video: np.ndarray | None = None, task: str = "") -> GeminiEpisode:
@@ -298,10 +298,10 @@ class Gemini(SubgoalPredictor):
 
 @SUBGOALS.register("openai")
 class OpenAI(Gemini):
-    """The same questions to any endpoint that speaks OpenAI's chat completions; videos are shown as images.
+    """The same questions to any endpoint with OpenAI's chat completions; videos are shown as images.
 
     client: an object with openai's `client.chat.completions.create`; None makes one.
-    settings: keys of `mme_vla.subgoal.models.openai_chat.OpenAISettings`.
+    settings: keys of `mme_vla.subgoal.models.connection.OpenAISettings`.
     """
 
-    speaks = "openai"
+    provider = "openai"

@@ -83,8 +83,8 @@ class Memer(VLMPredictor):
     def predict_due(self, episodes: Sequence[MemerEpisode]) -> list[Subgoal]:
         """Ask for all of them in one batch."""
         _ = [episode.frame for episode in episodes]  # every episode has seen something
-        answers = self.ask([self.question(episode) for episode in episodes])
-        return [self._read(e, completion.text) for e, completion in zip(episodes, answers, strict=True)]
+        completions = self.ask([self.question(episode) for episode in episodes])
+        return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
 
     def _read(self, episode: MemerEpisode, reply: str) -> Subgoal:
         recent = episode.recent(self.recent, self.stride)

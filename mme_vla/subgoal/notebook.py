@@ -162,7 +162,7 @@ class Notebook:
             note.check(before, finished is not None)  # type: ignore[arg-type]
             notes[name] = note
         if len(notes) > MOST_NOTES:
-            raise MalformedReply(f"the notebook has room for {MOST_NOTES} notes")
+            raise MalformedReply(f"the notebook takes {MOST_NOTES} notes")
         return Notebook(notes, self.finished if finished is None else (*self.finished, finished))
 
     def in_words(self) -> str:

@@ -16,7 +16,7 @@ from mme_vla.subgoal.text import MalformedReply, parse_subgoal, subgoal_system, 
 
 
 class VLMPredictor(SubgoalPredictor):
-    """What `qwenvl` and `memer` share: one model that answers for all episodes at once.
+    """What `qwenvl` and `memer` share: one model for a batch of all episodes.
 
     Args:
         model: a repository on the hub, a folder, or `tiny`. adapter: LoRA weights to add; None for none.
@@ -45,12 +45,12 @@ class VLMPredictor(SubgoalPredictor):
     def ask(self, questions: Sequence[Question]) -> list[Completion]:
         """Answer and keep count."""
         started = time.perf_counter()
-        answers = self.vlm.generate(questions, self.max_new_tokens)
+        completions = self.vlm.generate(questions, self.max_new_tokens)
         self.usage.seconds += time.perf_counter() - started
-        self.usage.calls += len(answers)
-        self.usage.input_tokens += sum(completion.input_tokens for completion in answers)
-        self.usage.output_tokens += sum(completion.output_tokens for completion in answers)
-        return answers
+        self.usage.calls += len(completions)
+        self.usage.input_tokens += sum(completion.input_tokens for completion in completions)
+        self.usage.output_tokens += sum(completion.output_tokens for completion in completions)
+        return completions
 
 
 class QwenEpisode(SubgoalEpisode):
@@ -63,7 +63,7 @@ class QwenEpisode(SubgoalEpisode):
 
 @SUBGOALS.register("qwenvl")
 class QwenVL(VLMPredictor):
-    """Asks for the next subgoal, given all that were different from the one before.
+    """Predicts the next subgoal, given all that were different from the one before.
 
     Args:
         hold: keep the first subgoals of three tasks for a fixed time, as released.
@@ -98,8 +98,8 @@ class QwenVL(VLMPredictor):
 
     def predict_due(self, episodes: Sequence[QwenEpisode]) -> list[Subgoal]:
         """Ask for all of them in one batch."""
-        answers = self.ask([self.question(episode) for episode in episodes])
-        return [self._read(e, completion.text) for e, completion in zip(episodes, answers, strict=True)]
+        completions = self.ask([self.question(episode) for episode in episodes])
+        return [self._read(e, completion.text) for e, completion in zip(episodes, completions, strict=True)]
 
     def _read(self, episode: QwenEpisode, reply: str) -> Subgoal:
         try:

@@ -25,6 +25,7 @@ from torch import Tensor, distributed, nn
 from mme_vla.errors import UserError, listed
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import STATE, checkpoint_name, checkpoints_in, step_of
+from mme_vla.policy.saving import save_settings
 from mme_vla.policy.tensor_files import (
     assign_tensors,
     cast,
@@ -102,7 +103,7 @@ def save_shards(
     keep: KeepRule,
     hurry: bool = False,
 ) -> Path:
-    """Begin to write `folder`/step_… of a sharded run; all processes call it, and continue when `writer` has its copies.
+    """Begin to write `folder`/step_… of a sharded run; all processes call it and wait for the copies alone.
 
     Args:
         hurry: let the checkpoint appear as soon as it can be resumed from, and write the policy's weights into it
@@ -116,7 +117,7 @@ def save_shards(
     about: list[str] = []
     if first:
         fresh_folder(draft)
-        about = [*policy.save_about(draft), STATE]
+        about = [*save_settings(policy, draft), STATE]
 
     def finish() -> None:
         place = draft

@@ -13,6 +13,7 @@ from mme_vla.data.sources import default_val_episodes, open_sources, split_episo
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import TrainsOnKeyframes, with_vision_memory
 from mme_vla.processing.base import STATS_FILE
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.prompt import SubgoalText
@@ -55,24 +56,25 @@ def prepare_data(
         check_sums(stats_from, [STATS_FILE])
         processor.stats = NormStats.load(inside(stats_from, STATS_FILE))
     else:
-        counted = processor.counted
+        counted = processor.stats_spec
         processor.stats = compute_norm_stats(
-            sources, split.train, counted.horizon or processor.horizon, offset, seed, policy.embodiment,
+            sources, split.train, counted.horizon or processor.embodiment.action.horizon, offset, seed, policy.embodiment,
             every=counted.every, extremes=counted.extremes, exact=counted.exact,
             video=counted.video,
         )  # fmt: skip
     subgoal = SubgoalText.from_config(policy.config.get("subgoal_text"))
     caches = None
     if policy.memory is not None:
-        cache, encoder = data["cache"], encoder or policy.vision_fingerprint()
+        cache, source_policy = data["cache"], with_vision_memory(policy)
+        encoder = encoder or source_policy.vision_fingerprint()
         caches = [
             ensure_cache(
                 source,
                 policy.memory,
-                policy.encode_frames,
+                source_policy.encode_frames,
                 encoder,
                 root=cache["root"],
-                dtype=str(policy.history_dtype).removeprefix("torch."),
+                dtype=str(source_policy.history_dtype).removeprefix("torch."),
                 max_build_frames=cache["max_build_frames"],
                 batch_size=cache["batch_size"],
                 command=cache_command,
@@ -81,11 +83,10 @@ def prepare_data(
         ]
 
     def side(episodes: list[Any], held_out: bool = False) -> TrainingDataset | KeyframeDataset:
-        if processor.samples == "keyframes":
-            return KeyframeDataset(
-                sources, processor, policy.keyframes, episodes=episodes, seed=seed, sampled=not held_out
-            )
-        kind = GroupDataset if processor.group_size > 1 else TrainingDataset
+        if processor.samples.kind == "keyframes":
+            keyframes = policy.keyframes if isinstance(policy, TrainsOnKeyframes) else 1
+            return KeyframeDataset(sources, processor, keyframes, episodes=episodes, seed=seed, sampled=not held_out)
+        kind = GroupDataset if processor.samples.group_size > 1 else TrainingDataset
         return kind(
             sources, processor, policy.memory, caches, episodes=episodes, action_offset=offset,
             mask_padding=data["mask_padding"], jitter=data["jitter"] and not held_out, subgoal=subgoal, seed=seed,

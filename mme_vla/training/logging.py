@@ -1,4 +1,4 @@
-"""Where the numbers go: a JSON-lines file in every run folder, TensorBoard by default, Weights & Biases on request."""
+"""Numbers of a run: `metrics.jsonl` in its folder, a line on the screen, and one of accelerate's trackers."""
 
 import json
 import math
@@ -8,11 +8,21 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Protocol, Self
+from typing import IO, Any, Literal, Self
 
+import numpy as np
 import torch
+from accelerate.tracking import (
+    GeneralTracker,
+    MLflowTracker,
+    TensorBoardTracker,
+    TrackioTracker,
+    WandBTracker,
+)
+from PIL import Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor
@@ -20,7 +30,7 @@ from torch import Tensor
 from mme_vla.errors import UserError, missing_extra
 from mme_vla.registry import Registry
 from mme_vla.training.runs import METRICS
-from mme_vla.utils import parse_json, read_text, write_atomically
+from mme_vla.utils import read_lines, write_atomically
 
 
 class Window:
@@ -149,162 +159,155 @@ def resident_gib() -> float:
 
 
 LOGGERS: Registry[Any] = Registry("logger")
-"""Constructors called with (run folder, configuration, **the section's other keys)."""
-
-
-class Logger(Protocol):
-    """A place for numbers."""
-
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        """Record values after `step` updates."""
-        ...
-
-    def log_image(self, step: int, name: str, path: Path) -> None:
-        """Record an image file."""
-        ...
-
-    def close(self) -> None:
-        """Have everything on disk, or sent."""
-        ...
-
-
-class JsonLines:
-    """`metrics.jsonl`: one object a line, first `step`. A resumed run cuts off what lies beyond its first step."""
-
-    def __init__(self, folder: Path, first_step: int) -> None:
-        path = folder / METRICS
-        lines = [line for line in read_metrics(folder) if line["step"] <= first_step]
-        with write_atomically(path) as draft:
-            draft.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        self._file = path.open("a", buffering=1)
-
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        self._file.write(json.dumps({"step": step, **values}) + "\n")
-
-    def log_image(self, step: int, name: str, path: Path) -> None:
-        """Images lie in the run folder already."""
-
-    def close(self) -> None:
-        self._file.close()
+"""Makers of accelerate trackers, called with (run folder, configuration, updates already done, **the section's other
+keys)."""
 
 
 @LOGGERS.register("tensorboard")
-class TensorBoard:
+def tensorboard_tracker(
+    folder: Path, config: Mapping[str, Any], first_step: int, flush_secs: int = 30
+) -> GeneralTracker:
     """Event files in `tensorboard/` of the run folder: `tensorboard --logdir outputs`."""
-
-    def __init__(self, folder: Path, config: Mapping[str, Any], first_step: int = 0, flush_secs: int = 30) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
-        # Of an interrupted run, TensorBoard drops the points that this one writes again.
-        self._writer = SummaryWriter(
-            str(folder / "tensorboard"), purge_step=first_step + 1 if first_step else None, flush_secs=flush_secs
-        )
-
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        for name, value in values.items():
-            self._writer.add_scalar(name, value, step)
-
-    def log_image(self, step: int, name: str, path: Path) -> None:
-        import numpy as np
-        from PIL import Image
-
-        with Image.open(path) as image:
-            self._writer.add_image(name, np.asarray(image.convert("RGB")), step, dataformats="HWC")
-
-    def close(self) -> None:
-        self._writer.close()
+    # Of an interrupted run, TensorBoard drops the points that this one writes again.
+    purge = first_step + 1 if first_step else None
+    return TensorBoardTracker("tensorboard", folder, purge_step=purge, flush_secs=flush_secs)
 
 
 @LOGGERS.register("wandb")
-class WeightsAndBiases:
-    """A Weights & Biases run under the run folder's name; a resumed run continues in the same one."""
+def wandb_tracker(
+    folder: Path,
+    config: Mapping[str, Any],
+    first_step: int,
+    project: str = "mme_vla",
+    entity: str | None = None,
+    group: str | None = None,
+    tags: list[str] | None = None,
+    mode: Literal["online", "offline", "disabled"] = "online",
+) -> GeneralTracker:
+    """A Weights & Biases run under the run folder's name; a resumed run continues the same one."""
+    return WandBTracker(
+        project, entity=entity, group=group, tags=tags, mode=mode, dir=str(folder), name=_run_name(folder),
+        id=_run_id(folder), resume="allow", config=dict(config),
+    )  # fmt: skip
 
-    def __init__(
-        self,
-        folder: Path,
-        config: Mapping[str, Any],
-        first_step: int = 0,
-        project: str = "mme_vla",
-        entity: str | None = None,
-        group: str | None = None,
-        tags: list[str] | None = None,
-        mode: Literal["online", "offline", "disabled"] = "online",
-    ) -> None:
-        self.check()
-        import wandb
 
-        record = folder / "wandb_id"
-        if not record.is_file():
-            with write_atomically(record) as draft:
-                draft.write_text(secrets.token_hex(4))
-        self._wandb = wandb
-        self._run = wandb.init(
-            project=project, entity=entity, group=group, tags=tags, mode=mode, dir=str(folder),
-            name=f"{folder.parent.name}/{folder.name}", id=record.read_text(), resume="allow", config=dict(config),
-        )  # fmt: skip
+@LOGGERS.register("trackio")
+def trackio_tracker(
+    folder: Path,
+    config: Mapping[str, Any],
+    first_step: int,
+    project: str = "mme_vla",
+    group: str | None = None,
+    space_id: str | None = None,
+) -> GeneralTracker:
+    """A Trackio run, on this machine or in a Space of the hub; a resumed run continues the same one."""
+    name = f"{_run_name(folder)}-{_run_id(folder)}"
+    return TrackioTracker(
+        project, name=name, group=group, space_id=space_id, resume="allow", embed=False, config=dict(config)
+    )
 
-    @staticmethod
-    def check() -> None:
-        """Find out early whether the package is there."""
-        try:
-            import wandb  # noqa: F401
-        except ImportError:
-            # TensorBoard, the default, needs nothing more.
-            raise missing_extra("logger=wandb", "wandb") from None
 
-    def write(self, step: int, values: Mapping[str, float]) -> None:
-        self._run.log(dict(values), step=step)
+@LOGGERS.register("mlflow")
+def mlflow_tracker(
+    folder: Path,
+    config: Mapping[str, Any],
+    first_step: int,
+    project: str = "mme_vla",
+    tracking_uri: str | None = None,
+) -> GeneralTracker:
+    """An MLflow run, in a file of the run folder or on a server; a resumed run continues the same one."""
+    import mlflow
 
-    def log_image(self, step: int, name: str, path: Path) -> None:
-        self._run.log({name: self._wandb.Image(str(path))}, step=step)
+    mlflow.set_tracking_uri(tracking_uri or f"sqlite:///{(folder / 'mlflow.db').absolute()}")
+    record = folder / "mlflow_id"
+    run_id = record.read_text() if record.is_file() else None
+    artifacts = None if tracking_uri else (folder / "mlflow").absolute().as_uri()
+    return MLflowTracker(project, artifacts, run_id=run_id, run_name=_run_name(folder))
 
-    def close(self) -> None:
-        self._run.finish()
+
+def _run_name(folder: Path) -> str:
+    return f"{folder.parent.name}/{folder.name}"
+
+
+def _run_id(folder: Path) -> str:
+    """The tracker's id of this run, made once."""
+    record = folder / "wandb_id"
+    if not record.is_file():
+        with write_atomically(record) as draft:
+            draft.write_text(secrets.token_hex(4))
+    return record.read_text()
 
 
 class Loggers:
-    """Several loggers as one; on processes other than the first, none."""
+    """`metrics.jsonl` of a run, and its tracker. Processes other than the first have neither and record nothing."""
 
-    def __init__(self, loggers: list[Logger]) -> None:
-        self._loggers = loggers
+    def __init__(self, file: IO[str] | None = None, tracker: GeneralTracker | None = None) -> None:
+        self._file, self._tracker = file, tracker
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
-        for logger in self._loggers:
-            logger.write(step, values)
+        """Record values after `step` updates."""
+        if self._file is not None:
+            self._file.write(json.dumps({"step": step, **values}) + "\n")
+        if self._tracker is not None:
+            self._tracker.log(dict(values), step=step)
 
     def log_image(self, step: int, name: str, path: Path) -> None:
-        for logger in self._loggers:
-            logger.log_image(step, name, path)
+        """Record an image file of the run folder."""
+        match self._tracker:
+            case TensorBoardTracker() as tracker:
+                with Image.open(path) as image:
+                    pixels = np.asarray(image.convert("RGB"))[None]
+                tracker.log_images({name: pixels}, step, dataformats="NHWC")
+            case WandBTracker() as tracker:
+                tracker.log_images({name: [str(path)]}, step)
+            case MLflowTracker() as tracker:
+                tracker.log_artifact(str(path))
 
     def close(self) -> None:
-        for logger in self._loggers:
-            logger.close()
+        """Write or send everything."""
+        if self._file is not None:
+            self._file.close()
+        if self._tracker is not None:
+            self._tracker.finish()
 
 
 def check_logger(config: Mapping[str, Any]) -> None:
-    """Make sure, before any long work, that the logger which the section `logger` names can be used."""
-    section = config.get("logger") or {}
-    if section:
-        getattr(LOGGERS[section["name"]], "check", lambda: None)()
+    """Raise an error, before any long work, if the package of the logger that the section `logger` names is missing."""
+    name = (config.get("logger") or {}).get("name")
+    if name in ("wandb", "trackio", "mlflow") and not _is_installed(name):
+        if name == "wandb":
+            raise missing_extra("logger=wandb", "wandb")
+        raise UserError(f"logger={name} needs the package {name}: pip install -c constraints.txt {name}")
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        return find_spec(package) is not None
+    except ValueError:  # a module without a specification
+        return False
 
 
 def open_loggers(folder: Path, config: Mapping[str, Any], first_step: int) -> Loggers:
-    """The JSON-lines file and the logger that the section `logger` names, if any."""
-    section = dict(config.get("logger") or {})
+    """Open `metrics.jsonl` and the tracker that the section `logger` names, if any.
+
+    A resumed run removes the lines that lie beyond its first step.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    loggers: list[Logger] = []
-    if section:
-        loggers.append(LOGGERS.build(section, folder, config, first_step=first_step))
-    return Loggers([JsonLines(folder, first_step), *loggers])
+    tracker = None
+    if section := dict(config.get("logger") or {}):
+        check_logger(config)
+        tracker = LOGGERS.build(section, folder, config, first_step=first_step)
+        tracker.start()
+        if isinstance(tracker, MLflowTracker):
+            with write_atomically(folder / "mlflow_id") as draft:
+                draft.write_text(tracker.tracker.info.run_id)
+    lines = [line for line in read_metrics(folder) if line["step"] <= first_step]
+    with write_atomically(folder / METRICS) as draft:
+        draft.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return Loggers((folder / METRICS).open("a", buffering=1), tracker)
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`; a last line cut off by a kill is left out."""
+    """The lines of a run's `metrics.jsonl`."""
     path = folder / METRICS
-    lines = []
-    for line in read_text(path, "metrics", limit=2**30).splitlines() if path.exists() else []:
-        try:
-            lines.append(parse_json(line, str(path), finite=False))
-        except UserError:
-            break
-    return lines
+    return read_lines(path, dict, "metrics", finite=False) if path.exists() else []

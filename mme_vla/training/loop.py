@@ -13,8 +13,11 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from mme_vla.data.dataset import TrainingDataset
+from mme_vla.errors import UserError
 from mme_vla.memory.base import Memory
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import AugmentsImages
+from mme_vla.speed.recompute import Recomputes
 from mme_vla.training.checkpoint import (
     checkpoint_name,
     restore,
@@ -27,13 +30,12 @@ from mme_vla.training.data import SplitData
 from mme_vla.training.logging import Loggers, ProgressLine, Window, memory_gib, read_metrics
 from mme_vla.training.open_loop import error_lines, open_loop, plot_open_loop
 from mme_vla.training.optim import EMA, clip_gradients, make_optimizer, scheduled_rate
-from mme_vla.training.order import BatchOrder, generator_for, readers, seed_of, size_of
+from mme_vla.training.order import BatchOrder, Collate, Samples, Validation, generator_for, readers, seed_of, size_of
 from mme_vla.training.parallel import full_value, gathered, reshard, shard
 from mme_vla.training.runs import PLOT, SUMMARY, Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import ShardWriter
 from mme_vla.training.stopping import leave_signals_alone, stop_requests
-from mme_vla.training.validation import Collate, Samples, Validation
 from mme_vla.types import send
 from mme_vla.utils import write_atomically
 
@@ -97,7 +99,13 @@ class Trainer:
         if not self.sharded:
             policy.to(accelerator.device)
         self.policy = policy.train()
-        policy.recompute(settings.recomputation)
+        if settings.recomputation:
+            if not isinstance(policy, Recomputes):
+                raise UserError(
+                    f"train.gradient_checkpointing=true: {type(policy).__name__} cannot recompute activations; set it "
+                    "to false."
+                )
+            policy.recompute(settings.recomputation)
         if settings.compile:
             policy.compile()
         if self.sharded:
@@ -164,10 +172,11 @@ class Trainer:
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
+        draws = self.policy.training_noise(settings.batch_size, generator_for(settings.seed, "train", step))
         # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)
-        draws = {**draws, **self.policy.image_draws(settings.batch_size, generator)}
+        if isinstance(self.policy, AugmentsImages):
+            draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():

@@ -1,7 +1,7 @@
 """How processes share one training run: every one with all weights (DDP), or each with a part of them (FSDP2).
 
 Sharded, a process keeps 1/n of the weights, gradients, moments and averages, and gathers a group of weights
-(`Policy.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
+(`Sharded.shard_groups`) right before it is needed. All of it is PyTorch's `fully_shard`; launchers stay `torchrun` and
 `accelerate launch`.
 """
 
@@ -20,7 +20,8 @@ from torch.distributed.tensor import DTensor
 
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.policy.base import Policy
-from mme_vla.speed.sharding import float32_modules
+from mme_vla.policy.saving import recompute_buffers
+from mme_vla.speed.sharding import Sharded, ShardGroup, float32_modules, stacked_layers
 
 STRATEGIES = ("auto", "ddp", "fsdp")
 FULL_STATE = StateDictOptions(full_state_dict=True, cpu_offload=True)
@@ -76,14 +77,15 @@ def shard(policy: Policy, mesh: DeviceMesh, dtype: torch.dtype, compiled: bool =
     full = dict(policy.state_dict()) if distributed.get_rank() == 0 else {}
     full = {name: tensor.detach().cpu() for name, tensor in full.items()}
     if distributed.get_rank() != 0:
-        policy.compute_unsaved()
+        recompute_buffers(policy)
     low = None if dtype == torch.float32 else dtype
 
     def wrap(module: nn.Module | list[nn.Module], kind: torch.dtype | None) -> None:
         rules = MixedPrecisionPolicy(param_dtype=kind, reduce_dtype=torch.float32, cast_forward_inputs=False)
         fully_shard(module, mesh=mesh, mp_policy=rules)
 
-    for group in policy.shard_groups():
+    groups = policy.shard_groups() if isinstance(policy, Sharded) else map(ShardGroup, stacked_layers(policy))
+    for group in groups:
         exact = [] if group.full or low is None or compiled else float32_modules(group.module)
         if exact:
             wrap(exact, None)

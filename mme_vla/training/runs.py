@@ -150,9 +150,16 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         **config,
         "embodiment": embodiment_of(config).to_dict(),
         "train": {**train, **config["train"]},
+        "data": _with_default_split(config.get("data") or {}),
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
     }
+
+
+def _with_default_split(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `data` as it is written now: runs on the shipped sample named the episode that is now the default."""
+    is_default = list(data.get("sources") or []) == ["sample"] and data.get("val_episodes") == [3]
+    return {**data, "val_episodes": None} if is_default else dict(data)
 
 
 def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str, Any]:

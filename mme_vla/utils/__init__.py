@@ -1,4 +1,4 @@
-"""Files as they really are: damaged, shared, half written, from untrusted sources. Nothing here knows what is in them."""
+"""Files of the system: reading, writing, locks, checksums. Nothing here depends on what a file means."""
 
 from mme_vla.utils.checksums import (
     SUMS,
@@ -6,12 +6,10 @@ from mme_vla.utils.checksums import (
     check_sums,
     file_sum,
     sum_line,
-    to_json,
-    verified,
-    with_checksum,
     write_sums,
 )
 from mme_vla.utils.io import (
+    append_lines,
     decoding,
     disk_trouble,
     draft_of,
@@ -22,12 +20,17 @@ from mme_vla.utils.io import (
     parse_json,
     read_bytes,
     read_json,
-    read_json_lines,
+    read_lines,
     read_text,
     remove_drafts,
     require_file,
     safe_name,
+    to_dataclass,
+    to_json,
+    to_line,
     user_cache,
+    verified,
+    with_checksum,
     write_atomically,
     write_json,
 )
@@ -39,6 +42,7 @@ __all__ = [
     "SUMS",
     "FolderLock",
     "Sums",
+    "append_lines",
     "check_sums",
     "claim_plan",
     "decoding",
@@ -54,13 +58,15 @@ __all__ = [
     "parse_json",
     "read_bytes",
     "read_json",
-    "read_json_lines",
+    "read_lines",
     "read_text",
     "remove_drafts",
     "require_file",
     "safe_name",
     "sum_line",
+    "to_dataclass",
     "to_json",
+    "to_line",
     "user_cache",
     "verified",
     "with_checksum",

@@ -1,15 +1,12 @@
 """A checksum of every file of a folder, in the layout of `sha256sum`, which can check it as well: `sha256sum -c`."""
 
 import hashlib
-import json
 import re
-import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError
 from mme_vla.utils.io import inside, read_text, write_atomically
 
 SUMS = "SHA256SUMS"
@@ -106,32 +103,3 @@ def _read_sums(sums: Path) -> dict[str, str]:
         elif line:
             raise UserError(f"{sums}, line {number} is damaged: expected a SHA-256 and a file's name.")
     return table
-
-
-SEAL = "crc32"
-
-
-def to_json(value: Any) -> Any:
-    """`value` as JSON gives it back: tuples are lists, keys are texts."""
-    return json.loads(json.dumps(value))
-
-
-def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
-    """`values` and, under `crc32`, a checksum of them that does not depend on the order of keys."""
-    return {**values, SEAL: _sum(values)}
-
-
-def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """`values` without their seal; those that were written without one, manually or long ago, are taken as they are."""
-    inner = {key: value for key, value in values.items() if key != SEAL}
-    if SEAL in values and values[SEAL] != _sum(inner):
-        raise UserError(
-            f"{source} is not what was written: its {SEAL} is {brief(values[SEAL], 20)}, that of its content "
-            f"{_sum(inner)!r}. It is damaged; if you changed it on purpose, take {SEAL} out."
-        )
-    return inner
-
-
-def _sum(values: Mapping[str, Any]) -> str:
-    # ASCII, so that half characters, which no encoding of text takes, count as well.
-    return f"{zlib.crc32(json.dumps(values, sort_keys=True, separators=(',', ':')).encode('ascii')):08x}"

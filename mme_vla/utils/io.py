@@ -1,4 +1,7 @@
-"""The one reader of text and JSON. Whatever lies in a file's place, the answer is its content or one clear sentence."""
+"""Reads and writes files: text, JSON, lines of JSON. A damaged or missing file raises one clear error.
+
+Checks happen when a file is opened; what a reader returns is trusted from then on.
+"""
 
 import errno
 import json
@@ -7,13 +10,18 @@ import os
 import re
 import socket
 import stat
+import types
 import uuid
-from collections.abc import Iterator
+import warnings
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import MISSING, fields
+from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
 
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError, brief, listed
 
 # "errno = 28" (HDF5), "os error 28" (Rust)
 _NUMBER = re.compile(r"\b(?:errno|os error)(?: ?= ?| )(\d+)\b", re.IGNORECASE)
@@ -165,6 +173,7 @@ def user_cache(kind: str) -> Path:
 _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "a text"}
 
 TEXT_LIMIT = 64 * 2**20  # bytes; the largest files of text here, tables of subgoals and statistics, stay far below
+LOG_LIMIT = 2**30  # bytes of a file of lines
 
 
 def read_bytes(path: Path, what: str = "data", limit: int = TEXT_LIMIT) -> bytes:
@@ -240,14 +249,127 @@ def read_json(
     return parse_json(read_text(path, what, limit), str(path), kind, finite)
 
 
-def read_json_lines(
-    path: Path, what: str = "lines of JSON", limit: int = TEXT_LIMIT, finite: bool = True
-) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield (line number from 1, object) for every line that is not empty."""
+def read_lines[T](
+    path: Path,
+    kind: Callable[[dict[str, Any]], T],
+    what: str = "lines of JSON",
+    *,
+    limit: int = LOG_LIMIT,
+    finite: bool = True,
+) -> list[T]:
+    """Read a file of JSON lines, one object each: episode records, probe lines, rows, logs.
+
+    A line's `crc32` (see `with_checksum`) is verified and removed. Empty lines are skipped. A half-written last line
+    without a line end is ignored with a warning: a killed process was writing it.
+
+    Args:
+        kind: makes a value from a line's object, such as `partial(to_dataclass, EpisodeLine)`, or `dict`.
+        finite: raise an error for NaN and infinities.
+    """
     # Not splitlines(): a JSON text may hold U+2028, which is no line end in a file.
-    for number, line in enumerate(read_text(path, what, limit).split("\n"), start=1):
-        if line.strip():
-            yield number, parse_json(line, f"{path}, line {number}", finite=finite)
+    *complete, last = read_bytes(path, what, limit).split(b"\n")
+    values = []
+    for number, line in enumerate([*complete, last], start=1):
+        if not line.strip():
+            continue
+        source = f"{path}, line {number}"
+        try:
+            values.append(_read_line(line, kind, source, finite))
+        except UserError:
+            if number <= len(complete):
+                raise
+            warnings.warn(f"{path}: ignored a half-written last line ({len(line)} bytes).", stacklevel=2)
+    return values
+
+
+def _read_line[T](line: bytes, kind: Callable[[dict[str, Any]], T], source: str, finite: bool) -> T:
+    row = verified(parse_json(line, source, finite=finite), source)
+    try:
+        return kind(row)
+    except UserError as error:
+        raise UserError(f"{source}: {error}") from None
+
+
+def append_lines(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Append objects as JSON lines, each with its checksum, in one write that is on disk when this returns."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as file:
+        file.write("".join(to_line(row) + "\n" for row in rows).encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def to_line(row: Mapping[str, Any]) -> str:
+    """An object as one JSON line with its checksum, without the line end."""
+    return json.dumps(with_checksum(row), ensure_ascii=False, separators=(",", ":"))
+
+
+def to_dataclass[T](cls: type[T], values: Mapping[str, Any]) -> T:
+    """Build a dataclass from an object of a file: every field is known, present and of the annotated type."""
+    types, members = _type_hints(cls), {member.name: member for member in fields(cls)}  # type: ignore[arg-type]
+    required = [n for n, m in members.items() if m.default is MISSING and m.default_factory is MISSING]
+    missing, unknown = sorted(set(required) - set(values)), sorted(set(values) - set(members))
+    if missing or unknown:
+        raise UserError(
+            f"not a {cls.__name__}: missing {listed(missing) or 'nothing'}, unknown {listed(unknown) or 'nothing'}."
+        )
+    for name, value in values.items():
+        if not _is_of(value, types[name]):
+            raise UserError(f"{cls.__name__}.{name}={brief(value)}: expected {_type_name(types[name])}.")
+    return cls(**values)
+
+
+@cache
+def _type_hints(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _type_name(expected: Any) -> str:
+    return expected.__name__ if isinstance(expected, type) and not get_args(expected) else str(expected)
+
+
+def _is_of(value: Any, expected: Any) -> bool:
+    """Whether a JSON value has a type such as `int`, `float | None` or `list[int]`; an integer is a float as well."""
+    origin, inner = get_origin(expected), get_args(expected)
+    if expected is Any:
+        return True
+    if origin in (Union, types.UnionType):
+        return any(_is_of(value, option) for option in inner)
+    if origin is list:
+        return isinstance(value, list) and all(_is_of(item, inner[0]) for item in value)
+    if expected in (int, float):
+        numbers = int if expected is int else (int, float)
+        return isinstance(value, numbers) and not isinstance(value, bool) and not abs(value) >= 2**63
+    return isinstance(value, origin or expected)
+
+
+CHECKSUM = "crc32"
+
+
+def with_checksum(values: Mapping[str, Any]) -> dict[str, Any]:
+    """`values` and, under `crc32`, a checksum of them that does not depend on the order of keys."""
+    return {**values, CHECKSUM: _crc(values)}
+
+
+def verified(values: Mapping[str, Any], source: str) -> dict[str, Any]:
+    """`values` without their checksum, which must fit. Values without a checksum are accepted."""
+    inner = {key: value for key, value in values.items() if key != CHECKSUM}
+    if CHECKSUM in values and values[CHECKSUM] != _crc(inner):
+        raise UserError(
+            f"{source} is not what was written: its {CHECKSUM} is {brief(values[CHECKSUM], 20)}, that of its content "
+            f"{_crc(inner)!r}. It is damaged; if you changed it on purpose, remove {CHECKSUM}."
+        )
+    return inner
+
+
+def _crc(values: Mapping[str, Any]) -> str:
+    # ASCII, so that half characters, which no encoding of text takes, count as well.
+    return f"{zlib.crc32(json.dumps(values, sort_keys=True, separators=(',', ':')).encode('ascii')):08x}"
+
+
+def to_json(value: Any) -> Any:
+    """`value` as JSON returns it: tuples are lists, keys are texts."""
+    return json.loads(json.dumps(value))
 
 
 def _finite(text: str) -> float:

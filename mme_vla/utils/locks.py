@@ -1,7 +1,6 @@
-"""One process at a time in a folder. The operating system lets go when the process ends, however it ends."""
+"""One process at a time in a folder, and work folders that a repeated command recognises."""
 
 import errno
-import fcntl
 import os
 import shutil
 import socket
@@ -10,93 +9,69 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from filelock import FileLock, Timeout
+
 from mme_vla.errors import UserError
 from mme_vla.utils.io import is_draft, name_place, read_json, remove_drafts, write_json
 
 LOCK = ".lock"
-_locked: set[int] = set()  # descriptors
-
-
-def _release_all() -> None:
-    """A forked process holds nothing: it would continue holding the folder when this process is gone."""
-    while _locked:
-        os.close(_locked.pop())
-
-
-os.register_at_fork(after_in_child=_release_all)
+_NO_LOCKS = (errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK)  # errors of a file system without locks
 
 
 class FolderLock:
-    """Hold a folder for this process, as a context manager or from `acquire()` to `release()`.
+    """Lock a folder for this process, as a context manager or from `acquire()` to `release()`.
 
-    The lock is the file `.lock` in the folder. Whoever lets go removes it, and the folder too if nothing else is in it;
-    after a kill it stays behind, without meaning.
+    The lock is a file in the folder. `release` removes it, and the folder if nothing else is in it. After a kill the
+    file stays, unlocked. A forked process does not have its parent's lock.
+    Deleting the object unlocks the folder.
 
     Args:
-        folder: made if need be. what: it is for, in the message.
-        name: of the lock's file, where several kinds of holders share a folder.
+        folder: made if need be. what: its purpose, for the message. name: of the file, where several share a folder.
     """
 
     def __init__(self, folder: Path, what: str = "run", name: str = LOCK) -> None:
         self.folder, self.what, self.path = Path(folder), what, Path(folder) / name
-        self._descriptor: int | None = None
+        self._process = os.getpid()
+        # A second attempt counts where the process before removes the file between opening and locking it.
+        self._lock = FileLock(self.path, timeout=0.1, poll_interval=0.02, thread_local=False, fallback_to_soft=False)
 
     def acquire(self) -> Self:
-        """Take the lock, making the folder if need be."""
+        """Lock the folder; raises an error that names the process which has locked it."""
         for last in (False,) * 99 + (True,):
+            self.folder.mkdir(parents=True, exist_ok=True)
             try:
-                self.folder.mkdir(parents=True, exist_ok=True)
-                descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
-            except FileNotFoundError:  # its last holder has just removed the folder
+                self._lock.acquire()
+                break
+            except FileNotFoundError:  # the process before has just removed the folder
                 if last:
                     raise
-                continue
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                holder = os.pread(descriptor, 200, 0).decode(errors="replace").strip()
-                os.close(descriptor)
-                if error.errno not in (errno.EAGAIN, errno.EACCES):  # a file system without locks
-                    return self
+            except Timeout:
                 raise UserError(
-                    f"{self.folder} is in use by another {self.what} ({holder or 'a process that has just started'}). "
+                    f"{self.folder} is in use by another {self.what} ({self._holder()}). "
                     "Wait until it has ended, stop it, or write to another folder."
                 ) from None
-            self._descriptor = descriptor
-            _locked.add(descriptor)
-            if self._in_place():
-                break
-            self._forget()  # what we hold was removed by its last holder between our opening and our locking it
-        try:
-            os.ftruncate(descriptor, 0)
-            os.pwrite(descriptor, f"process {os.getpid()} on {socket.gethostname()}".encode(), 0)
-        except OSError:  # a full disk: the lock holds without words
-            pass
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+                return self
+        with suppress(OSError):  # a full disk: the lock holds without its text
+            self.path.write_text(f"process {os.getpid()} on {socket.gethostname()}")
         return self
 
     def release(self) -> None:
-        """Let go of the folder; harmless if it is not held."""
-        if self._descriptor not in _locked:
+        """Unlock the folder; harmless if this process has not locked it."""
+        if os.getpid() != self._process or not self._lock.is_locked:
             return
-        with suppress(OSError):  # the folder may have been moved or removed by its holder
-            if self._in_place():
-                self.path.unlink()
-                self.folder.rmdir()
-        self._forget()
+        with suppress(OSError):  # the folder may have been moved or removed meanwhile
+            self.path.unlink()
+            self.folder.rmdir()
+        self._lock.release()
 
-    def _in_place(self) -> bool:
-        """Whether the file that is locked is still the one under the lock's name."""
-        assert self._descriptor is not None
+    def _holder(self) -> str:
         try:
-            return os.path.samestat(os.fstat(self._descriptor), self.path.stat())
-        except FileNotFoundError:
-            return False
-
-    def _forget(self) -> None:
-        if self._descriptor in _locked:  # not so in a forked process
-            _locked.remove(self._descriptor)
-            os.close(self._descriptor)
-        self._descriptor = None
+            return self.path.read_text(errors="replace")[:200].strip() or "a process that has just started"
+        except OSError:
+            return "a process that has just ended"
 
     def __enter__(self) -> Self:
         return self.acquire()
@@ -114,7 +89,7 @@ PLAN = "plan.json"
 def claim_plan(folder: Path, plan: Any) -> bool:
     """Make `folder` the work folder of a plan, or recognise it as such. The caller holds its lock.
 
-    A folder without any work is nobody's, whatever a run left that was killed while it wrote its plan.
+    A folder without any work is free, whatever a killed run left while it wrote its plan.
 
     Args:
         plan: plain JSON, an object or a list.
@@ -130,7 +105,7 @@ def claim_plan(folder: Path, plan: Any) -> bool:
                 remove_drafts(folder)
                 return True
         except UserError:
-            pass  # cut off when the machine went down: nobody's, if there is no work yet
+            pass  # cut off when the machine went down: free, if there is no work yet
         else:
             return False
     if any(_is_work(path) for path in folder.iterdir()):

@@ -1,4 +1,4 @@
-"""The front door: any checkpoint into a policy, whole or as a start for another variant."""
+"""Load any checkpoint into a policy, completely or as a start for another variant."""
 
 import re
 import warnings
@@ -10,30 +10,31 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.methods.diffusion_policy.weights import diffusion_adapter
-from mme_vla.methods.memoryvla.weights import memoryvla_adapter
-from mme_vla.methods.openvla_oft.weights import openvla_adapter
-from mme_vla.methods.sam2act.weights import sam2act_adapter
 from mme_vla.policy.base import Policy
 from mme_vla.policy.finetune import merge_state
+from mme_vla.policy.saving import recompute_buffers
 from mme_vla.policy.tensor_files import assign_tensors, check_fit, check_kinds, check_values, dtype_of
 from mme_vla.processing.processor import CONFIG_FILE
 from mme_vla.utils import inside, read_json
 from mme_vla.weights.ports import HISTORY, check_window, port_adapter
 from mme_vla.weights.released import members_of, partial_adapter, released_adapter
-from mme_vla.weights.source import Source, open_source
+from mme_vla.weights.source import METHOD_FORMATS, Source, open_source
 from mme_vla.weights.statistics import read_stats, stats_files
 from mme_vla.weights.tables import Adapter, memory_parameters
 
-ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
+_ADAPTERS: dict[str, Callable[[Any], Adapter]] = {
     "lerobot": port_adapter,
     "openpi": port_adapter,
     "released": released_adapter,
-    "diffusion_policy": diffusion_adapter,
-    "sam2act_plus": sam2act_adapter,
-    "openvla": openvla_adapter,
-    "memoryvla": memoryvla_adapter,
 }
+
+
+def adapter_of(fmt: str, policy: Policy) -> Adapter:
+    """The name table of a format for a policy; raises an error where the format does not hold such a policy."""
+    make = _ADAPTERS[fmt] if fmt in _ADAPTERS else METHOD_FORMATS[fmt].function("adapter")
+    adapter: Adapter = make(policy)
+    return adapter
+
 
 # What a memory adds to a policy, as our names, the released leaves, LeRobot's own memory and MemoryVLA's banks tell.
 _OF_MEMORY = re.compile(r"^(memory|integration)\.|\.experts\.(?!vlm\.|action\.)")
@@ -75,7 +76,7 @@ def load_weights(
     if policy.processor is not None and checkpoint.format != "lerobot" and len(datasets) < 2:
         stats = read_stats(checkpoint.folder)
     assign_tensors(policy, read_as(policy, checkpoint), str(source), kind)
-    policy.compute_unsaved()
+    recompute_buffers(policy)
     if stats is not None and policy.processor is not None:
         policy.processor.stats = stats
     elif len(datasets) > 1:
@@ -93,7 +94,7 @@ def read_as(policy: Policy, source: Source) -> dict[str, Tensor]:
         return merge_state(source.tensors(), source.config.get("adapters"))
     if source.format == "lerobot":
         check_window(policy, source.config, str(source.folder))
-    adapter, state = ADAPTERS[source.format](policy), policy.state_dict()
+    adapter, state = adapter_of(source.format, policy), policy.state_dict()
     tensors = source.tensors(lambda values: adapter.check_fit(values, state, source.label))
     return adapter.translate(tensors, state, source.label)
 
@@ -140,7 +141,9 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
             matched, {name: tuple(tensor.shape) for name, tensor in state.items()}, str(source), optional=memory_names
         )
     else:
-        of_format = partial_adapter(policy) if checkpoint.format == "released" else ADAPTERS[checkpoint.format](policy)
+        of_format = (
+            partial_adapter(policy) if checkpoint.format == "released" else adapter_of(checkpoint.format, policy)
+        )
         memory_names |= of_format.fresh
         members = [place for place, _ in members_of(policy.memory)]
 
@@ -167,7 +170,7 @@ def transfer(policy: Policy, source: str | Path, *, revision: str | None = None)
 
 def _part(policy: Policy, name: str) -> str | None:
     """The part of a policy that another's parameter would belong to; None where it has none such."""
-    return next((part for part, pattern in policy.parts().items() if re.match(pattern, name)), None)
+    return next((part for part, pattern in policy.finetune_spec.components.items() if re.match(pattern, name)), None)
 
 
 def _check_tokenizer(policy: Policy, folder: Path) -> None:
@@ -176,10 +179,10 @@ def _check_tokenizer(policy: Policy, folder: Path) -> None:
     if policy.processor is None or not file.is_file():
         return
     source_fingerprint = read_json(inside(folder, CONFIG_FILE), "a processor's settings").get("tokenizer_fingerprint")
-    processor, target_fingerprint = policy.processor, policy.processor.words_fingerprint
+    processor, target_fingerprint = policy.processor, policy.processor.prompt_spec.fingerprint
     if source_fingerprint is not None and target_fingerprint is not None and source_fingerprint != target_fingerprint:
         raise UserError(
-            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than {processor.words_from!r} "
+            f"{folder} was trained with another tokenizer ({brief(source_fingerprint)}) than {processor.prompt_spec.encoder!r} "
             f"({target_fingerprint}): its ids would mean other words. Set processor.tokenizer to that one."
         )
 

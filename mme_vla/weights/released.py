@@ -36,7 +36,11 @@ def partial_adapter(policy: Any) -> Adapter:
         table |= prefixed(place, memory_names.released_names(member))
         unread += memory_names.released_unread(member)
         derived += memory_names.released_derived(member)
-    known = {name: pieces for name, pieces in table.items() if name in state or policy.component_of(name) != "memory"}
+    known = {
+        name: pieces
+        for name, pieces in table.items()
+        if name in state or policy.finetune_spec.component_of(name) != "memory"
+    }
     return Adapter(known, unread, derived=derived)
 
 
@@ -50,7 +54,9 @@ def members_of(memory: Memory | None) -> list[tuple[str, Memory]]:
 def released_table(policy: MMEPolicy) -> NameTable:
     """Every parameter of the policy and the released leaves it is made of."""
     table = _table(policy)
-    unnamed = sorted(memory_parameters(policy) ^ {name for name in table if policy.component_of(name) == "memory"})
+    unnamed = sorted(
+        memory_parameters(policy) ^ {name for name in table if policy.finetune_spec.component_of(name) == "memory"}
+    )
     if unnamed:
         owners = [part for part in (policy.memory, policy.integration) if part is not None]
         raise UserError(

@@ -1,8 +1,7 @@
 """What a user points at: which format it is in, and its tensors under that format's names."""
 
-import tempfile
-import zipfile
-from collections.abc import Callable, Mapping, Sequence
+import importlib
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,123 +9,20 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, did_you_mean, listed
-from mme_vla.methods.diffusion_policy.weights import is_diffusion_policy, unwrap_names
-from mme_vla.methods.memoryvla.weights import is_memoryvla, read_names
-from mme_vla.methods.openvla_oft.weights import FOLDER, has_adapters, is_openvla, merged, named_base, with_heads
-from mme_vla.methods.sam2act.weights import is_sam2act, unwrap_sam2act_names
 from mme_vla.policy.saving import CONFIG, local_folder, read_config
 from mme_vla.policy.tensor_files import INDEX, WEIGHTS, check_header, read_files, weight_files
-from mme_vla.utils import decoding, safe_name
-from mme_vla.weights.orbax import ARRAY_FILES, MANIFEST, VARIANT_FILE, Zipped, find_params, read_orbax, variant_of
+from mme_vla.utils import decoding, require_file
+from mme_vla.weights.orbax import (
+    ARCHIVE_SUFFIX,
+    Zipped,
+    find_archive,
+    find_params,
+    open_archive,
+    read_orbax,
+    variant_of,
+)
 from mme_vla.weights.ports import LEROBOT_PREFIX, from_port, is_port
 from mme_vla.weights.torch_files import SUFFIXES, find_torch_files, read_torch_file
-
-SUFFIX = ".zip"
-_MOST_ENTRIES, _MOST_BYTES, _MOST_RATIO = 200_000, 2**38, 200
-"""Of an archive, of all it unpacks to, and of one file or all against the packed size: beyond, it is no checkpoint."""
-_SMALL = 4 * 2**20  # bytes of a file that is unpacked
-_HEADER = 30  # least bytes before the content of a file
-_REMEDY = "Download or copy it again."
-_facts: dict[tuple[Path, int], tempfile.TemporaryDirectory[str]] = {}
-
-
-@dataclass(frozen=True)
-class Archive:
-    """An archive that holds a checkpoint.
-
-    params: where its arrays are. folder: what says its variant, and its statistics, unpacked until the program ends.
-    """
-
-    params: Zipped
-    folder: Path
-
-
-def find_archive(folder: Path) -> Path | None:
-    """The archive of the newest step in a folder, such as `79999.zip`; None without any."""
-    steps = [file for file in folder.glob(f"*{SUFFIX}") if file.stem.isdigit()]
-    return max(steps, key=lambda file: int(file.stem)) if steps else None
-
-
-def open_archive(file: Path) -> Archive:
-    """Look through an archive and find the checkpoint in it."""
-    with decoding(file, "a zip archive", _REMEDY), zipfile.ZipFile(file) as opened:
-        entries = [entry for entry in opened.infolist() if not entry.is_dir()]
-        _check(file, entries, opened.start_dir)
-        names = [entry.filename for entry in entries]
-        place = _arrays(names)
-        if place is None:
-            raise UserError(f"{file} holds no checkpoint of the released code: there are no Orbax arrays in it.")
-        within = tuple(name.removeprefix(place) for name in names if name.startswith(place))
-        folder = _unpack_facts(file, opened, entries)
-    return Archive(Zipped(file.resolve(), place, within), folder)
-
-
-def _check(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
-    """Refuse what no checkpoint holds. end: offset of the archive's directory, where its last entry ends."""
-    total, packed = sum(entry.file_size for entry in entries), sum(entry.compress_size for entry in entries)
-    if len(entries) > _MOST_ENTRIES or total > _MOST_BYTES:
-        raise UserError(f"{file} unpacks to {len(entries):,} files of {total:,} bytes: that is no checkpoint.")
-    for entry in entries:
-        name, parts = entry.filename, entry.filename.split("/")
-        if name.startswith("/") or "\\" in name or ".." in parts or ":" in parts[0]:
-            raise UserError(f"{file} names {brief(name)}, which lies outside of it. {_REMEDY}")
-        if entry.flag_bits & 1:
-            raise UserError(f"{file} is encrypted: unpack it yourself, and name the folder.")
-        if entry.file_size > _SMALL and entry.file_size > _MOST_RATIO * max(entry.compress_size, 1):
-            raise UserError(f"{file}: {brief(name)} unpacks to {entry.file_size:,} bytes: that is no checkpoint.")
-    if total > _SMALL and total > _MOST_RATIO * packed:
-        raise UserError(f"{file}: {packed:,} bytes unpack to {total:,}: that is no checkpoint.")
-    _check_distinct(file, entries, end)
-
-
-def _check_distinct(file: Path, entries: list[zipfile.ZipInfo], end: int) -> None:
-    """Refuse names and bytes that stand twice: what is compared with its checksum might not be what is read."""
-    names: set[str] = set()
-    for entry in entries:
-        if entry.filename in names:
-            raise UserError(f"{file} names {brief(entry.filename)} twice. {_REMEDY}")
-        names.add(entry.filename)
-    ordered = sorted(entries, key=lambda entry: entry.header_offset)
-    ends = [*(entry.header_offset for entry in ordered[1:]), end]
-    for entry, following in zip(ordered, ends, strict=True):
-        if entry.header_offset + _HEADER + entry.compress_size > following:
-            raise UserError(f"{file}: the bytes of {brief(entry.filename)} overlap with what follows. {_REMEDY}")
-
-
-def _arrays(names: list[str]) -> str | None:
-    """The folder of the arrays, with a slash at its end: `params` before others, the outermost that holds arrays."""
-    stores = [name.removesuffix(MANIFEST) for name in names if name.split("/")[-1] == MANIFEST]
-    if not stores:
-        stores = [
-            "/".join([*name.split("/")[:-2], ""]).lstrip("/")
-            for name in names
-            for array in ARRAY_FILES
-            if name.endswith(array)
-        ]
-    return min(stores, key=lambda place: (not place.endswith("params/"), place.count("/"), place), default=None)
-
-
-def _unpack_facts(file: Path, opened: zipfile.ZipFile, entries: list[zipfile.ZipInfo]) -> Path:
-    """Write the variant's name and the statistics, as a released step has them, and return the folder."""
-    key = file.resolve(), file.stat().st_mtime_ns
-    if key in _facts:
-        return Path(_facts[key].name)
-    unpacked = _facts[key] = tempfile.TemporaryDirectory(prefix="mme-vla-")
-    folder = Path(unpacked.name)
-    for entry in entries:
-        *above, last = entry.filename.split("/")
-        if last == VARIANT_FILE:
-            target = folder / VARIANT_FILE
-        elif last == "norm_stats.json" and above:
-            target = folder / "assets" / safe_name(above[-1]) / last
-        else:
-            continue
-        if entry.file_size > _SMALL:
-            raise UserError(f"{file}: {brief(entry.filename)} has {entry.file_size:,} bytes. {_REMEDY}")
-        target.parent.mkdir(parents=True, exist_ok=True)
-        target.write_bytes(opened.read(entry))
-    return folder
-
 
 FORMATS = {
     "ours": "save_pretrained() of this library",
@@ -141,22 +37,53 @@ FORMATS = {
 
 
 @dataclass(frozen=True)
-class NativeFormat:
-    """A format of one method, told by its tensors' names.
+class MethodFormat:
+    """A format of one method: where the functions are that read and write it, imported when first used.
 
-    matches: whether names are its. plain: tensors under the one spelling that its name table knows.
+    matches: whether tensor names are its. adapter: its name table for a policy. write: a policy as its files.
+    native: tensors under the one spelling of the name table, for files of `torch.save`. stats: reads its statistics.
     """
 
-    matches: Callable[[Sequence[str]], bool]
-    to_native: Callable[[Mapping[str, Tensor], str], dict[str, Tensor]]
+    module: str
+    matches: str
+    adapter: str
+    write: str
+    native: str | None = None
+    stats: str | None = None
+
+    def function(self, role: str) -> Callable[..., Any]:
+        """Import one of the functions."""
+        name: str = getattr(self, role)
+        function: Callable[..., Any] = getattr(importlib.import_module(self.module), name)
+        return function
 
 
-NATIVE_FORMATS = {
-    "diffusion_policy": NativeFormat(is_diffusion_policy, unwrap_names),
-    "sam2act_plus": NativeFormat(is_sam2act, unwrap_sam2act_names),
-    "memoryvla": NativeFormat(is_memoryvla, read_names),
-}
+METHOD_FORMATS = {
+    "diffusion_policy": MethodFormat(
+        "mme_vla.methods.diffusion_policy.weights", "is_diffusion_policy", "diffusion_adapter",
+        "write_diffusion_policy", native="unwrap_names", stats="read_diffusion_stats",
+    ),
+    "sam2act_plus": MethodFormat(
+        "mme_vla.methods.sam2act.weights", "is_sam2act", "sam2act_adapter", "write_sam2act",
+        native="unwrap_sam2act_names",
+    ),
+    "memoryvla": MethodFormat(
+        "mme_vla.methods.memoryvla.weights", "is_memoryvla", "memoryvla_adapter", "write_memoryvla",
+        native="read_names",
+    ),
+    "openvla": MethodFormat(
+        "mme_vla.methods.openvla_oft.weights", "is_openvla", "openvla_adapter", "write_openvla",
+        stats="read_dataset_statistics",
+    ),
+}  # fmt: skip
+NATIVE_FORMATS = [name for name, of in METHOD_FORMATS.items() if of.native]
 """Formats in files of `torch.save`; each is called as the model it holds."""
+
+
+def _openvla() -> Any:
+    """The reader of OpenVLA-OFT's adapters and heads, which lie in files of their own."""
+    return importlib.import_module(METHOD_FORMATS["openvla"].module)
+
 
 VARIANTS = {
     "pi05_baseline": "pi05",
@@ -197,13 +124,15 @@ class Source:
         if self.params is not None:
             return read_orbax(self.params, fits)
         if self.format in NATIVE_FORMATS:
-            return NATIVE_FORMATS[self.format].to_native(read_torch_file(self.files[0]), str(self.files[0]))
+            to_native = METHOD_FORMATS[self.format].function("native")
+            native: dict[str, Tensor] = to_native(read_torch_file(self.files[0]), str(self.files[0]))
+            return native
         if self.base is not None:
-            heads = with_heads({}, self.folder)
-            return merged(self.base.tensors(), self.folder) | heads
+            heads: dict[str, Tensor] = _openvla().with_heads({}, self.folder)
+            return _openvla().merged(self.base.tensors(), self.folder) | heads
         tensors = read_files(self.folder, self.files)
         if self.format == "openvla":
-            return with_heads(tensors, self.folder)
+            tensors = _openvla().with_heads(tensors, self.folder)
         return from_port(tensors, str(self.folder)) if self.format in ("lerobot", "openpi") else tensors
 
     @property
@@ -257,11 +186,13 @@ def open_source(
     path = local_folder(source, revision, token)
     if not path.exists():
         raise UserError(f"No checkpoint at {path}: there is no such file or folder.")
+    if not path.is_dir():
+        require_file(path, "a checkpoint")
     is_local = path.is_file() or (path / WEIGHTS).is_file() or (path / INDEX).is_file()
     if base is not None:
-        if is_local or not has_adapters(path):
+        if is_local or not _openvla().has_adapters(path):
             raise UserError(
-                f"base={str(base)!r} is for a run that holds {FOLDER} alone; {path} does not: leave it out."
+                f"base={str(base)!r} is for a run that holds {_openvla().FOLDER} alone; {path} does not: leave it out."
             )
         base_source = open_source(base)
         if base_source.format != "openvla":
@@ -271,7 +202,7 @@ def open_source(
         return Source("openvla", path, base=base_source)
     if path.is_file() and path.suffix in SUFFIXES:
         return _of_torch_file(path)
-    if path.is_file() and path.suffix == SUFFIX:
+    if path.is_file() and path.suffix == ARCHIVE_SUFFIX:
         return _of_archive(path)
     if path.is_file():
         return _of_files(path.parent, (path,))
@@ -282,9 +213,10 @@ def open_source(
         return Source("released", params.parent if params.name == "params" else params, params=params)
     if (zipped := find_archive(path)) is not None:
         return _of_archive(zipped)
-    if has_adapters(path):
+    if _openvla().has_adapters(path):
+        original = brief(_openvla().named_base(path))
         raise UserError(
-            f"{path} holds adapters apart from what they were trained on ({brief(named_base(path))}): name it, "
+            f"{path} holds adapters apart from what they were trained on ({original}): name it, "
             "load_weights(policy, run, base=…), or mme-vla weights <run> <new folder> --base …"
         )
     if len(files := find_torch_files(path)) == 1:
@@ -310,7 +242,7 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
     # Not every kind of policy has a backbone among its modules; each has one in its configuration.
     if any(name.startswith("backbone.") for name in names) or "backbone" in Source("ours", folder).config:
         return Source("ours", folder, files)
-    if is_openvla(names):
+    if METHOD_FORMATS["openvla"].function("matches")(names):
         return Source("openvla", folder, files)
     if any(name.startswith("PaliGemma/") for name in names):
         return Source("released", folder, files)
@@ -322,8 +254,8 @@ def _of_files(folder: Path, files: tuple[Path, ...]) -> Source:
 
 def _of_torch_file(path: Path) -> Source:
     names = list(read_torch_file(path))
-    for name, of in NATIVE_FORMATS.items():
-        if of.matches(names):
+    for name in NATIVE_FORMATS:
+        if METHOD_FORMATS[name].function("matches")(names):
             return Source(name, path.parent, (path,))
     few = listed(sorted(names), 3)
     raise UserError(
@@ -333,13 +265,8 @@ def _of_torch_file(path: Path) -> Source:
 
 def _names(file: Path) -> list[str]:
     """Tensor names in a safetensors file's header."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
     check_header(file)
-    try:
-        with safe_open(file, "pt") as opened:
-            return list(opened.keys())
-    except (SafetensorError, OSError) as error:
-        raise UserError(
-            f"{file} is damaged or not a safetensors file: {brief(str(error), 300, quote=False)}"
-        ) from error
+    with decoding(file, "a safetensors file", "Download or copy it again."), safe_open(file, "pt") as opened:
+        return list(opened.keys())

@@ -8,11 +8,10 @@ import numpy as np
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief, listed
-from mme_vla.methods.diffusion_policy.weights import read_diffusion_stats
-from mme_vla.methods.openvla_oft.weights import read_dataset_statistics
 from mme_vla.policy.tensor_files import read_safetensors
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.utils import check_sums, inside, read_json
+from mme_vla.weights.source import METHOD_FORMATS
 
 _PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 _FEATURES = {"state": "observation.state", "actions": "action"}
@@ -47,7 +46,10 @@ def read_stats(folder: Path | str, asset: str | None = None) -> NormStats | None
         return NormStats.load(_local_file(folder, next(iter(files.values()))))
     if (folder / "norm_stats.json").is_file():
         return NormStats.load(_local_file(folder, folder / "norm_stats.json"))
-    return read_diffusion_stats(folder) or read_dataset_statistics(folder) or next(_lerobot_stats(folder), None)
+    for fmt in METHOD_FORMATS.values():
+        if fmt.stats is not None and (stats := fmt.function("stats")(folder)) is not None:
+            return stats
+    return next(_lerobot_stats(folder), None)
 
 
 def stats_files(folder: Path) -> dict[str, Path]:

@@ -205,4 +205,4 @@ def pi05_of(policy: Policy) -> Pi05Backbone:
 
 def memory_parameters(policy: Policy) -> set[str]:
     """Names of the tensors a policy has beyond memoryless π0.5: memory, integration, and the memory's own expert."""
-    return {name for name in policy.state_dict() if policy.component_of(name) == "memory"}
+    return {name for name in policy.state_dict() if policy.finetune_spec.component_of(name) == "memory"}

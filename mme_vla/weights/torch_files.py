@@ -1,12 +1,13 @@
 """Checkpoints that `torch.save` wrote, read without running anything in them."""
 
-import pickle
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError, brief, listed
+from mme_vla.errors import UserError, listed
+from mme_vla.utils import decoding, require_file
 
 SUFFIXES = (".pth", ".pt")
 MODEL = ("model", "state_dict", "model_state_dict", "model_state")
@@ -18,15 +19,23 @@ def find_torch_files(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix in SUFFIXES and file.is_file())
 
 
+_REMEDY = "It is damaged, or holds objects, which are code and are not run. Download or copy it again."
+
+
+def load_torch_file(path: Path, what: str) -> Any:
+    """Read a file that `torch.save` wrote, tensors on the CPU. Objects in it are code, and are not run.
+
+    Args:
+        what: the file is, for the message.
+    """
+    require_file(path, what)  # torch would wait for a pipe without end
+    with decoding(path, what, _REMEDY):
+        return torch.load(path, map_location="cpu", weights_only=True)
+
+
 def read_torch_file(path: Path) -> dict[str, Tensor]:
-    """The tensors of a file, by name (of tables by part: part and name), memory-mapped where its layout allows."""
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, OSError, ValueError, KeyError, AttributeError) as error:
-        raise UserError(
-            f"{path} cannot be read as weights alone ({brief(str(error).splitlines()[0], 200, quote=False)}): it is "
-            "damaged, or holds objects, which are code and are not run."
-        ) from error
+    """The tensors of a file, by name (of tables by part: part and name)."""
+    content = load_torch_file(path, "weights")
     for key in MODEL:
         if isinstance(content, dict) and isinstance(content.get(key), dict):
             content = content[key]

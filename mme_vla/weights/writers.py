@@ -10,10 +10,6 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.methods.diffusion_policy.weights import diffusion_adapter, write_diffusion_policy
-from mme_vla.methods.memoryvla.weights import memoryvla_adapter, write_memoryvla
-from mme_vla.methods.openvla_oft.weights import openvla_adapter, write_openvla
-from mme_vla.methods.sam2act.weights import sam2act_adapter, write_sam2act
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.policy.tensor_files import DTYPES, WEIGHTS, cast
@@ -27,7 +23,7 @@ from mme_vla.weights.names.torch_backbone import EMBEDDING
 from mme_vla.weights.orbax import write_orbax
 from mme_vla.weights.ports import to_lerobot, to_openpi
 from mme_vla.weights.released import released_table, to_released
-from mme_vla.weights.source import VARIANTS
+from mme_vla.weights.source import METHOD_FORMATS, VARIANTS
 
 BEFORE, AFTER = "policy_preprocessor", "policy_postprocessor"
 _QUANTILES = {"VISUAL": "IDENTITY", "STATE": "QUANTILES", "ACTION": "QUANTILES"}
@@ -104,22 +100,14 @@ ASSET = "robomme"  # the name under which openpi's layout keeps a dataset's stat
 _SIZES = {"paligemma_variant": "gemma_2b", "action_expert_variant": "gemma_300m"}
 
 
-_OF_ONE_METHOD = {
-    "sam2act_plus": sam2act_adapter,
-    "diffusion_policy": diffusion_adapter,
-    "openvla": openvla_adapter,
-    "memoryvla": memoryvla_adapter,
-}
-
-
 def check_target(policy: Policy, fmt: str) -> None:
     """Refuse a format that has no place for this policy, before anything is read."""
     if fmt in ("lerobot", "openpi") and policy.memory is not None:
         raise UserError(f"The format {fmt!r} holds memoryless π0.5 only: it has no names for a memory's parameters.")
     if fmt == "released":
         released_table(mme_of(policy, "The released layout"))
-    if fmt in _OF_ONE_METHOD:
-        _OF_ONE_METHOD[fmt](policy)
+    if fmt in METHOD_FORMATS:
+        METHOD_FORMATS[fmt].function("adapter")(policy)
 
 
 def write_native(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:
@@ -187,16 +175,18 @@ def write_released(policy: Policy, folder: Path, dtype: torch.dtype, stats: Norm
     _write_assets(folder / "0", stats)
 
 
-WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]] = {
+_WRITERS: dict[str, Callable[[Policy, Path, torch.dtype, NormStats | None], None]] = {
     "ours": write_native,
     "lerobot": write_lerobot,
     "openpi": write_openpi,
     "released": write_released,
-    "diffusion_policy": write_diffusion_policy,
-    "sam2act_plus": write_sam2act,
-    "openvla": write_openvla,
-    "memoryvla": write_memoryvla,
 }
+
+
+def write_policy(policy: Policy, folder: Path, fmt: str, dtype: torch.dtype, stats: NormStats | None) -> None:
+    """Write a policy into `folder` in a format of `FORMATS`."""
+    writer = _WRITERS[fmt] if fmt in _WRITERS else METHOD_FORMATS[fmt].function("write")
+    writer(policy, folder, dtype, stats)
 
 
 def _write_safetensors(tensors: Mapping[str, Tensor], folder: Path, dtype: torch.dtype) -> None:

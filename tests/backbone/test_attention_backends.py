@@ -65,7 +65,7 @@ def test_a_policy_gives_the_same_loss_and_the_same_chunk(model: str, backend: st
     def results(attention: str) -> tuple[float, Tensor]:
         policy = small_policy(model, backbone=FEW_TOKENS, policy={"augment": False}, **{"+policy.attention": attention})
         batch = random_batch(policy, 2)
-        draws = policy.loss_draws(2, torch.Generator().manual_seed(1))
+        draws = policy.training_noise(2, torch.Generator().manual_seed(1))
         with torch.no_grad():
             loss, _ = policy(batch, draws)
         return float(loss), policy.eval().sample_actions(batch, draws["noise"], steps=2)

@@ -69,7 +69,7 @@ def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
     policy = small_policy(model, policy={"augment": False})
     batch = random_batch(policy, 3)
     batch.image_mask[2, 1] = False
-    draws = policy.loss_draws(3, torch.Generator().manual_seed(1))
+    draws = policy.training_noise(3, torch.Generator().manual_seed(1))
 
     def results() -> tuple[Tensor, dict[str, Tensor], Tensor]:
         policy.zero_grad()

@@ -11,7 +11,7 @@ import pytest
 
 from helpers.h5_files import write_file
 from mme_vla import cli
-from mme_vla.config.errors import print_user_errors
+from mme_vla.cli.errors import Terminated, print_user_errors
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.envs.recording.outputs import Job, RecordingPlan
@@ -28,7 +28,7 @@ CONFIG = {"train": {"steps": 3}, "seed": 1}
 def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str, code: int, words: str) -> None:
     script = f"""
         import signal
-        from mme_vla.config.errors import print_user_errors
+        from mme_vla.cli.errors import print_user_errors
         signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever the parent did with it
         with print_user_errors(), print_user_errors():
             signal.raise_signal(signal.{number})
@@ -37,6 +37,20 @@ def test_a_signal_ends_a_command_with_a_sentence_and_the_shells_code(number: str
     assert (done.returncode, "Traceback" in done.stderr) == (code, False)
     assert done.stderr.count("\n") == 1
     assert f"Stopped by {words}" in done.stderr
+
+
+@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt(), 130), (Terminated(), 143)], ids=["Ctrl-C", "SIGTERM"])
+@pytest.mark.parametrize("hidden", [AttributeError("half-made"), UserError("cannot be composed")], ids=["bug", "user"])
+def test_a_signal_is_reported_though_a_finally_fails(
+    stop: BaseException, code: int, hidden: Exception, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended, print_user_errors():
+        try:
+            raise stop
+        finally:
+            raise hidden
+    assert ended.value.code == code
+    assert "Stopped by" in capsys.readouterr().err
 
 
 def test_ctrl_c_while_a_command_is_still_being_imported_ends_with_the_same_sentence(monkeypatch, capsys) -> None:

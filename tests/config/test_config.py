@@ -12,8 +12,9 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from helpers import commands
-from mme_vla.config.composition import check_overrides, cli, compose, config_dir, import_plugins, options_first
-from mme_vla.config.naming import join_memories, resolve_name
+from mme_vla.cli.command import check_overrides, cli, options_first
+from mme_vla.config.composition import compose, config_dir, import_plugins, true_name
+from mme_vla.config.naming import join_memories
 from mme_vla.errors import UserError
 
 MODELS = ["pi05"] + [
@@ -199,7 +200,7 @@ def test_every_model_of_the_library_composes(model: str) -> None:
 @pytest.mark.parametrize("model", MODELS[::6])
 def test_a_models_name_is_the_one_that_comparing_all_models_would_find(model: str) -> None:
     cfg = compose("train", [f"model={model}", "train.steps=2"])
-    assert resolve_name(join_memories(cfg.copy()), "train", (config_dir().resolve(),)) == model
+    assert true_name(join_memories(cfg.copy()), "train", (config_dir().resolve(),)) == model
 
 
 def test_a_misspelt_model_of_the_library_is_answered() -> None:
@@ -210,7 +211,7 @@ def test_a_misspelt_model_of_the_library_is_answered() -> None:
 
 APP = """
     from pathlib import Path
-    from mme_vla.config.composition import cli
+    from mme_vla.cli.command import cli
     from mme_vla.errors import UserError
 
     @cli("demo", Path({tree!r}))

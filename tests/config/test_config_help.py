@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from helpers import REPOSITORY, commands
-from mme_vla.config.composition import compose, config_dir, help_text
-from mme_vla.config.help import COMMANDS, choices, defaults, keys, near_keys
+from mme_vla.cli.command import help_text
+from mme_vla.cli.help import COMMANDS, choices, defaults, keys, near_keys
+from mme_vla.config.composition import compose, config_dir
 from mme_vla.errors import UserError
 
 MODULES = {name: words.removeprefix("python -m ") for name, words in COMMANDS.items() if "python" in words}

@@ -1,11 +1,11 @@
 """One reader turns a section into its dataclass; every mistake names the key, the value and what was expected."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pytest
 
-from mme_vla.config.sections import read_section
+from mme_vla.config.sections import Positive, Range, read_section
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.serving.settings import ServeSettings
@@ -29,6 +29,9 @@ class Outer:
     limit: int | None = None
     secret: str | None = field(default=None, repr=False)
     anything: Any = None
+    port: Annotated[int, Range(0, 9)] | None = None
+    seconds: Positive = 1.0
+    kind: Literal["simple", "grounded"] | None = None
 
 
 def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
@@ -58,6 +61,11 @@ def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
         ({"name": "a", "betas": [0.1]}, r"outer\.betas=\[0\.1\] must be a list of 2 values: a number, a number"),
         ({"name": "a", "betas": "ab"}, r"outer\.betas='ab' must be a list of 2"),
         ({"name": "a", "places": [1, "x"]}, r"outer\.places=.* must be a list, each a whole number"),
+        ({"name": "a", "port": 10}, r"outer\.port=10 must be a whole number from 0 to 9 or null"),
+        ({"name": "a", "seconds": 0}, r"outer\.seconds=0 must be a number above 0"),
+        ({"name": "a", "seconds": float("nan")}, r"outer\.seconds=nan must be a number above 0"),
+        ({"name": "a", "kind": "simpel"}, r"outer\.kind='simpel'\. Did you mean 'simple'"),
+        ({"name": "a", "kind": 3}, r"outer\.kind=3 must be simple or grounded or null"),
         ([1], r"outer must be a section of keys, got \[1\]"),
     ],
 )  # fmt: skip

@@ -75,7 +75,7 @@ def test_own_memories_are_named_by_their_files_and_parts(own: Path) -> None:
 def test_a_command_and_its_sweep_work_in_folders_of_the_true_name(tmp_path: Path) -> None:
     app = tmp_path / "app.py"
     app.write_text(
-        'from mme_vla.config.composition import cli\n@cli("train")\ndef main(cfg):\n'
+        'from mme_vla.cli.command import cli\n@cli("train")\ndef main(cfg):\n'
         "    from hydra.core.hydra_config import HydraConfig\n"
         '    print("at", cfg.name, cfg.output.split("/")[1], HydraConfig.get().runtime.output_dir)\nmain()\n'
     )

@@ -11,8 +11,7 @@ import mme_vla.data.convert as convert_module
 from helpers.h5_files import Recorded, write_file
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes
 from mme_vla.errors import UserError
 
 PNG = ConvertOptions(images="png")

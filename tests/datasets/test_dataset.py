@@ -162,7 +162,7 @@ def test_subgoals_reach_the_prompt_through_the_choice_given(data) -> None:
 
 
 def test_a_memory_without_caches_is_refused(data, processor) -> None:
-    with pytest.raises(UserError, match=r"python -m mme_vla\.data\.cache"):
+    with pytest.raises(UserError, match=r"mme-vla cache"):
         TrainingDataset(data[0], processor, LastFrames())
     with pytest.raises(UserError, match="action_offset=2"):
         TrainingDataset(data[0], processor, action_offset=2)

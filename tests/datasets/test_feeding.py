@@ -10,8 +10,7 @@ import torch
 
 from helpers.trainings import RECIPE, policy
 from mme_vla.config.composition import compose
-from mme_vla.data.ahead import ahead
-from mme_vla.data.cache_building import PAGE, save_aligned
+from mme_vla.data.cache_building import PAGE, ahead, save_aligned
 from mme_vla.errors import UserError
 from mme_vla.memory.history import FrameScores
 from mme_vla.memory.tokendrop import FIRST_FRAME_SCORE, THRESHOLD, ranked_patches
@@ -109,7 +108,7 @@ def gradients(recompute: bool | str) -> dict[str, torch.Tensor]:
     built = policy("framesamp_modul", policy={"augment": False}).train()
     built.recompute(recompute)
     batch = built.full_batch()
-    built(batch, built.loss_draws(1, torch.Generator().manual_seed(0)))[0].backward()
+    built(batch, built.training_noise(1, torch.Generator().manual_seed(0)))[0].backward()
     return {name: p.grad for name, p in built.named_parameters() if p.grad is not None}
 
 
@@ -135,7 +134,7 @@ def _products(how: bool | str) -> int:
 
     built = policy(policy={"augment": False}).train()
     built.recompute(how)
-    draws = built.loss_draws(1, torch.Generator().manual_seed(0))
+    draws = built.training_noise(1, torch.Generator().manual_seed(0))
     with Count() as count:
         built(built.full_batch(), draws)[0].backward()
     return count.found

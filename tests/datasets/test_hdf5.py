@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.h5_files import write_file
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.errors import UserError
 
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import open_episode
-from mme_vla.data.hdf5_episode import EpisodeRef, RawEpisode
+from mme_vla.data.hdf5 import EpisodeRef, RawEpisode, open_episode
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.data.sample import EPISODES
 

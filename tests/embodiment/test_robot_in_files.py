@@ -9,8 +9,7 @@ import pyarrow as pa
 import pytest
 
 from mme_vla import MMEPolicy, UserError, build_policy
-from mme_vla.data.lerobot_files import find_columns
-from mme_vla.data.tables import check_vectors
+from mme_vla.data.lerobot_files import check_vectors, find_columns
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.policy.saving import composition_digest
 from mme_vla.testing.small import SMALL_VISION, unit_stats

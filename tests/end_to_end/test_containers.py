@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from mme_vla.cli.help import COMMANDS, keys
 from mme_vla.config.composition import compose
-from mme_vla.config.help import COMMANDS, keys
 from mme_vla.errors import UserError
 from mme_vla.serving.settings import ServeSettings
 

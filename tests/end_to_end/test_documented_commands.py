@@ -18,9 +18,10 @@ import pytest
 from hydra._internal.utils import get_args_parser
 
 from helpers import REPOSITORY
+from mme_vla.cli.command import check_overrides
+from mme_vla.cli.help import COMMANDS
 from mme_vla.cli.nano import with_settings
-from mme_vla.config.composition import check_overrides, compose
-from mme_vla.config.help import COMMANDS
+from mme_vla.config.composition import compose
 from mme_vla.config.plugins import trust_as_override
 
 pytestmark = pytest.mark.slow

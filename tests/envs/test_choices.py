@@ -21,8 +21,7 @@ from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_choices, row_of
 from mme_vla.embodiment import Embodiment

@@ -10,8 +10,7 @@ import numpy as np
 
 from helpers.env_cubes import COLOURS, least_distance, read_button, read_cube
 from helpers.env_unmask import make, wait
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.bin_fill import BinFill
 
 STREAMING, STATIC = 4, 1  # seeds
@@ -72,7 +71,7 @@ def test_streaming_cubes_appear_50_steps_after_each_other():
 def test_a_recovery_episode_has_another_order_of_colours():
     env = make(BinFill, STATIC, "hard", recovery="z")
     stream = Draws(0)
-    stream.restore(env._drawn)
+    stream.restore(env._draws_state)
     picks = env.goal.total()
     stream.permutation(3)
     stream.integer(0, picks)

@@ -8,8 +8,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_unmask import lift, make, names, push_down, released, skip_place, texts, turn, under, wait
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.button_unmask_swap import ButtonUnmaskSwap
 
 

@@ -13,18 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from helpers.env_scenes import Scene, recorded
 from mme_vla.envs.recording.recorder import demonstrate
+from mme_vla.envs.robot.demonstrator import Demonstrator, PlanningError, arc
 from mme_vla.envs.robot.gripper_skills import failing_offset, grasp_orientation
-from mme_vla.envs.robot.stick_skills import Demonstrator, PlanningError, arc
-from mme_vla.envs.scene.objects import (
-    PEG_COLOUR,
-    build_aperture_box,
-    build_board,
-    build_button,
-    build_container,
-    build_cube,
-    build_disc,
-    build_peg,
-)
+from mme_vla.envs.scene.articulated import PEG_COLOUR, build_button, build_peg
+from mme_vla.envs.scene.objects import build_aperture_box, build_board, build_container, build_cube, build_disc
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.envs.task import Task

@@ -8,7 +8,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
 from mme_vla.envs import make_env
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 

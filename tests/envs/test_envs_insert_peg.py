@@ -12,9 +12,9 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 from helpers.env_cubes import steps_of_demonstration
 from helpers.env_unmask import make, texts, wait
 from mme_vla.envs.robot.control import PlanningError
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Peg
-from mme_vla.envs.scene.objects.shapes import at
+from mme_vla.envs.scene.articulated import Peg
+from mme_vla.envs.scene.objects import at
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.envs.tasks.insert_peg import InsertPeg
 

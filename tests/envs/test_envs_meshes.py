@@ -9,8 +9,9 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
 from mme_vla.envs import make_env
-from mme_vla.envs.rendering import CELL, coarsen, read_stl, render_backend, stl_bytes
+from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.robot import robots
+from mme_vla.envs.robot.robots import CELL, coarsen, read_stl, stl_bytes
 from mme_vla.errors import UserError
 
 SQUARE = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[1, 0, 0], [1, 1, 0], [0, 1, 0]]], np.float32)

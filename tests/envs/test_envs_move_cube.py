@@ -10,9 +10,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_cubes import read_cube, read_disc, steps_of_demonstration
 from helpers.env_unmask import make, texts, wait
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.objects import H
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.things import Thing, distance_xy
 from mme_vla.envs.subtasks import NO_RECORD
 from mme_vla.envs.tasks.move_cube import MANNERS, MoveCube

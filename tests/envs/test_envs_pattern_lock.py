@@ -10,7 +10,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_stick import Ear, Tip, read_path, recorded_moves
 from helpers.env_unmask import make, texts, wait
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.tasks.pattern_lock import DIRECTIONS, PatternLock
 
 WORDS = ("forward", "backward", "left", "right", "forward-left", "forward-right", "backward-left", "backward-right")

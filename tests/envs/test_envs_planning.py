@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from helpers.env_scenes import Scene, recorded
 from mme_vla.envs.robot.control import LIMITS
 from mme_vla.envs.robot.kinematics import Arm, pose_distance
-from mme_vla.envs.robot.path_search import Obstacles, sample_path
-from mme_vla.envs.robot.planning import CONTROL_STEP, plan_free, plan_screw, twist_of
+from mme_vla.envs.robot.planning import CONTROL_STEP, Obstacles, plan_free, plan_screw, sample_path, twist_of
 from mme_vla.envs.scene.stage import RESET_QPOS
 
 EPISODES = [("PickXtimes", 8), ("VideoUnmask", 4), ("PatternLock", 8)]

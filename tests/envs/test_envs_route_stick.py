@@ -11,8 +11,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_stick import Ear, Flags, Tip, circle, read_route, say
 from helpers.env_unmask import make, texts, wait
-from mme_vla.envs.robot.stick_skills import arc
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.tasks.route_stick import RouteStick
 
 MOVES = {"easy": ((2, 3), False), "medium": ((4, 5), False), "hard": ((4, 7), True)}
@@ -75,7 +75,7 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, monkeypatch
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
 def test_routes_go_to_neighbours_and_turn_back_only_where_they_may(stick, monkeypatch, difficulty):
-    for name in ("difficulty", "route", "turns"):
+    for name in ("difficulty", "route", "directions"):
         monkeypatch.setattr(stick, name, difficulty)
     counts, returns, (moves, turn_back) = set(), 0, MOVES[difficulty]
     for seed in range(100):

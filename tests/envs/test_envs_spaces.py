@@ -8,9 +8,9 @@ import pytest
 
 sapien = pytest.importorskip("sapien", reason="the simulator is not installed: uv sync --inexact --extra sim")
 
-from mme_vla.envs.choices import Choice  # noqa: E402
 from mme_vla.envs.grounding import project  # noqa: E402
 from mme_vla.envs.spaces import Control, UnreachableError, action_space  # noqa: E402
+from mme_vla.envs.subtasks import Choice  # noqa: E402
 from mme_vla.errors import UserError  # noqa: E402
 
 JOINTS = [0.1, 0.2, 0.3, -1.5, 0.1, 1.5, 0.7]

@@ -9,8 +9,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_cubes import Flags, read_button
 from helpers.env_unmask import make, push_down, texts, wait
-from mme_vla.envs.robot.stick_skills import Demonstrator
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.stop_cube import StopCube
 

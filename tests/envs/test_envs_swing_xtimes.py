@@ -8,8 +8,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube, read_disc
 from helpers.env_unmask import make, push_down, texts, wait
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.swing_xtimes import SwingXtimes
 
 LOW = 0.11

@@ -17,8 +17,8 @@ from mme_vla.envs import make_env, metadata
 from mme_vla.envs.grounding import project
 from mme_vla.envs.make import load_tasks
 from mme_vla.envs.metadata import TASK_NAMES
-from mme_vla.envs.robot.stick_skills import arc
-from mme_vla.envs.scene.cues import TALLY_RADIUS, TALLY_X
+from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.motions import TALLY_RADIUS, TALLY_X
 from mme_vla.registry import TASKS
 
 TALLIED = ("BinFill", "PickXtimes", "SwingXtimes", "StopCube", "VideoRepick")

@@ -15,7 +15,7 @@ import pytest
 from helpers.env_fakes import FRAME, make_light_env
 from mme_vla.envs import VecEnv, make_vec_env
 from mme_vla.envs.vector.pool import Job, Reply
-from mme_vla.envs.vector.processes import begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 
 

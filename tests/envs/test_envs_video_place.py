@@ -9,8 +9,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube, read_disc, steps_of_demonstration
 from helpers.env_unmask import make, texts, wait
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.families.video_place import VideoPlace
 from mme_vla.envs.tasks.video_place_button import VideoPlaceButton

@@ -9,8 +9,7 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_cubes import COLOURS, Hand, least_distance, read_button, read_cube
 from helpers.env_unmask import make, push_down, texts, wait
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region, rotated_anchors
+from mme_vla.envs.scene.placement import Draws, Region, rotated_anchors
 from mme_vla.envs.scene.things import distance_xy
 from mme_vla.envs.tasks.video_repick import VideoRepick
 

@@ -11,9 +11,8 @@ pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_scenes import replay, setup
 from helpers.env_unmask import lift, make, names, skip_place, texts, turn, under, wait
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import COVER_STEPS
-from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Region
+from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Draws, Region
 from mme_vla.envs.tasks.video_unmask import VideoUnmask
 
 OFFICIAL = [("robomme_h5", 4, "easy"), ("robomme_h5_full", 6, "medium")]

@@ -9,8 +9,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_unmask import lift, make, names, skip_place, texts, turn, under, wait
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.placement import Region
+from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.video_unmask_swap import VideoUnmaskSwap
 
 TRIANGLE = [(-0.05, -0.1), (-0.05, 0.1), (0.1, 0.0)]

@@ -18,8 +18,7 @@ from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.data.waypoints import find_motions
 from mme_vla.embodiment import Embodiment
@@ -153,9 +152,9 @@ def test_a_policy_of_motions_is_served_a_motion_at_a_time() -> None:
         asked = challenge(frames, frames, states, True)
         answer = client.infer({**asked, "action_space": "waypoint"})["actions"]
         assert answer.shape == (1, 7) and abs(answer[0, 6]) == 1
-        with pytest.raises(UserError, match="answers with waypoint only"):
+        with pytest.raises(UserError, match="returns waypoint only"):
             client.infer({**asked, "action_space": "joint_angle"})
-    with pytest.raises(UserError, match="answers with waypoint, 7 numbers"):
+    with pytest.raises(UserError, match="returns waypoint, 7 numbers"):
         PolicyServer(policy, ServeSettings(action_space="joint_angle"))
     reading = quick_policy("pi05_past_actions", embodiment="robomme_waypoint")
     with pytest.raises(UserError, match="which motions were executed"):

@@ -13,14 +13,13 @@ from mme_vla.cli.record import record_episode
 from mme_vla.config.composition import compose
 from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import open_episode
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, open_episode
 from mme_vla.embodiment import Embodiment
 from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.recording.frames import FrameChoice
 from mme_vla.envs.recording.outputs import Job
 from mme_vla.envs.recording.recorder import RecordedStep, Recorder
-from mme_vla.envs.render_request import RenderRequest
 from mme_vla.envs.rendering import render_backend
 from mme_vla.errors import UserError
 

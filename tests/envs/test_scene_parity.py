@@ -15,12 +15,11 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact --extra sim")
 
-from mme_vla.data.hdf5 import find_files, list_episodes
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes
 from mme_vla.envs import make_env
 from mme_vla.envs.make import make_task
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.recording.recorder import RecordedStep, Recorder
-from mme_vla.envs.render_request import RenderRequest
 from mme_vla.envs.rendering import render_backend
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 from mme_vla.errors import UserError

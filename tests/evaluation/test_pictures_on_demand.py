@@ -143,7 +143,7 @@ def test_acting_on_a_frame_that_was_not_drawn_is_refused() -> None:
     drawn = {"front": np.array([0]), "wrist": np.array([0])}
     episode.observe({"front": pictures, "wrist": pictures}, np.zeros((3, 8), np.float32), rendered=drawn)
     assert episode.n_observed_frames == 3
-    with pytest.raises(UserError, match="current frame was not drawn"):
+    with pytest.raises(UserError, match="current frame was not rendered"):
         policy.act(episode)
 
 

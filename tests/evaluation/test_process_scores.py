@@ -16,8 +16,7 @@ from mme_vla.envs import metadata
 from mme_vla.envs.make import load_tasks
 from mme_vla.envs.metadata import TASK_NAMES
 from mme_vla.envs.scene.motions import COVER_STEPS
-from mme_vla.envs.scores import ProcessScore, process_score
-from mme_vla.envs.subtasks import OPERATIONS, Progress, SubTask
+from mme_vla.envs.subtasks import OPERATIONS, ProcessScore, Progress, SubTask, process_score
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks.pick_xtimes import PickXtimes
 from mme_vla.envs.tasks.video_unmask import VideoUnmask

@@ -8,10 +8,10 @@ import sapien
 
 from helpers.env_unmask import wait
 from mme_vla.envs.recording.recorder import demonstrate
-from mme_vla.envs.robot.stick_skills import Demonstrator
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Button, Cube, Disc, H
-from mme_vla.envs.scene.placement import TRIALS, Region
+from mme_vla.envs.robot.demonstrator import Demonstrator
+from mme_vla.envs.scene.articulated import Button
+from mme_vla.envs.scene.objects import Cube, Disc, H
+from mme_vla.envs.scene.placement import TRIALS, Draws, Region
 from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.task import Task
 

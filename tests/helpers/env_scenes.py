@@ -7,11 +7,10 @@ import h5py
 import numpy as np
 from sapien.physx import PhysxArticulationLinkComponent, PhysxCollisionShapeBox
 
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.scene.articulated import build_button, build_peg
 from mme_vla.envs.scene.objects import (
     build_aperture_box,
     build_board,
-    build_button,
     build_container,
     build_cube,
     build_disc,
@@ -19,9 +18,9 @@ from mme_vla.envs.scene.objects import (
     build_highlight,
     build_moving_cube,
     build_obstacle,
-    build_peg,
     build_sphere,
 )
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.subtasks import SubTask
 from mme_vla.envs.task import Task
 

@@ -9,8 +9,8 @@ import sapien
 import torch
 
 from helpers.env_scenes import recorded, setup
-from mme_vla.envs.robot.stick_skills import arc
-from mme_vla.envs.scene.draws import Draws
+from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.task import Task
 

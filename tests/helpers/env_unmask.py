@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import sapien
 
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Button, Container
-from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Region
+from mme_vla.envs.scene.articulated import Button
+from mme_vla.envs.scene.objects import Container
+from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Draws, Region
 from mme_vla.envs.scene.things import Thing
 from mme_vla.envs.task import Task
 

@@ -50,7 +50,7 @@ class RandomHistory(History):
 
 
 def window(memory: RecurrentMemory, length: int, exec_start: int = 0) -> HistoryTokens:
-    return stack_history([memory.recall(RandomHistory(length, exec_start), length - 1)])
+    return stack_history([memory.gather_selection(RandomHistory(length, exec_start), length - 1)])
 
 
 def same_memory(a, b) -> bool:

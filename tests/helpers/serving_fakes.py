@@ -74,7 +74,7 @@ class Served:
     @property
     def busy(self) -> int:
         """Clients that wait for an answer."""
-        return sum(connection.busy for connection in self.server.connections.open)
+        return sum(connection.busy for connection in self.server.connections.open.values())
 
     @contextmanager
     def reading(self) -> Iterator["Reading"]:

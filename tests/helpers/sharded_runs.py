@@ -29,11 +29,11 @@ from mme_vla.training.checkpoint import trainable
 from mme_vla.training.logging import Loggers, ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.optim import clip_gradients, make_optimizer
+from mme_vla.training.order import Validation
 from mme_vla.training.parallel import ParallelSettings, full_value, gathered, is_sharded, shard
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
 from mme_vla.training.shards import shard_files
-from mme_vla.training.validation import Validation
 
 RUNS = [(2, "train,stop,policies,die"), (1, "go_on"), (3, "resume"), (1, "whole")]
 """How many processes do what one after the other; starting them takes longer than what they do, so few do much."""
@@ -57,7 +57,7 @@ def trainer(folder: Path, steps: int, resumed: bool = False, **changes: Any) -> 
 
 def finish_run(job: Trainer, line: ProgressLine | None = None) -> bool:
     first, run = job.accelerator.is_main_process, job.run_info
-    loggers = open_loggers(run.folder, {}, run.step) if first else Loggers([])
+    loggers = open_loggers(run.folder, {}, run.step) if first else Loggers()
     with line or ProgressLine(job.settings.steps, 0, visible=False) as shown:
         finished = job.run(shown, loggers)
         job.close()
@@ -134,8 +134,8 @@ def compare(name: str, dtype: str) -> dict[str, Any]:
     shared = copy.deepcopy(alone)
     shard(shared, ParallelSettings("fsdp").mesh("cpu"), shared.compute_dtype)
     batch = alone.full_batch()
-    draws = alone.loss_draws(1, torch.Generator().manual_seed(1))
-    start = alone.sample_draws(torch.Generator().manual_seed(2))
+    draws = alone.training_noise(1, torch.Generator().manual_seed(1))
+    start = alone.sampling_noise(torch.Generator().manual_seed(2))
     asked = {key: value[None] for key, value in start.items()}
     results: dict[str, Any] = {}
     for which, model in (("alone", alone), ("shared", shared)):

@@ -12,9 +12,9 @@ from mme_vla.policy.finetune import apply_finetuning
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.training.logging import Loggers, open_loggers
 from mme_vla.training.loop import Trainer
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import Run
 from mme_vla.training.settings import TrainSettings
-from mme_vla.training.validation import Validation
 from mme_vla.types import Batch, HistoryTokens
 
 SMALL = {"depth": 1, "vision": {"depth": 1, "image_size": 16, "patch_size": 1, "width": 16, "mlp_dim": 16}}

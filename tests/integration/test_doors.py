@@ -162,7 +162,7 @@ def test_a_door_leads_to_the_action_in_training_and_in_every_step_of_sampling(ow
 def test_a_policy_learns_and_acts_through_a_door(own: type[Integration]) -> None:
     policy = own_policy(own)
     batch = random_batch(policy, valid=64)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     before, _ = policy(batch, draws)
     before.backward()
     torch.optim.SGD(policy.parameters(), 1e-2).step()
@@ -222,4 +222,5 @@ def test_the_memoryless_ports_start_an_own_integration_too(tmp_path: Path) -> No
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     policy = own_policy(Everything)
     start = transfer(policy, tmp_path / "lerobot")
-    assert set(start.new) == {name for name in policy.state_dict() if policy.component_of(name) == "memory"}
+    component = policy.finetune_spec.component_of
+    assert set(start.new) == {name for name in policy.state_dict() if component(name) == "memory"}

@@ -8,6 +8,7 @@ from mme_vla import UserError
 from mme_vla.memory.history import LazyHistory, OnlineHistory, StorageSpec
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing.small import moving_frames, small_policy
+from mme_vla.types import FrameBatch
 
 SPEC = StorageSpec(2, keep_every=2)
 
@@ -31,8 +32,9 @@ def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -
         return numbered(frames)
 
     lazy, eager = LazyHistory(SPEC, encode), OnlineHistory(SPEC)
-    lazy.take(shown, encode, drawn, 6)
-    eager.take(shown, numbered, drawn, 6)
+    batch = FrameBatch.of(shown, drawn, 6)
+    lazy.take(batch, encode)
+    eager.take(batch, numbered)
     assert encoded == [] and len(lazy) == len(eager) == 6
     for indices in (np.array([[3, 1], [1, 0], [3, 2]]), np.array([[5, 3], [3, 0]])):
         assert torch.equal(lazy.gather(indices), eager.gather(indices))
@@ -43,7 +45,7 @@ def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -
 
 def test_a_waiting_frame_keeps_no_message_alive() -> None:
     lazy, message = LazyHistory(SPEC, numbered), pictures(4)
-    lazy.take(message, numbered)
+    lazy.take(FrameBatch.of(message), numbered)
     assert all(not np.shares_memory(picture, message) for picture in lazy._waiting.values())
 
 

@@ -63,7 +63,7 @@ def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are(
     found.require_processor().stats = statistics([made], found)
     sharp = Decisions.of(found, [made])
     sharp.save(tmp_path / "a.safetensors")
-    blurred = Decisions.load(tmp_path / "a.safetensors", blur=0.5)
+    blurred = Decisions.load(tmp_path / "a.safetensors", token_noise=0.5)
     now, same, other = blurred.collate([0, 1, 2]), blurred.collate([0, 1, 2]), blurred.collate([2, 1, 0])
     seen = sharp.collate([0, 1, 2])
     assert now.view_tokens is not None and seen.view_tokens is not None and now.history is not None

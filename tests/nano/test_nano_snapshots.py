@@ -11,8 +11,8 @@ from mme_vla.nano.demonstrations import record
 def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
     """Marks come and go, and belong to no thing of the task: what is drawn afterwards has them where they were."""
     from mme_vla.envs.make import make_env
+    from mme_vla.envs.observations import RenderRequest
     from mme_vla.envs.recording.frames import FrameChoice
-    from mme_vla.envs.render_request import RenderRequest
 
     remembered = {"name": "framesamp", "budget": 16, "grid": 1, "every": 7}
     made = record("PatternLock", 3_000_001, "easy", [FrameChoice("decisions", remembered)], ["front"])

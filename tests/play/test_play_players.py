@@ -123,7 +123,7 @@ def test_an_unusable_answer_is_counted_and_asked_again_with_the_reason():
 def test_a_model_that_never_answers_well_fails_and_a_broken_network_is_an_error():
     player, _ = gemini("x", "y", tries=2)
     session = play(a_session(), player)
-    assert (session.status, session.ended_by) == ("fail", "2 answers in a row could not be used; the last one: 'y'")
+    assert (session.status, session.ended_by) == ("fail", "2 replies in a row could not be used; the last one: 'y'")
     player, _ = gemini(ConnectionError("gone"))
     session = play(a_session(), player)
     assert (session.status, session.record("gemini").error) == ("error", "no answer (failed): ConnectionError: gone")

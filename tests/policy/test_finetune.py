@@ -52,7 +52,7 @@ def test_full_learns_all_but_the_vision_tower(variant: str) -> None:
 def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None:
     policy = small_policy(variant, backbone=FEW_TOKENS)
     counts = apply_finetuning(policy, "expert_only")
-    assert {policy.component_of(name) for name in learning(policy)} == {"action", "memory"} - (
+    assert {policy.finetune_spec.component_of(name) for name in learning(policy)} == {"action", "memory"} - (
         {"memory"} if variant == "pi05" else set()
     )
     assert counts["vlm"] == counts["vision"] == 0
@@ -70,8 +70,10 @@ def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> 
     counts = apply_finetuning(policy, "lora", rank=4, alpha=8)
     assert torch.equal(chunk(policy), plain)
     assert counts["vision"] == 0
+    spec = policy.finetune_spec
     assert all(
-        ".lora_" in n or policy.component_of(n) == "memory" or n.split(".")[1] in policy.heads for n in learning(policy)
+        ".lora_" in n or spec.component_of(n) == "memory" or n.split(".")[1] in spec.full_train
+        for n in learning(policy)
     )
     frozen = {n: p.clone() for n, p in policy.named_parameters() if not p.requires_grad}
     stir(policy)

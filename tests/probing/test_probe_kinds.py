@@ -11,7 +11,7 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
 from mme_vla.memory.history import OnlineHistory
-from mme_vla.methods.sam2act.memory import BankState
+from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.probing.channels import channel_of
 from mme_vla.probing.interventions import Feed

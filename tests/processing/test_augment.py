@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError
-from mme_vla.processing.augment import augment_views, augmentation_draws, crop_and_rotate, jitter_colours
+from mme_vla.processing.images import augment_views, augmentation_draws, crop_and_rotate, jitter_colours
 
 VIEWS = ("all", "colour")
 

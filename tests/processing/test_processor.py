@@ -106,7 +106,7 @@ def test_config_names_a_tokenizer_and_statistics_by_path(tmp_path: Path) -> None
     built = Processor.from_config(
         {"image_size": 56, "tokenizer": "sample", "stats": str(tmp_path / "mine.json"), "horizon": 10}
     )
-    assert built.stats is not None and built.horizon == 10 and built.prompt_length == 64
+    assert built.stats is not None and built.embodiment.action.horizon == 10 and built.prompt_length == 64
 
 
 @pytest.mark.parametrize(

@@ -101,7 +101,7 @@ def in_process(policy: MMEPolicy, numbers: list[int]) -> np.ndarray:
     seen = [[world.reset(None)] for world in worlds]
     for episode, world in zip(episodes, worlds, strict=True):
         if world.video:
-            episode.remember(np.stack(world.video), is_demo=True)
+            episode.add_frames(np.stack(world.video), is_demo=True)
     while len(worlds[0].taken) < STEPS:
         for episode, frames in zip(episodes, seen, strict=True):
             views = {"front": "agentview", "wrist": "wrist"}
@@ -199,4 +199,4 @@ def test_the_server_listens_on_this_machine_alone_by_default(
     monkeypatch.setattr(sys, "argv", ["vla_eval", *words, f"--args.checkpoint={tmp_path / 'checkpoint'}"])
     main()
     assert addresses == [address]
-    assert ("whoever reaches this port" in caplog.text) == warned
+    assert ("every client that reaches this port" in caplog.text) == warned

@@ -322,15 +322,17 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
 
 
 def test_settings_and_policies_that_cannot_work_are_refused(policy):
-    for bad in ({"port": 70000}, {"action_space": "joints"}, {"api_key": ""},
-                {"execute": 0}, {"max_batch": 1.5}, {"limits": Limits(send_s=-1)}):  # fmt: skip
-        with pytest.raises(UserError):
-            ServeSettings(**bad)
+    for bad, message in (({"port": 70000}, "port=70000 must be a whole number from 0 to 65535"),
+                         ({"action_space": "joints"}, "'joint_angle'"), ({"api_key": " x"}, "without blanks"),
+                         ({"execute": 0}, "a whole number, 1 or more or null"), ({"max_batch": 1.5}, "a whole number"),
+                         ({"limits": {"send_s": -1}}, "limits.send_s=-1 must be a number above 0")):  # fmt: skip
+        with pytest.raises(UserError, match=message):
+            ServeSettings.from_dict(bad)
     unknowing = serving_policy()
     unknowing.require_processor().stats = None
     with pytest.raises(UserError, match="statistics"):
         PolicyServer(unknowing, ServeSettings())
-    with pytest.raises(UserError, match="answers with joint_angle"):
+    with pytest.raises(UserError, match="returns joint_angle"):
         PolicyServer(policy, ServeSettings(action_space="ee_pose"))
     with (
         Served(policy) as first,

@@ -6,6 +6,7 @@ import json
 import logging
 import re
 import socket
+from contextlib import suppress
 from types import SimpleNamespace
 
 import numpy as np
@@ -129,6 +130,40 @@ def test_a_page_in_a_browser_is_refused(served):
     assert ask(served, "POST", "/reset", pack({"reset": True}), Origin="http://example.com")[0] == 403
 
 
+def slow_post(served: Served) -> socket.socket:
+    raw = socket.create_connection(served.address, timeout=20)
+    raw.sendall(b"POST /infer HTTP/1.1\r\nHost: x\r\nContent-Length: 100000\r\n\r\nx")
+    return raw
+
+
+def test_bodies_that_arrive_slowly_hold_no_place(policy):
+    with Served(policy, limits=Limits(connections=2)) as served:
+        bodies = [slow_post(served) for _ in range(2)]
+        wait_until(lambda: served.server.stats.connections == 2)
+        assert served.busy == 0
+        with served.client() as client, served.client() as other:
+            assert client.reset() and other.reset()
+        assert ask(served, "GET", "/stats")[0] == 200
+        for raw in bodies:  # both were closed for the clients
+            with suppress(ConnectionResetError):
+                assert raw.recv(100) == b""
+            raw.close()
+
+
+def test_a_body_has_a_time_limit_as_a_whole(policy, monkeypatch):
+    monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.1)
+    with Served(policy, limits=Limits(receive_s=1)) as served, slow_post(served) as raw:
+        raw.settimeout(0.2)
+        answer = b""
+        for _ in range(100):  # a byte each 0.2 s: no pause reaches receive_s
+            try:
+                answer += raw.recv(4096)
+                break
+            except TimeoutError:
+                raw.sendall(b"x")
+        assert answer.startswith(b"HTTP/1.1 408")
+
+
 def test_silent_sessions_are_freed(policy):
     with Served(policy, limits=Limits(idle_s=4)) as served:
         by_http(served, course()[:1])
@@ -220,13 +255,13 @@ def test_a_request_that_waited_does_not_go_on_with_an_episode_that_failed_meanwh
 
     async def meet():
         first = sessions.find(name, Reset())
-        await first.turn.acquire()
+        await first.lock.acquire()
         waiting = asyncio.ensure_future(sessions.respond(name, AddBuffer([], 0, np.zeros((0, 8), np.float32)), 0.0))
         await asyncio.sleep(0)
         assert first.requests == 1
         sessions.drop(name)  # as an error of the request before it does
         second = sessions.find(name, Reset())
-        first.turn.release()
+        first.lock.release()
         with pytest.raises(NoEpisodeError, match="begin the episode again"):
             await waiting
         return sessions.entries.pop(name) is second

@@ -7,14 +7,12 @@ import threading
 import time
 import warnings
 import weakref
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from helpers.serving_fakes import Served, acted_directly, ask, challenge, course, observation, serving_policy, states
@@ -163,20 +161,6 @@ def test_a_body_that_nobody_asked_for_is_not_kept(policy, monkeypatch, path):
                     time.sleep(0.01)
         assert resident_mib() - before < 100
         assert ask(served, "GET", "/healthz")[0] == 200
-
-
-def test_a_message_in_endless_pieces_is_refused(policy, monkeypatch):
-    monkeypatch.setattr(connections, "MOST_PIECES", 10)
-    with Served(policy) as served, connect(f"ws://127.0.0.1:{served.server.port}", compression=None) as raw:
-        raw.recv(10)
-
-        def pieces() -> Iterator[bytes]:
-            yield from [b""] * 12
-            raw.recv(10)  # before more is sent: what nobody reads would take the answer's place
-
-        with pytest.raises(ConnectionClosed) as closed:
-            raw.send(pieces())
-        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009
 
 
 def test_a_lost_http_episode_is_not_gone_on_with(policy):

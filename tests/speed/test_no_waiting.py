@@ -42,7 +42,7 @@ def on_meta(policy: MMEPolicy) -> tuple[Any, dict[str, torch.Tensor]]:
     """A batch and the draws of its loss there, and the policy moved."""
     batch = random_batch(policy, 2)
     generator = torch.Generator().manual_seed(0)
-    draws = policy.loss_draws(2, generator) | policy.image_draws(2, generator)
+    draws = policy.training_noise(2, generator) | policy.augmentation_params(2, generator)
     policy.to("meta")
     return batch.to("meta"), {name: value.to("meta") for name, value in draws.items()}
 

@@ -57,7 +57,7 @@ def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
         encoded.append(pixels.shape)
         return b"clip"
 
-    monkeypatch.setattr("mme_vla.subgoal.models.google.video_bytes", count)
+    monkeypatch.setattr("mme_vla.subgoal.models.connection.video_bytes", count)
     predictor, client = predictor_of(*[says("a")] * 4)
     play(predictor, started(predictor, video=10), 10)
     assert len(client.asked) == 4 and [shape[0] for shape in encoded] == [10, 48, 48, 48]

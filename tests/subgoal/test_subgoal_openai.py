@@ -17,7 +17,7 @@ from helpers.chat_server import ChatServer, chat_server, failure, says
 from mme_vla.errors import UserError
 from mme_vla.play import OpenAIPlayer
 from mme_vla.subgoal import OpenAI, build_predictor
-from mme_vla.subgoal.models.openai_chat import OpenAISettings
+from mme_vla.subgoal.models.connection import OpenAISettings
 
 pytest.importorskip("openai", reason="needs the extra openai")
 SECRET = "sk-not-a-real-key"
@@ -134,13 +134,13 @@ def test_a_wrong_key_or_model_ends_the_run_at_once(server: ChatServer) -> None:
     [
         ({"base_url": "127.0.0.1:80"}, "must be an address"),
         ({"video_frames": 3}, "an even number"),
-        ({"video_frames": True}, "an even number"),
-        ({"temperature": -1}, "or null for models"),
+        ({"video_frames": True}, "a whole number, 2 or more"),
+        ({"temperature": -1}, "a number, 0 or more or null"),
     ],
 )
 def test_impossible_settings_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        OpenAISettings(**settings)
+        OpenAI(**settings)
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,7 +181,7 @@ def test_an_answer_that_repeats_the_key_is_kept_without_it(
     kept = "".join(file.read_text() for file in tmp_path.rglob("*.json"))
     for text in (caplog.text, repr(heard), kept):
         assert not any(secret in text for secret in (SECRET, "ssword", login))
-    assert heard[1].answer is not None and "press *** *** ***" in heard[1].answer and "press *** *** ***" in kept
+    assert "press *** *** ***" in heard[1].reply and "press *** *** ***" in kept
     assert set(server.keys) == {f"Basic {login}"}, "as it is sent for an address with a password"
 
 

@@ -226,8 +226,7 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
     from omegaconf import OmegaConf
 
     from mme_vla.config.composition import config_dir
-    from mme_vla.subgoal.models.connection import Settings
-    from mme_vla.subgoal.models.openai_chat import OpenAISettings
+    from mme_vla.subgoal.models.connection import OpenAISettings, Settings
     from mme_vla.subgoal.qwenvl import VLMPredictor
 
     shared = {**dict.fromkeys(("qwenvl", "memer"), VLMPredictor), "gemini": Settings}

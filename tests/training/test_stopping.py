@@ -17,14 +17,14 @@ from mme_vla.training.stopping import stop_requests
 ASKED_ONCE = """
 import os, signal, sys
 from torch import distributed
-from mme_vla.training.stopping import stop_asked
+from mme_vla.training.stopping import stop_requests
 meeting, rank = sys.argv[1], int(sys.argv[2])
 distributed.init_process_group("gloo", init_method=f"file://{meeting}", rank=rank, world_size=2)
-with stop_asked() as asked:
+with stop_requests() as stop:
     for step in range(1, 7):
         if rank == 1 and step == 3:
             os.kill(os.getpid(), signal.SIGTERM)
-        if asked():
+        if stop():
             break
 print("stopped after", step)
 distributed.destroy_process_group()
@@ -38,7 +38,7 @@ def test_a_stop_signal_saves_and_leaves(tmp_path: Path) -> None:
 
     handler = signal.getsignal(signal.SIGTERM)
     built = trainer(tmp_path)
-    with Interrupted(6, 0, shown=False) as line:
+    with Interrupted(6, 0, visible=False) as line:
         assert not built.run(line, loggers(tmp_path))
     assert resolve_checkpoint(tmp_path).name == "step_000001"
     assert signal.getsignal(signal.SIGTERM) == handler
@@ -62,7 +62,7 @@ def usual_interrupt() -> Iterator[None]:
 
 @pytest.mark.usefixtures("usual_interrupt")
 def test_a_second_signal_ends_the_process_as_usual() -> None:
-    with pytest.raises(KeyboardInterrupt), stop_requests() as asked:
+    with pytest.raises(KeyboardInterrupt), stop_requests() as stop:
         signal.raise_signal(signal.SIGINT)
         assert asked()
         signal.raise_signal(signal.SIGINT)

@@ -18,11 +18,11 @@ from mme_vla.policy.build import build_from_config
 from mme_vla.policy.run_folders import checkpoints_in, resolve_checkpoint
 from mme_vla.training.checkpoint import check_disk
 from mme_vla.training.data import check_frozen
-from mme_vla.training.logging import Loggers, ProgressLine, check_logger, open_loggers, read_metrics
+from mme_vla.training.logging import ProgressLine, check_logger, open_loggers, read_metrics
 from mme_vla.training.loop import Trainer, loss_change
+from mme_vla.training.order import Validation
 from mme_vla.training.runs import Run, differing_keys, open_run, start_from
 from mme_vla.training.settings import KeepRule, TrainSettings
-from mme_vla.training.validation import Validation
 
 
 def train(folder: Path, *args: Any, **kwargs: Any) -> Trainer:
@@ -206,7 +206,7 @@ def test_a_checkpoint_of_the_released_code_names_the_command_that_converts_it(tm
         (tmp_path / file).touch()
     run, step = tmp_path, tmp_path / files[0].split("/")[0]
     for place in (run, step):
-        with pytest.raises(UserError, match=rf"python -m mme_vla\.weights\.convert {place} \S+_converted"):
+        with pytest.raises(UserError, match=rf"mme-vla weights {place} \S+_converted"):
             resolve_checkpoint(place)
 
 
@@ -242,58 +242,75 @@ def test_too_small_a_disk_is_found_before_training(tmp_path: Path, monkeypatch: 
         check_disk(tmp_path / "not" / "there", policy(), KeepRule())
 
 
-def test_loggers_record_numbers_and_pictures(tmp_path: Path) -> None:
+def log_twice(folder: Path, section: dict[str, Any]) -> None:
+    """Log as a run that is resumed after its third update."""
     from PIL import Image
+
+    Accelerator(cpu=True)
+    folder.mkdir(parents=True)
+    Image.new("RGB", (4, 4)).save(folder / "p.png")
+    for step in (3, 4):
+        opened = open_loggers(folder, {"logger": section}, step - 1)
+        opened.write(step, {"train/loss": 0.5})
+        opened.log_image(step, "plot", folder / "p.png")
+        opened.close()
+    assert read_metrics(folder) == [{"step": step, "train/loss": 0.5} for step in (3, 4)]
+
+
+def test_tensorboard_records_numbers_and_images(tmp_path: Path) -> None:
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    Image.new("RGB", (4, 4)).save(tmp_path / "p.png")
-    opened = open_loggers(tmp_path, {"logger": {"name": "tensorboard"}}, 0)
-    opened.write(3, {"train/loss": 0.5})
-    opened.log_image(3, "plot", tmp_path / "p.png")
-    opened.close()
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    log_twice(tmp_path / "run", {"name": "tensorboard"})
+    events = EventAccumulator(str(tmp_path / "run" / "tensorboard"))
     events.Reload()
-    assert [event.step for event in events.Scalars("train/loss")] == [3]
+    assert [event.step for event in events.Scalars("train/loss")] == [3, 4]
     assert events.Tags()["images"] == ["plot"]
-    assert read_metrics(tmp_path) == [{"step": 3, "train/loss": 0.5}]
+
+
+def test_wandb_records_offline_and_a_resumed_run_keeps_its_id(tmp_path: Path) -> None:
+    pytest.importorskip("wandb", reason="uv sync --inexact --extra wandb")
+    folder = tmp_path / "model" / "run"
+    log_twice(folder, {"name": "wandb", "mode": "offline"})
+    run_id = (folder / "wandb_id").read_text()
+    files = list(folder.glob(f"wandb/offline-run-*/run-{run_id}.wandb"))
+    assert len(files) == 2 and all(file.stat().st_size for file in files)
+
+
+def test_trackio_resumes_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
+    trackio = pytest.importorskip("trackio", reason="pip install -c constraints.txt trackio")
+    log_twice(tmp_path / "model" / "run", {"name": "trackio"})
+    (run,) = trackio.Api().runs("mme_vla")
+    assert run.name.startswith("model/run-")
+
+
+def test_mlflow_resumes_its_run(tmp_path: Path) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="pip install -c constraints.txt mlflow")
+    folder = tmp_path / "model" / "run"
+    log_twice(folder, {"name": "mlflow"})
+    run_id = (folder / "mlflow_id").read_text()
+    history = mlflow.MlflowClient().get_metric_history(run_id, "train/loss")
+    assert [point.step for point in history] == [3, 4]
+    assert list((folder / "mlflow").rglob("p.png"))
 
 
 def test_metrics_beyond_the_resumed_step_are_cut_off(tmp_path: Path) -> None:
     (tmp_path / "metrics.jsonl").write_text('{"step": 1}\n{"step": 2}\n{"st')
-    open_loggers(tmp_path, {}, 1).close()
+    with pytest.warns(UserWarning, match="half-written"):
+        open_loggers(tmp_path, {}, 1).close()
     assert read_metrics(tmp_path) == [{"step": 1}]
 
 
-def test_weights_and_biases_records_offline_and_a_resumed_run_keeps_its_id(tmp_path: Path) -> None:
-    pytest.importorskip("wandb", reason="uv sync --inexact --extra wandb")
-    from PIL import Image
-
-    folder = tmp_path / "model" / "run"
-    folder.mkdir(parents=True)
-    Image.new("RGB", (4, 4)).save(folder / "p.png")
-    ids = []
-    for step in (3, 4):
-        opened = open_loggers(folder, {"logger": {"name": "wandb", "mode": "offline"}}, step - 1)
-        opened.write(step, {"train/loss": 0.5})
-        opened.log_image(step, "plot", folder / "p.png")
-        opened.close()
-        ids.append((folder / "wandb_id").read_text())
-    assert ids[0] == ids[1] and ids[0]
-    assert [file.stat().st_size > 0 for file in folder.glob(f"wandb/offline-run-*/run-{ids[0]}.wandb")] == [True] * 2
-    assert read_metrics(folder) == [{"step": step, "train/loss": 0.5} for step in (3, 4)]
+@pytest.mark.parametrize("name", ["wandb", "trackio", "mlflow"])
+def test_missing_logger_package_is_reported(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.setitem(__import__("sys").modules, name, None)
+    with pytest.raises(UserError, match=f"logger={name} needs the .* `?{name}"):
+        check_logger({"logger": {"name": name}})
 
 
-def test_an_absent_wandb_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "wandb", None)
-    with pytest.raises(UserError, match="logger=wandb needs the extra `wandb`"):
-        check_logger({"logger": {"name": "wandb"}})
+def test_unknown_logger_names_the_nearest(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"Unknown logger 'tensorbord'.*tensorboard"):
         open_loggers(tmp_path, {"logger": {"name": "tensorbord"}}, 0)
-
-
-def test_no_loggers_write_nothing(tmp_path: Path) -> None:
-    Loggers([]).write(1, {"a": 1.0})
-    assert not list(tmp_path.iterdir())
 
 
 def test_loss_change_compares_both_ends() -> None:
@@ -302,7 +319,8 @@ def test_loss_change_compares_both_ends() -> None:
     assert loss_change([]) == {}
 
 
-@pytest.mark.parametrize("overrides", [[], ["experiment=robomme"], ["logger=wandb"], ["logger=none"]])
+@pytest.mark.parametrize("overrides", [[], ["experiment=robomme"], ["logger=wandb"], ["logger=none"],
+                                       ["logger=trackio"], ["logger=mlflow"]])  # fmt: skip
 def test_shipped_recipes_are_valid(overrides: list[str]) -> None:
     config = OmegaConf.to_container(compose("train", overrides), resolve=True)
     assert isinstance(config, dict)

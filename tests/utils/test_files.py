@@ -2,9 +2,12 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import tracemalloc
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,14 +16,16 @@ from mme_vla.errors import UserError, brief, listed
 from mme_vla.utils import (
     SUMS,
     FolderLock,
+    append_lines,
     check_sums,
     inside,
     parse_json,
     read_bytes,
     read_json,
-    read_json_lines,
+    read_lines,
     read_text,
     safe_name,
+    to_dataclass,
     write_atomically,
     write_json,
     write_sums,
@@ -58,13 +63,48 @@ def test_whatever_stands_in_a_files_place_is_refused_without_waiting(tmp_path: P
             read_text(tmp_path / name, limit=100)
 
 
-def test_lines_of_json_name_the_damaged_line(tmp_path: Path) -> None:
+@dataclass(frozen=True)
+class Reading:
+    name: str
+    value: float | None
+    ages: list[int] = field(default_factory=list)
+
+
+def readings(path: Path) -> list[Reading]:
+    return read_lines(path, partial(to_dataclass, Reading), "readings")
+
+
+def test_appended_lines_are_read_back(tmp_path: Path) -> None:
+    file, values = tmp_path / "log.jsonl", [Reading("\u2028", 1.5, [3, 4]), Reading("b", None)]
+    for value in values:
+        append_lines(file, [asdict(value)])
+    assert readings(file) == values
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('{"name"', "line 2 is not valid JSON"), ('{"name": "a"}', "line 2: .*missing value"),
+        ('{"name": "a", "value": 1, "x": 1}', "line 2: .*unknown x"),
+        ('{"name": {}, "value": 1}', "name={}: expected str"),
+        ('{"name": "a", "value": true}', "value=True: expected float"), ('{"name": "a", "value": NaN}', "NaN"),
+        ('{"name": "a", "value": 1, "ages": ["1"]}', r"ages=\['1'\]: expected list\[int\]"), ("[]", "an object"),
+        ('{"name": "a", "value": 1, "crc32": "0"}', "line 2 is not what was written"),
+    ],
+)  # fmt: skip
+def test_damaged_line_is_reported_with_its_number(tmp_path: Path, line: str, message: str) -> None:
     file = tmp_path / "log.jsonl"
-    file.write_text('{"a": "\u2028"}\n\n{"a": 2}\n{"a"\n', encoding="utf-8")
-    lines = read_json_lines(file)
-    assert [next(lines), next(lines)] == [(1, {"a": "\u2028"}), (3, {"a": 2})]
-    with pytest.raises(UserError, match="line 4"):
-        next(lines)
+    file.write_text(f'{{"name": "a", "value": 1}}\n{line}\n')
+    with pytest.raises(UserError, match=message):
+        readings(file)
+
+
+def test_half_written_last_line_is_ignored_with_a_warning(tmp_path: Path) -> None:
+    file = tmp_path / "log.jsonl"
+    append_lines(file, [asdict(Reading("a", 1.0)), asdict(Reading("b", 2.0))])
+    file.write_bytes(file.read_bytes()[:-2])
+    with pytest.warns(UserWarning, match="half-written"):
+        assert [reading.name for reading in readings(file)] == ["a"]
 
 
 def test_numbers_that_are_not_finite_are_read_where_they_are_allowed() -> None:
@@ -129,9 +169,9 @@ def test_the_sums_are_those_of_sha256sum(tmp_path: Path) -> None:
     assert (tmp_path / SUMS).read_text() == f"{known}  a\n"
 
 
-def test_a_folder_belongs_to_one_process_until_that_ends_however_it_ends(tmp_path: Path) -> None:
+def test_folder_lock_holds_until_its_process_is_killed(tmp_path: Path) -> None:
     hold = "import sys; from pathlib import Path; from mme_vla.utils import FolderLock\n"
-    hold += "FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
+    hold += "lock = FolderLock(Path(sys.argv[1])).acquire(); print('held', flush=True); sys.stdin.read()"
     other = subprocess.Popen(
         [sys.executable, "-c", hold, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -144,6 +184,29 @@ def test_a_folder_belongs_to_one_process_until_that_ends_however_it_ends(tmp_pat
     with FolderLock(tmp_path), pytest.raises(UserError, match="in use"):
         FolderLock(tmp_path).acquire()
     FolderLock(tmp_path).acquire().release()
+
+
+FORK = """
+import os, sys, time
+from pathlib import Path
+from mme_vla.utils import FolderLock
+
+lock = FolderLock(Path(sys.argv[1])).acquire()
+child = os.fork()
+if child == 0:
+    os.close(1)
+    time.sleep(60)
+print(child, flush=True)
+os._exit(0)
+"""
+
+
+def test_forked_process_does_not_keep_the_lock(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", FORK, tmp_path], stdout=subprocess.PIPE, text=True, check=True)
+    try:
+        FolderLock(tmp_path).acquire().release()
+    finally:
+        os.kill(int(done.stdout), signal.SIGKILL)
 
 
 def test_values_and_lists_in_messages_stay_short() -> None:

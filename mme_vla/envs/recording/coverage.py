@@ -47,7 +47,7 @@ class TaskCoverage:
 
     @property
     def missing_episodes(self) -> int:
-        """How many episodes ask for what was never shown."""
+        """How many episodes have a goal that was never demonstrated."""
         return sum(map(len, self.missing.values()))
 
     def to_dict(self) -> dict[str, Any]:
@@ -57,7 +57,7 @@ class TaskCoverage:
 
 
 def compare(recorded: Mapping[str, set[str]], requested: Iterable[tuple[EpisodeSpec, str]]) -> dict[str, TaskCoverage]:
-    """Which of the goals that episodes ask for were recorded, by task.
+    """Which of the goals of episodes were recorded, by task.
 
     Args:
         recorded: goals by task. requested: episodes with their goals.

@@ -1,4 +1,4 @@
-"""Which frames of a demonstration are drawn: those at which something is decided, and those a memory then reads."""
+"""Which frames of a demonstration are rendered: those of decisions, and those that a memory reads there."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,8 +9,9 @@ import numpy as np
 from mme_vla.data.waypoints import CHOICE_NUMBERS, Motions, find_choices, find_motions, known_poses, row_of
 from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.errors import UserError
+from mme_vla.memory.base import past_view_spec
 from mme_vla.registry import MEMORIES
 
 if TYPE_CHECKING:
@@ -25,15 +26,15 @@ _SOME_WIDTH = 64  # which frames a memory reads does not depend on the width of 
 
 @dataclass(frozen=True)
 class FrameChoice:
-    """A list of frames that every demonstration is drawn at; all other steps have no images.
+    """The rendered frames of every demonstration; all other steps have no images.
 
     at: the frames that both cameras show. `decisions`: the last frame before each planned motion of the execution,
         where a waypoint policy acts; `choices`: the last frame before each part of it, where one acts that chooses
         among options; n: the execution's first frame and every n-th after it; or numbers and ranges, counted from the
         episode's first stored frame.
-    memory: a section of a memory; the front camera also shows what this memory may read when asked at those frames, and
-        so does the other where the memory gives a backbone past views.
-    every: of the decisions, every so many, for a policy that executes so many motions before it is asked again.
+    memory: a section of a memory; the front camera also shows what this memory may read at those frames, and so does
+        the other where the memory gives a backbone past views.
+    every: stride over the decisions, for a policy that executes several motions of a chunk.
     """
 
     at: str | int | Sequence[int | str]
@@ -49,25 +50,25 @@ class FrameChoice:
             _build(self.memory)
 
     def beforehand(self) -> RenderRequest | None:
-        """What is drawn, where no demonstration has to be seen for it: numbers that no memory adds to; else None."""
+        """The request, where it does not depend on the demonstration: numbers without a memory; else None."""
         if isinstance(self.at, int) or self.at in (DECISIONS, CHOICES) or self.memory is not None:
             return None
         numbers = frozenset(k for span in spans(self.at, "frames", GRAMMAR) for k in span)
         return RenderRequest(dict.fromkeys(CAMERAS, numbers), now=())
 
     def render_request(self, steps: Sequence["RecordedStep"]) -> RenderRequest:
-        """What is drawn of a demonstration whose steps are known, from a recording without images."""
+        """The request for a demonstration whose steps are known from a recording without images."""
         video = _video(steps)
         numbers = self._frame_numbers(steps, video)
         frames = {camera: frozenset(numbers) for camera in CAMERAS}
         if self.memory is not None:
             read = self.read(np.array(numbers, np.int64), video)
-            for camera in CAMERAS if _build(self.memory).past_view_spec is not None else (MEMORY_CAMERA,):
+            for camera in CAMERAS if past_view_spec(_build(self.memory)) is not None else (MEMORY_CAMERA,):
                 frames[camera] |= read
         return RenderRequest(frames, now=())
 
     def read(self, frames: np.ndarray, exec_start: int) -> frozenset[int]:
-        """What the memory may read when it is asked at these frames [n], the execution beginning at `exec_start`."""
+        """What the memory may read at these frames [n]; the execution begins at `exec_start`."""
         if self.memory is None:
             return frozenset()
         return frozenset(_build(self.memory).frames_read(frames, exec_start).tolist())

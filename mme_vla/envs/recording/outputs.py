@@ -1,4 +1,4 @@
-"""What a recording is to leave behind: a LeRobot dataset, official files, or both; and what of it is there already."""
+"""The outputs of a recording: a LeRobot dataset, official files, or both."""
 
 import json
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class EpisodeWriter:
         path: of the new file.
         index: of the episode.
         task: what is demonstrated; its seed, difficulty, goals and options go into `setup`.
-        frames: the choice of frames that are drawn, where not all are.
+        frames: the choice of frames that are rendered, where not all are.
     """
 
     def __init__(self, path: Path, index: int, task: "Task", frames: "FrameChoice | None" = None) -> None:
@@ -107,7 +107,7 @@ class Job:
     recovery: str | None
     retries: int
     frames: FrameChoice | None = None
-    """At which frames it is drawn; None: at all."""
+    """The rendered frames; None: all."""
 
     @property
     def name(self) -> str:
@@ -116,7 +116,7 @@ class Job:
 
     @property
     def plan(self) -> dict[str, Any]:
-        """What decides the result; plans from before frames could be chosen do not speak of them."""
+        """What decides the result; without `frames` where all are rendered, as in older plans."""
         plan = asdict(self) | {"frames": self.frame_selection}
         return plan if self.frames is not None else {k: v for k, v in plan.items() if k != "frames"}
 
@@ -126,7 +126,7 @@ class Job:
         return None if self.frames is None else self.frames.to_dict()
 
     def made(self, seed: int | None, difficulty: str | None, frames: Any) -> bool:
-        """Whether an episode of this seed and difficulty, drawn at these frames, can be what this job records."""
+        """Whether an episode of this seed, difficulty and rendered frames can be what this job records."""
         right = seed is not None and self.seed <= seed < self.seed + self.retries
         return right and difficulty == self.difficulty and frames == self.frame_selection
 
@@ -165,7 +165,7 @@ class RecordingPlan:
     def write(self, missing: Sequence[Path], episodes: Path, options: "ConvertOptions") -> None:
         """Write these places from the recorded files in `episodes`; each appears whole or not at all."""
         from mme_vla.data.convert import convert
-        from mme_vla.data.hdf5_episode import EpisodeRef
+        from mme_vla.data.hdf5 import EpisodeRef
 
         for place in missing:
             if place != self.dataset:

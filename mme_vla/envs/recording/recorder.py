@@ -1,4 +1,4 @@
-"""One demonstration as data: every stored step of an episode, with the fields of the official files."""
+"""Demonstrates a task and records every stored step, with the fields of the official files."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -9,11 +9,10 @@ import numpy as np
 
 from mme_vla.embodiment.robomme import ARM_JOINTS, CAMERAS, POSE
 from mme_vla.envs.grounding import Grounding, project
-from mme_vla.envs.observations import AngleTrack, Include, Observer
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import AngleTrack, Include, Observer, RenderRequest
 from mme_vla.envs.robot.control import PlanningError
+from mme_vla.envs.robot.demonstrator import Demonstrator
 from mme_vla.envs.robot.gripper_skills import DOWNWARD_Q
-from mme_vla.envs.robot.stick_skills import Demonstrator
 from mme_vla.envs.subtasks import COMPLETED, NO_RECORD
 
 if TYPE_CHECKING:
@@ -24,18 +23,13 @@ if TYPE_CHECKING:
 
 
 def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["SubTask"] | None = None) -> bool:
-    """Perform the sub-tasks of a task that has just been reset, evaluating before and after each one.
+    """Perform the sub-tasks of a task that has just been reset, with `env.recording` set; whether it succeeded.
 
-    The demonstrator's view of where the episode stands, `env.progress.planned`, moves at these evaluations only. In a
-    recovery demonstration the drawn pick of the execution fails once first.
+    The task is evaluated before and after each sub-task; `env.progress.planned` moves at these evaluations only. In a
+    recovery demonstration the sampled pick of the execution fails once first.
 
     Args:
-        env: the task; while this runs, `env.recording` is set.
-        demonstrator: of the same task. Its steps are where frames are taken, its waypoints where they are noted.
-        subtasks: what to perform; by default all of the task's.
-
-    Returns:
-        Whether the task succeeded.
+        subtasks: by default all of the task's.
 
     Raises:
         PlanningError: a motion could not be planned.
@@ -59,7 +53,7 @@ def demonstrate(env: "Task", demonstrator: Demonstrator, subtasks: Sequence["Sub
 
 
 def _ended(env: "Task") -> bool:
-    """Evaluate once, as a recorder does between sub-tasks; whether the episode is over."""
+    """Evaluate once; whether the episode is over."""
     env.evaluate()
     env.progress.planned = env.progress.index
     return env.progress.succeeded or env.progress.failed
@@ -78,10 +72,7 @@ class TooLongError(RuntimeError):
 
 @dataclass(frozen=True)
 class RecordedStep:
-    """One stored time step; the observation was taken after the action.
-
-    obs: keys of the official files' `obs`. action: likewise. info: likewise.
-    """
+    """One stored time step with the keys of the official files; the observation was made after the action."""
 
     obs: dict[str, Any]
     action: dict[str, Any]
@@ -90,7 +81,7 @@ class RecordedStep:
 
 @dataclass
 class Recording:
-    """What became of one demonstration."""
+    """The result of one demonstration."""
 
     success: bool
     steps: int
@@ -99,21 +90,19 @@ class Recording:
     video: int = 0
     """Stored steps of the conditioning video."""
     error: str | None = None
-    """Why the demonstration broke off, if it did."""
+    """Why the demonstration ended early, if it did."""
     frames: list[RecordedStep] = field(default_factory=list)
     """Empty where a callback took the steps."""
 
 
 class Recorder:
-    """Demonstrates a task and takes down every step that is worth storing.
-
-    Steps during which the demonstrator is at a sub-task without words (`NO_RECORD`) are not stored.
+    """Demonstrates a task and records its steps, except those of sub-tasks without a text (`NO_RECORD`).
 
     Args:
         task: created with the observation mode `none`.
         render: take images; without them frames hold states, actions and plain texts only.
-        drawing: which stored steps are drawn, counted from 0, by which cameras; `obs` of the others has no images.
-            By default all. Where a text needs a pixel, the front camera looks all the same.
+        render_request: which stored steps, counted from 0, are rendered by which cameras; by default all. Where a text
+            needs a pixel, the front camera renders in any case.
         on_step: takes each stored step; by default they are collected in `Recording.frames`.
     """
 
@@ -144,13 +133,13 @@ class Recorder:
         self._displayed = task.progress.displayed
         self._result = Recording(success=False, steps=0)
         self._demonstrator = Demonstrator(task, self._step, self._note_waypoint)
-        task.observe = self._observe
+        task.on_frame = self._on_frame
         try:
             self._result.success = demonstrate(task, self._demonstrator)
         except (PlanningError, TooLongError) as error:
             self._result.error = str(error) or type(error).__name__
         finally:
-            task.observe = None
+            task.on_frame = None
         return self._result
 
     def _step(self, action: np.ndarray) -> None:
@@ -163,14 +152,14 @@ class Recorder:
     def _note_waypoint(self, pose: "sapien.Pose", gripper: float) -> None:
         self._enter_phase()
         angles = AngleTrack().follow(pose.q)
-        # Straight down is a half turn either way: which one would be a matter of rounding.
+        # Straight down is half a turn either way, which rounding would decide.
         if np.array_equal(pose.q, DOWNWARD_Q):  # as over buttons
             angles[0] = -np.pi
         else:
             angles = np.where(np.abs(angles + np.pi) < SEAM, np.pi, angles)
         self._waypoint = np.concatenate([pose.p, angles, [gripper]]).astype(np.float64)
 
-    def _observe(self, evaluated: dict[str, Any]) -> None:
+    def _on_frame(self, evaluated: dict[str, Any]) -> None:
         self._observer.follow()
         progress = self._task.progress
         # The text was set before the evaluation moved the pointer: it follows one step later.
@@ -188,7 +177,7 @@ class Recorder:
             self._on_step(step)
 
     def _enter_phase(self) -> None:
-        """Forget the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
+        """Drop the video's waypoint where the execution begins: at its first step, or at a waypoint before that."""
         video = self._task.progress.demonstrated.video
         if self._in_video is not None and video != self._in_video:
             self._waypoint = None

@@ -1,4 +1,4 @@
-"""What the gripper is shown to do: pick, place, put down, drop, press, hover."""
+"""Primitives of the gripper: pick, place, put down, drop, press, hover; and the orientations they need."""
 
 from collections.abc import Sequence
 
@@ -9,8 +9,8 @@ from sapien import physx
 from scipy.spatial.transform import Rotation
 
 from mme_vla.envs.robot.control import CLOSE, OPEN, RobotControl
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Button
+from mme_vla.envs.scene.articulated import Button
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.things import Thing
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -24,14 +24,7 @@ def grasp_orientation(thing: Thing, closing: np.ndarray) -> np.ndarray:
     """Orientation of the tool for grasping an object from above.
 
     The fingers close along the shorter of the two horizontal axes of the object's smallest bounding box; where these
-    are equal, along the one nearer to how the fingers stand now.
-
-    Args:
-        thing: an actor with collision shapes.
-        closing: the direction the fingers close along now, [3].
-
-    Returns:
-        Quaternion [4], wxyz.
+    are equal, along the one nearer to `closing`, their present direction [3]. Returns a quaternion [4], wxyz.
     """
     body = thing.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
     box = get_component_mesh(body).bounding_box_oriented.primitive
@@ -64,12 +57,9 @@ def wxyz(rotation: Rotation) -> np.ndarray:
 
 
 def failing_offset(mode: str, distance: float, seed: int) -> np.ndarray:
-    """Where a grasp that is to fail goes instead, relative to the right place [3].
+    """Offset [3] of a grasp that is to fail, `distance` metres along each axis that is missed.
 
-    Args:
-        mode: `z` closes too high, `xy` beside the object.
-        distance: metres, along each axis that is missed.
-        seed: the episode's; draws the direction of `xy`.
+    `z` closes too high, `xy` beside the object, in a direction that the seed decides.
     """
     if mode == "z":
         return np.array([0.0, 0.0, distance])
@@ -107,7 +97,6 @@ class GripperPrimitives(RobotControl):
         """Put what is held on a target, and withdraw.
 
         Args:
-            target: where to.
             z: height of the tool at the release, metres; by default the target's own.
         """
         q = self.env.tcp_pose.q
@@ -140,7 +129,6 @@ class GripperPrimitives(RobotControl):
         """Press a button with closed fingers and let it go.
 
         Args:
-            button: which one.
             hold: first move above it; without, the tool is there already.
             close: close the fingers first; without, they are closed already and time is short.
         """
@@ -167,7 +155,7 @@ class GripperPrimitives(RobotControl):
         initial_height = thing.position[2]
         self._grasp_at(grasp, thing, above)
         if self.env.second_tries and thing.position[2] - initial_height < LIFTED:
-            # A finger was in something's way: once more, across the other sides.
+            # A finger was blocked: once more, across the other sides.
             self.open()
             grasp = self._grasp_pose(thing, depth)
             self._grasp_at(sapien.Pose(grasp.p, turned(grasp.q, "z", np.pi / 2)), thing, above)

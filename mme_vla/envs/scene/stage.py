@@ -1,4 +1,4 @@
-"""The stage of a task: robot, table, cameras and the clock, before there is anything to do."""
+"""The stage of a task: robot, table, cameras and the step counter."""
 
 from collections.abc import Sequence
 from typing import Any, ClassVar
@@ -22,13 +22,7 @@ FIELD_OF_VIEW = np.pi / 2
 
 
 class Stage(BaseEnv):
-    """A robot at a table under two cameras. What stands on the table, and why, is the script's: `Task`.
-
-    Args:
-        seed: fixes the scene and the script; the `seed` of `reset` has no effect.
-        second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
-        does.
-    """
+    """A robot at a table under two cameras; `Task` adds the objects and the script."""
 
     SUPPORTED_REWARD_MODES = ("none", "dense")
     stick: ClassVar[bool] = False
@@ -36,7 +30,7 @@ class Stage(BaseEnv):
     spectator: ClassVar[tuple[Sequence[float], Sequence[float]]] = ((0.6, 0.7, 0.6), (0, 0, 0.35))
     """From where, and to where, the camera for people looks; no policy sees its images."""
 
-    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the cameras' settings that were asked for
+    _custom_sensor_configs: dict[str, Any] | None  # ManiSkill's: the requested camera settings
 
     def __init__(
         self,
@@ -49,6 +43,8 @@ class Stage(BaseEnv):
     ) -> None:
         self.seed = seed
         self.second_tries = second_tries
+        self.recording = False
+        """A demonstrator is recording: `dropped` is evaluated as it was when the official data were recorded."""
         self.reset_in_progress = False
         """The arm is being driven back between the conditioning video and the execution."""
         self.after_video = False
@@ -78,10 +74,10 @@ class Stage(BaseEnv):
             keep_renderer(self._render_device)
 
     def _clear(self) -> None:
-        """Give up the scene. What it holds points back to it, so this circle is cut here.
+        """Release the scene by cutting its reference cycle.
 
-        ManiSkill has all garbage of the process collected instead, before and after every episode: 0.4 s of the 0.5 s
-        that an episode without images takes to begin and end.
+        ManiSkill collects all garbage instead, which is 0.4 s of the 0.5 s that an episode without images
+        takes to begin and end.
         """
         self._close_viewer()
         if self.scene is not None:
@@ -112,7 +108,7 @@ class Stage(BaseEnv):
         self.reset_in_progress = self.after_video = False
         self.stored_qpos = None
 
-    # The clock ----------------------------------------------------------------------------------------------------
+    # Steps --------------------------------------------------------------------------------------------------------
 
     @property
     def steps_done(self) -> int:

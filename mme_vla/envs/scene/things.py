@@ -1,4 +1,4 @@
-"""What stands on the table, as the tasks see it: an entity with a name, a place, and a place to go back to."""
+"""Objects of a scene as the tasks use them: an entity with a name, a pose, and a pose to be restored to."""
 
 from typing import Any
 

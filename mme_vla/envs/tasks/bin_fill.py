@@ -6,17 +6,16 @@ from itertools import islice
 
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, row, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Appear
-from mme_vla.envs.scene.objects import Cube, H, build_board, build_button, build_cube
-from mme_vla.envs.scene.placement import Region, SceneError, draw_button, draw_cube
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Appear, Cue, row, tally
+from mme_vla.envs.scene.objects import Cube, H, build_board, build_cube
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_button, draw_cube
 from mme_vla.envs.scene.predicates import ON_TARGET, any_picked_up, dropped, pressed, released_and_away
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import SubTask, number, ordinal
+from mme_vla.envs.subtasks import Choice, SubTask, number, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import press
 
 # Both bounds belong to the range.
 AVAILABLE = {"easy": 1, "medium": 2, "hard": 3}
@@ -126,16 +125,7 @@ class BinFill(Task):
             for i in range(self.goal[colour])
             for step in (self._pick(i, self.cubes[colour][i]), self._drop())
         ]
-        press = SubTask(
-            "press the button",
-            done=lambda: pressed(self.button),
-            run=lambda demo: demo.press(self.button),
-            grounded="press the button at <>",
-            targets=[self.button],
-            choice="c",
-            operation="how many",
-        )
-        return [*steps, press]
+        return [*steps, press(self.button, "press the button", "c", operation="how many")]
 
     def _pick(self, i: int, cube: Cube) -> SubTask:
         return SubTask(

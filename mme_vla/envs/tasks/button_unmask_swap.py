@@ -1,14 +1,17 @@
 """ButtonUnmaskSwap (Permanence): press two buttons while containers cover cubes and swap; pick up the right one."""
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import Button, build_button
-from mme_vla.envs.scene.placement import draw_button, shifted_anchors
+from mme_vla.envs.scene.articulated import Button, build_button
+from mme_vla.envs.scene.placement import Draws, draw_button, shifted_anchors
 from mme_vla.envs.scene.predicates import pressed
-from mme_vla.envs.subtasks import SubTask
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.containers import container_choices, container_picks, hiding_goal
-from mme_vla.envs.tasks.families.unmask_swap import CONTAINERS, UnmaskSwap
+from mme_vla.envs.tasks.families.containers import (
+    CONTAINERS,
+    UnmaskSwap,
+    container_choices,
+    container_picks,
+    hiding_goal,
+)
 
 LETTERS = ("c", "d")
 

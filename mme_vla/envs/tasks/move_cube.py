@@ -6,18 +6,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.objects import PEG_COLOUR, H, build_cube, build_disc, build_peg
-from mme_vla.envs.scene.objects.shapes import at
-from mme_vla.envs.scene.placement import Region, SceneError, draw_cube, draw_disc
-from mme_vla.envs.scene.predicates import StaticFor, dropped_onto, gripper_open, picked_up, pushed_onto, reset_reached
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.scene.articulated import PEG_COLOUR, build_peg
+from mme_vla.envs.scene.objects import H, at, build_cube, build_disc
+from mme_vla.envs.scene.placement import Draws, Region, SceneError, draw_cube, draw_disc
+from mme_vla.envs.scene.predicates import dropped_onto, gripper_open, picked_up, pushed_onto
+from mme_vla.envs.subtasks import Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
+from mme_vla.envs.tasks.families.stages import end_video, pick, wait
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 MANNERS = ("hook", "push", "grasp")
 MANNER_TEXTS = {
@@ -92,16 +91,7 @@ class MoveCube(Task):
                 thing.displace(pose)
 
     def subtasks(self) -> list[SubTask]:
-        steps = HOLD_STEPS[self.manner] + self.turned("delay")
-        between = [
-            SubTask("static", StaticFor(self, steps), lambda demo: demo.hold(steps), video=True),
-            SubTask(
-                NO_RECORD,
-                done=lambda: self.after_video and reset_reached(self, self.reset_action[:-1]),
-                run=lambda demo: demo.hard_reset(),
-                video=True,
-            ),
-        ]
+        between = [wait(self, HOLD_STEPS[self.manner] + self.turned("delay")), end_video(self)]
         moves = {"hook": self._hook, "push": self._push, "grasp": self._grasp}[self.manner]
         return [*moves(video=True), *between, *moves(video=False)]
 
@@ -176,18 +166,11 @@ class MoveCube(Task):
         ]
 
     def _grasp(self, video: bool) -> list[SubTask]:
+        def misplaced() -> bool:
+            return self._on_target() or self._holds_peg()
+
         return [
-            SubTask(
-                "Pick up the cube",
-                done=self._holds_cube,
-                run=lambda demo: demo.pick(self.cube),
-                grounded="Pick up the cube at <>",
-                failed=lambda: self._on_target() or self._holds_peg(),
-                targets=[self.cube],
-                choice="d",
-                video=video,
-                operation="how",
-            ),
+            pick(self, self.cube, "Pick up the cube", "d", failed=misplaced, video=video, operation="how"),
             SubTask(
                 "place the cube onto the target",
                 done=lambda: dropped_onto(self, self.cube, self.target),

@@ -5,20 +5,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.draws import Draws
 from mme_vla.envs.scene.motions import Mark, Trace, build_mark
 from mme_vla.envs.scene.objects import Disc, build_disc
-from mme_vla.envs.scene.placement import SceneError
+from mme_vla.envs.scene.placement import Draws, SceneError
 from mme_vla.envs.scene.predicates import over
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stick import back_to_start
+from mme_vla.envs.tasks.families.stages import end_stick_video
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 GRID = {"easy": 3, "medium": 4, "hard": 5}
 PATH_LENGTH = {"easy": (2, 4), "medium": (3, 5), "hard": (4, 8)}
@@ -93,7 +91,7 @@ class PatternLock(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *back_to_start(self), *self._moves(video=False)]
+        return [approach, *self._moves(video=True), *end_stick_video(self), *self._moves(video=False)]
 
     def _moves(self, video: bool) -> list[SubTask]:
         return [self._move(a, b, video) for a, b in zip(self.path, self.path[1:], strict=False)]

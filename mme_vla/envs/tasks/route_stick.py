@@ -6,21 +6,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.robot.stick_skills import arc
-from mme_vla.envs.scene.cues import Cue, Place, on_table
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import Mark, Trace, build_mark
+from mme_vla.envs.robot.demonstrator import arc
+from mme_vla.envs.scene.motions import Cue, Mark, Place, Trace, build_mark, on_table
 from mme_vla.envs.scene.objects import Disc, build_disc, build_obstacle
+from mme_vla.envs.scene.placement import Draws
 from mme_vla.envs.scene.predicates import over
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import NO_RECORD, SubTask
+from mme_vla.envs.subtasks import NO_RECORD, Choice, SubTask
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
-from mme_vla.envs.tasks.families.stick import back_to_start
+from mme_vla.envs.tasks.families.stages import end_stick_video
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 PLACES, SPACING, CENTRE_X = 9, 0.07, -0.1
 MOVES = {"easy": (2, 3), "medium": (4, 5), "hard": (4, 7)}
@@ -118,7 +116,7 @@ class RouteStick(Task):
             run=lambda demo: demo.stick_to(first, store=True),
             video=True,
         )
-        return [approach, *self._moves(video=True), *back_to_start(self, HOME_STEPS), *self._moves(video=False)]
+        return [approach, *self._moves(video=True), *end_stick_video(self, HOME_STEPS), *self._moves(video=False)]
 
     def _moves(self, video: bool) -> list[SubTask]:
         legs = zip(self.route, self.route[1:], self.directions, strict=False)

@@ -6,20 +6,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 import sapien
 
-from mme_vla.envs.choices import Choice
-from mme_vla.envs.scene.cues import Cue, row, tally
-from mme_vla.envs.scene.draws import Draws
-from mme_vla.envs.scene.motions import smoothstep
-from mme_vla.envs.scene.objects import build_button, build_disc, build_moving_cube
-from mme_vla.envs.scene.placement import draw_button
+from mme_vla.envs.scene.articulated import build_button
+from mme_vla.envs.scene.motions import Cue, row, smoothstep, tally
+from mme_vla.envs.scene.objects import build_disc, build_moving_cube
+from mme_vla.envs.scene.placement import Draws, draw_button
 from mme_vla.envs.scene.predicates import hovering, pressed
 from mme_vla.envs.scene.things import distance_xy
-from mme_vla.envs.subtasks import SubTask, ordinal
+from mme_vla.envs.subtasks import Choice, SubTask, ordinal
 from mme_vla.envs.task import Task
 from mme_vla.envs.tasks import register_task
 
 if TYPE_CHECKING:
-    from mme_vla.envs.robot.stick_skills import Demonstrator
+    from mme_vla.envs.robot.demonstrator import Demonstrator
 
 INTERVALS = (60, 80, 120)  # steps of one pass
 PASSES = 5

@@ -1,4 +1,4 @@
-"""Many environments at once, each in a process of its own; a policy batches whichever are ready.
+"""Many environments at once, each in its own process; a policy batches those that are ready.
 
     with make_vec_env("PickXtimes", episodes=range(50), workers=8) as envs:
         for worker in range(envs.workers):
@@ -8,7 +8,7 @@
                 ...  # reply.job, reply.observation, reply.info; then
                 envs.send(reply.worker, action)  # or, when reply.done: envs.start_next(reply.worker)
 
-Processes inherit nothing of the script that makes one (`processes.py`), which therefore keeps its work under
+Processes inherit nothing of the script that makes one (`worker.py`), which therefore keeps its work under
 `if __name__ == "__main__":`.
 """
 
@@ -25,7 +25,7 @@ from mme_vla.config.plugins import import_plugins, imported_plugins
 from mme_vla.envs import metadata
 from mme_vla.envs.make import check_names, make_env, require_simulator
 from mme_vla.envs.vector import worker as protocol
-from mme_vla.envs.vector.processes import begin, settings, simulating_processes
+from mme_vla.envs.vector.worker import begin, settings, simulating_processes
 from mme_vla.errors import UserError
 from mme_vla.utils.processes import signals_deferred
 
@@ -44,7 +44,7 @@ class Job:
 
 @dataclass
 class Reply:
-    """What came back from one worker: of a reset (`reward` is None) or of a step."""
+    """The result of one worker: of a reset (`reward` is None) or of a step."""
 
     worker: int
     job: Job
@@ -54,7 +54,7 @@ class Reply:
     truncated: bool
     info: dict[str, Any]
     crashed: bool = False
-    """The worker died or hung and was replaced, or the environment raised: this says nothing about the policy."""
+    """The worker died or hung and was replaced, or the environment raised: no result of the policy."""
 
     @property
     def done(self) -> bool:
@@ -151,7 +151,7 @@ class VecEnv:
         return bool(self._lost) or any(worker.running for worker in self._workers)
 
     def start_next(self, worker: int) -> Job | None:
-        """Let a worker begin the next episode that nobody has begun; None when there is none left."""
+        """Let a worker begin the next episode; None when there is none left."""
         self._idle(worker)
         if not self.jobs:
             return None
@@ -207,7 +207,7 @@ class VecEnv:
         for state in self._workers:
             try:
                 protocol.send(state.connection, protocol.CLOSE)
-                # A worker that waits to hand over a piece takes this for the answer, and then finds the pipe closed.
+                # A worker that waits to send a piece takes this for the acknowledgement, then the pipe is closed.
                 state.connection.close()
             except OSError:
                 pass  # it is gone already
@@ -256,8 +256,7 @@ class VecEnv:
     def _poll(self, index: int, state: _Worker) -> Reply | None:
         """Take what a worker has sent; its reply if that is complete."""
         try:
-            # A long video comes in many pieces, each sent when the last was taken: a caller that looks in rarely would
-            # hold it up, so the next one is waited for.
+            # A long video comes in many pieces, each sent when the last was taken; wait for the next one.
             while state.connection.poll(_NEXT_PIECE_SECONDS if state.arrays else 0):
                 kind, *content = protocol.receive(state.connection)
                 if kind == protocol.PIECE:
@@ -281,11 +280,10 @@ class VecEnv:
         return None
 
     def _crashed(self, index: int, what: str) -> Reply:
-        """Replace a worker that ended or hangs."""
         return self._replace(index, "WorkerCrash", f"the worker process {what}")
 
     def _replace(self, index: int, kind: str, message: str) -> Reply:
-        """Put a new process in a worker's place; the reply that reports what became of the old one's command."""
+        """Start a new process for a worker; the reply reports the failure of its command."""
         old = self._workers[index]
         old.connection.close()
         protocol.end(old.process)
@@ -303,7 +301,6 @@ class VecEnv:
 
 
 def _work(plugins: Sequence[str], *arguments: Any) -> None:
-    """A worker process: first what the user's own tasks are registered by, then its commands."""
     import_plugins(plugins)
     protocol.serve(*arguments)
 

@@ -22,6 +22,7 @@ from mme_vla.evaluation.results.paper import REPLAN, ModelCost
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
+from mme_vla.policy.capabilities import CountsCost
 
 
 class RememberedShapes(TorchDispatchMode):
@@ -71,6 +72,7 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
     """
     _check_attention_is_counted()
     policy = on_meta(model, budget, backbone)
+    assert isinstance(policy, CountsCost)
     batch, memory = policy.full_batch("meta"), policy.memory
     return ModelCost(
         model=model,
@@ -126,7 +128,7 @@ def _streamed(policy: Policy, batch: Any) -> int | None:
 
 
 def _frames(policy: Policy) -> int:
-    if policy.memory is None:
+    if policy.memory is None or not isinstance(policy, CountsCost):
         return 0
     n_encoded = sum(policy.memory.storage.keeps(frame) for frame in range(REPLAN, 2 * REPLAN))
     return n_encoded * flops(policy.warm_up_vision)

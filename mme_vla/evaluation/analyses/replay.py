@@ -82,4 +82,6 @@ def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:
     """Normalisation statistics for a fresh policy, which has none: those of the data it is shown."""
     processor = policy.require_processor()
     if processor.stats is None:
-        processor.stats = compute_norm_stats([source], horizon=processor.horizon, robot=processor.embodiment)
+        processor.stats = compute_norm_stats(
+            [source], horizon=processor.embodiment.action.horizon, robot=processor.embodiment
+        )

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mme_vla.envs.metadata import BASE, read_variant
-from mme_vla.envs.scores import MOTION, ProcessScore
-from mme_vla.envs.subtasks import OPERATIONS
+from mme_vla.envs.subtasks import MOTION, OPERATIONS, ProcessScore
 from mme_vla.errors import UserError
 from mme_vla.evaluation.records import EpisodeRecord, merge
 from mme_vla.evaluation.results.aggregate import Interval, Method, Results, wilson

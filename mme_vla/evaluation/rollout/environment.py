@@ -17,9 +17,8 @@ from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.embodiment.robomme import CAMERAS, SIDE, benchmark_action, benchmark_state
 from mme_vla.envs.make import make_env
 from mme_vla.envs.metadata import STICK_TASKS
-from mme_vla.envs.render_request import RenderRequest
-from mme_vla.envs.scores import process_score
-from mme_vla.envs.subtasks import Progress
+from mme_vla.envs.observations import RenderRequest
+from mme_vla.envs.subtasks import Progress, process_score
 from mme_vla.errors import UserError
 from mme_vla.evaluation.rollout.video import EpisodeVideo, video_name
 from mme_vla.registry import TASKS

@@ -21,6 +21,7 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
 from mme_vla.evaluation.store import INDIFFERENT, RECORDS, Claims, RecordLog, claim_run, fingerprint, read_records
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, ShowsDistractors
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
@@ -118,7 +119,7 @@ def evaluate(
     """
     policy.require_processor().require_stats()
     check_subgoals(policy, subgoals)
-    check_sessions(settings.split, policy.n_distractor_episodes)
+    check_sessions(settings.split, _n_distractors(policy))
     if base is make_env:
         check_benchmark(policy.embodiment, ACTION_SPACES)
     claim_run(output, run_settings(policy, facts, settings, subgoals, source), notes)
@@ -142,14 +143,18 @@ def evaluate(
     return Evaluation(_done(output, jobs, facts, shard), workload)
 
 
+def _n_distractors(policy: Policy) -> int:
+    return policy.n_distractor_episodes if isinstance(policy, ShowsDistractors) else 0
+
+
 def _environments(
     policy: Policy, output: Path, settings: RolloutSettings, base: Callable[..., Any], workers: int
 ) -> VecEnv:
     robot = policy.embodiment
     options: dict[str, Any] = {"base": base, "max_steps": settings.max_steps, "robot": robot}
-    options["max_actions"] = policy.max_actions
+    options["max_actions"] = policy.max_actions if isinstance(policy, LimitsActions) else None
     if base is make_env:
-        options |= {"sessions": policy.n_distractor_episodes}
+        options |= {"sessions": _n_distractors(policy)}
         options |= {"env": settings.env, "render": settings.render, "action_space": robot.action.space}
         options |= {f"include_{name}": True for name in robot.readings}
     if settings.video != "none":
@@ -199,7 +204,7 @@ def run_settings(
         "dtype": dtype,
         "subgoal": None if subgoals is None else _predictor_facts(facts.subgoal, subgoals),
         "execute": settings.execute or policy.embodiment.action.execute,
-        "flow_steps": settings.flow_steps or policy.sample_steps,
+        "flow_steps": settings.flow_steps or (policy.sample_steps if isinstance(policy, SamplesInSteps) else 1),
         **{name: getattr(settings, name) for name in names},
     }
 
@@ -220,7 +225,7 @@ def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
     """Refuse a predictor that says what this policy was not trained to read."""
     if subgoals is None:
         return
-    if not policy.require_processor().reads_subgoal:
+    if not policy.require_processor().prompt_spec.reads_subgoal:
         raise UserError(f"{policy.config.get('name', 'The policy')} reads no subgoal: leave out subgoal=….")
     kind = subgoal_kind(policy)
     if kind is not None and kind != f"{subgoals.kind}_subgoal":

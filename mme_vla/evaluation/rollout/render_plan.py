@@ -10,10 +10,12 @@ from functools import cache
 
 import numpy as np
 
-from mme_vla.envs.render_request import RenderRequest
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.memory.base import past_view_spec
 from mme_vla.policy.base import Policy
+from mme_vla.policy.capabilities import frames_read
 from mme_vla.subgoal import SubgoalPredictor
 
 EVERY = range(2**31)
@@ -34,7 +36,7 @@ class RenderPlan:
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
         memory = policy.memory
-        every = memory is not None and memory.past_view_spec is not None
+        every = past_view_spec(memory) is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
         self._reads = cache(self._reads_of)
         # Depth and poses of cameras come with every frame.
@@ -86,4 +88,4 @@ class RenderPlan:
         # A motion takes any number of frames, so that the policy may act at each.
         action = self._robot.action
         apart = 1 if action.frames is None else min(self._settings.execute or action.execute, action.horizon)
-        return self._policy.frames_read(exec_start + np.arange(0, self._settings.max_steps + 2, apart), exec_start)
+        return frames_read(self._policy, exec_start + np.arange(0, self._settings.max_steps + 2, apart), exec_start)

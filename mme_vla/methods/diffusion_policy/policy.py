@@ -1,54 +1,54 @@
 """`DiffusionPolicy`: chunks of absolute joint targets by denoising, as its authors trained it or with a memory."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
+from mme_vla.errors import UserError
 from mme_vla.integration.film import PooledIntegration
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.diffusion_policy import model
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.methods.diffusion_policy.model import DiffusionNetwork
 from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
-from mme_vla.policy.base import Policy
+from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.masking import masked_mean
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
-from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
 
 
 @POLICIES.register("diffusion_policy")
-class DiffusionPolicy(Policy):
+class DiffusionPolicy(NetworkPolicy):
     """Diffusion Policy (RoboMME's DP-Unet): a U-Net that denoises chunks under what is seen, felt and asked for.
 
     Any memory may stand beside it, through an integration that makes one vector of its tokens (`film`).
     """
 
     processor: DiffusionProcessor | None
-    lora_targets = ("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3")
-    heads = ("final_conv",)
-    PARTS: ClassVar[Mapping[str, str]] = {
-        "vision": r"backbone\.vision\.",
-        "memory": r"memory\.|integration\.",
-        "encoder": r"backbone\.(image_encoder|image_pool)\.",
-        "text": r"backbone\.text_proj\.",
-        "action": "",
-    }
+    finetune_spec = FineTuneSpec(
+        components={
+            "vision": r"backbone\.vision\.",  # the memory's tower alone, which is never trained
+            "memory": r"memory\.|integration\.",
+            "encoder": r"backbone\.(image_encoder|image_pool)\.",
+            "text": r"backbone\.text_proj\.",
+            "action": "",
+        },
+        lora_targets=("cond_encoder.1", "diffusion_step_encoder.1", "diffusion_step_encoder.3"),
+        full_train=("final_conv",),
+    )
 
     def __init__(
         self,
@@ -57,26 +57,15 @@ class DiffusionPolicy(Policy):
         integration: PooledIntegration | None = None,
         processor: DiffusionProcessor | None = None,
         config: Mapping[str, Any] | None = None,
-        *,
-        compute_dtype: str = "float32",
-        history_dtype: str = "bfloat16",
-        augment: bool = True,
+        **options: Any,
     ) -> None:
-        """Put the parts together.
+        """Put the parts together; `processor`, `config` and `options` as for `NetworkPolicy`.
 
-        Args:
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: what `from_config` was given; saved with the weights.
-            compute_dtype, history_dtype: as for `MMEPolicy`.
-            augment: crop at random while training, one place for the whole batch; else the centre, as when acting.
+        While training, `augment` crops at random, one position for the whole batch; else the centre is cropped, as
+        when acting.
         """
-        super().__init__()
+        super().__init__(processor, config, **options)
         self.backbone, self.memory, self.integration = backbone, memory, integration
-        self.processor = processor
-        self.config = dict(config or {})
-        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.augment = augment
         self.sizes = sizes = backbone.sizes
         self.horizon, self.action_dim = sizes.horizon, sizes.action_dim
         self.n_past_steps, self.sample_steps = sizes.window - 1, sizes.diffusion_steps
@@ -108,14 +97,9 @@ class DiffusionPolicy(Policy):
             raise UserError("Diffusion Policy needs its own processor: set processor=dp, or dp_tiny to try things out.")
         return cls(network, memory, integration, processor, config, **policy_options(cls, config))
 
-    def autocast(self) -> torch.autocast:
-        """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
-
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """The `noise` [n, h, a] that is added and the `step` [n] that says how much."""
         step = torch.randint(self.sizes.diffusion_steps, (count,), generator=generator)
         return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
@@ -123,19 +107,19 @@ class DiffusionPolicy(Policy):
     def forward(
         self,
         batch: DiffusionBatch,
-        draws: Mapping[str, Tensor] | None = None,
+        noise: Mapping[str, Tensor] | None = None,
         corner: tuple[int, int] | None = None,
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` makes them.
+            batch: with `actions`. noise: as `training_noise` makes them.
             corner: (top, left) of the crop; by default drawn while training and the centre's else.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        values = draws or self.loss_draws(len(batch.actions), torch.default_generator)
-        sampled = map_draws(values, lambda value: value.to(self.device))
+        values = noise or self.training_noise(len(batch.actions), torch.default_generator)
+        sampled = map_noise(values, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history)
         with self.autocast():
             condition = self.condition(batch, memory, corner)
@@ -152,13 +136,6 @@ class DiffusionPolicy(Policy):
         """What the U-Net denoises under, [b, c]: the window's steps, oldest first, then the memory's vector."""
         feature = None if self.integration is None else self.integration.feature(memory)
         return self.backbone.condition(self._cropped_images(batch.images, corner), batch.state, batch.text, feature)
-
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Memory tokens of a selection, or None for a policy without memory."""
-        if self.memory is None or history is None:
-            return None
-        with self.autocast():
-            return self.memory(history)
 
     def recompute(self, mode: Recompute) -> None:
         """Compute the images' features again in the backward pass instead of keeping them, or keep them."""
@@ -185,7 +162,7 @@ class DiffusionPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a], and what is `added` [99, h, a] after each step but the last."""
         shape, steps = (self.horizon, self.action_dim), self.sizes.diffusion_steps
         noise = torch.randn(shape, generator=generator)
@@ -195,19 +172,19 @@ class DiffusionPolicy(Policy):
     def sample_actions(
         self,
         batch: DiffusionBatch,
-        draws: Mapping[str, Tensor] | None = None,
+        noise: Mapping[str, Tensor] | None = None,
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
         """A normalised chunk [b, h, a], from the first step of the current frame on.
 
         Args:
-            draws: as `sample_draws` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
+            noise: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
             memory: memory tokens encoded beforehand.
         """
-        if draws is None:
-            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.state))])
-        sampled = map_draws(draws, lambda value: value.to(self.device))
+        if noise is None:
+            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))])
+        sampled = map_noise(noise, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():
             condition = self.condition(batch, memory)
@@ -228,34 +205,17 @@ class DiffusionPolicy(Policy):
         return DiffusionBatch(torch.stack(images), processor.states(torch.stack(states)), text).to(self.device)
 
     def answer(
-        self, batch: DiffusionBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: DiffusionBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories."""
-        memory = None
-        if self.memory is not None:
-            with torch.no_grad(), self.autocast():
-                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
-        return self.sample_actions(batch, draws, steps, memory)
-
-    @torch.no_grad()
-    def prepare(self, episode: Episode) -> bool:
-        return prepare(self, episode)
+        return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
 
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
         """What the memory reads beside the current frame; with a window of consecutive frames, any may be seen."""
         processor = self.require_processor()
-        if processor.window > 1 and processor.consecutive:
+        if processor.samples.window > 1 and processor.samples.consecutive:
             return None
         return np.zeros(0, np.int64) if self.memory is None else self.memory.frames_read(steps, exec_start)
-
-    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
-        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        return encode_frames(self, frames, self.backbone.pooled_tokens, self.sizes.memory_width, batch_size)
-
-    def vision_fingerprint(self) -> str:
-        """A hash of the memory's vision tower and the dtype it runs in: what a cache of its tokens depends on."""
-        self.require_memory()
-        return tower_fingerprint(self.backbone.vision, self.compute_dtype)
 
     def require_processor(self) -> DiffusionProcessor:
         """Return the processor, or say what it takes to have one."""
@@ -263,25 +223,22 @@ class DiffusionPolicy(Policy):
         assert isinstance(processor, DiffusionProcessor)
         return processor
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         processor, sizes = self.require_processor(), self.sizes
-        pairs = {
+        return {
             "picture": (processor.picture, sizes.picture),
-            "window": (processor.window, sizes.window),
+            "window": (processor.samples.window, sizes.window),
             "text_dim": (processor.text.width, sizes.text_dim),
-            "horizon": (processor.horizon, sizes.horizon),
+            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
             "memory_size": (processor.memory_size, sizes.memory_tower.image_size),
         }
-        for name, (actual, expected) in pairs.items():
-            if actual != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                    "from two checkpoints, or one was changed."
-                )
 
-    # Costs and parts
+    @property
+    def memory_tower(self) -> MemoryTower:
+        self.require_memory()
+        return MemoryTower(self.backbone.vision, self.backbone.pooled_tokens, self.sizes.memory_width)
+
+    # Costs
 
     def full_batch(self, device: torch.device | str = "cpu") -> DiffusionBatch:
         """A batch of one without content, with a memory that is full."""
@@ -292,17 +249,13 @@ class DiffusionPolicy(Policy):
             state=torch.zeros(1, sizes.window, robot.state.width, device=device),
             text=torch.zeros(1, sizes.text_dim, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(sizes.memory_width, device),
+            history=None if self.memory is None else full_history(self.memory, sizes.memory_width, device),
         )
 
     def warm_up_vision(self) -> None:
         """Run the memory's vision tower on one black frame."""
         side = self.sizes.memory_tower.image_size
         self.backbone.vision(torch.zeros(1, 3, side, side, device=self.device))
-
-    def parts(self) -> Mapping[str, str]:
-        """`vision` is the memory's tower alone, which stays as it is; the cameras' own encoder learns."""
-        return self.PARTS
 
 
 def _pooled(section: Mapping[str, Any] | None, sizes: DiffusionSizes) -> PooledIntegration | None:

@@ -17,7 +17,7 @@ from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean, missing_extra
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
-from mme_vla.processing.base import STATS_FILE, Counted, PolicyProcessor, Sample
+from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, Sample, SampleSpec, StatsSpec
 from mme_vla.processing.images import as_uint8_frames, resize_with_pad, resize_with_pad_uint8
 from mme_vla.processing.normalise import NormStats, normalize, unnormalize
 from mme_vla.registry import PROCESSORS
@@ -122,7 +122,7 @@ class DiffusionBatch(TensorStruct):
 class DiffusionProcessor(PolicyProcessor):
     """Images of one size without augmentation, states and actions between their extremes, and the goal's vector."""
 
-    counted = Counted(horizon=1, every=True, extremes=True)
+    stats_spec = StatsSpec(horizon=1, every=True, extremes=True)
 
     def __init__(
         self,
@@ -153,7 +153,7 @@ class DiffusionProcessor(PolicyProcessor):
         self.picture = (integer(height, "processor.picture"), integer(width, "processor.picture"))
         self.embodiment = embodiment
         self.text_name, self.text = text, text_encoder(text, integer(text_dim, "processor.text_dim"))
-        self.window, self.consecutive = window, frames == FRAMES[0]
+        self.samples = SampleSpec(window=window, consecutive=frames == FRAMES[0])
         self.memory_size = integer(memory_size, "processor.memory_size")
         self.stats = stats
 
@@ -175,9 +175,8 @@ class DiffusionProcessor(PolicyProcessor):
         )  # fmt: skip
 
     @property
-    def words_from(self) -> str:
-        """The text tower."""
-        return self.text_name
+    def prompt_spec(self) -> PromptSpec:
+        return PromptSpec(self.text_name)
 
     # Observations
 
@@ -250,8 +249,8 @@ class DiffusionProcessor(PolicyProcessor):
             "picture": list(self.picture),
             "text": self.text_name,
             "text_dim": self.text.width,
-            "window": self.window,
-            "frames": FRAMES[0] if self.consecutive else FRAMES[1],
+            "window": self.samples.window,
+            "frames": FRAMES[0] if self.samples.consecutive else FRAMES[1],
             "memory_size": self.memory_size,
             "embodiment": self.embodiment.to_dict(),
             "stats": None if self.stats is None else STATS_FILE,

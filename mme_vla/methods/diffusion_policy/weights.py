@@ -59,7 +59,7 @@ def diffusion_adapter(policy: Policy) -> Adapter:
     table = {
         name: [Piece(name.replace(_LOCAL, _UNET).removeprefix("backbone."))]
         for name in policy.state_dict()
-        if policy.component_of(name) not in ("memory", "vision")
+        if policy.finetune_spec.component_of(name) not in ("memory", "vision")
     }
     height, width = (map_size(side) for side in policy.sizes.cropped)
     return Adapter(table, derived=[Derived(_GRID, partial(cell_centres, height, width))])

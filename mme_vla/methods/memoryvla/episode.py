@@ -11,7 +11,9 @@ from torch import Tensor
 
 from mme_vla.memory.extensions.bank import BankState
 from mme_vla.methods.memoryvla.model import BankStates, MemoryVlaCore
-from mme_vla.policy.episode import Episode, Host, MemoryEntries
+from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.policy.episode import Episode, Host
+from mme_vla.types import FrameBatch
 
 VIDEO_STRIDE = 8  # of the conditioning video every eighth frame is a moment, but for its last one
 
@@ -41,26 +43,22 @@ class MemoryVlaEpisode(Episode):
         self._due: np.ndarray | None = None
 
     def _take(
-        self,
-        frames: np.ndarray,
-        demo: np.ndarray,
-        executed: np.ndarray,
-        rendered: np.ndarray | None = None,
-        states: np.ndarray | None = None,
+        self, frames: FrameBatch, demo: np.ndarray, executed: np.ndarray, states: np.ndarray | None = None
     ) -> None:
         if self.pending is not None:
             self.banks = self._writer.banked.store(self.banks, *self.pending)
             self.pending = None
         moments = []
-        images = dict(zip(range(len(demo)) if rendered is None else rendered.tolist(), frames, strict=True))
         for i in range(len(demo)):
             if self._due is not None and demo[i]:  # a later frame of the video shows that it was not the last one
                 moments.append(self._due)
             if self._due is not None and (demo[i] or not self._video_over):
                 self._due = None
             if demo[i] and (self.n_observed_frames + i) % VIDEO_STRIDE == 0:
-                self._due = images[i].copy()
-        super()._take(frames, demo, executed, rendered, states)
+                image = frames.image(i)
+                assert image is not None, "all frames are rendered for banks"
+                self._due = image.copy()
+        super()._take(frames, demo, executed, states)
         if moments:
             self.banks = self._writer.write(self.banks, np.stack(moments), self.prompt)
 

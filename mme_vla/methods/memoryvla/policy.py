@@ -2,40 +2,38 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.config import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
-from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import Memory
+from mme_vla.errors import UserError
+from mme_vla.memory.base import Memory, full_history
 from mme_vla.methods.memoryvla.episode import MemoryVlaEpisode, words
 from mme_vla.methods.memoryvla.model import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core, read_moments
 from mme_vla.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
 from mme_vla.methods.openvla_oft.processor import augment, centre_cut, draw_changes
 from mme_vla.methods.prismatic import IMAGENET, Prismatic
-from mme_vla.policy.base import Policy
+from mme_vla.model import masked_mean
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.masking import masked_mean
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import MemoryTower, NetworkPolicy
 from mme_vla.policy.saving import policy_options
-from mme_vla.policy.tensor_files import dtype_of
-from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
 from mme_vla.processing.base import PolicyProcessor
 from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import MemoryTokens, Noise, map_noise, stack_noise
 
 
 @POLICIES.register("memoryvla")
-class MemoryVlaPolicy(Policy):
+class MemoryVlaPolicy(NetworkPolicy):
     """MemoryVLA: what a moment means (one token of a Llama) and what it looks like (tokens of two towers), each with a
     bank of past moments that is read, fused and written; a diffusion transformer answers.
 
@@ -43,27 +41,20 @@ class MemoryVlaPolicy(Policy):
     A memory of the library may stand in the banks' place: each moment then reads its own history's tokens.
     """
 
-    heads = ("core",)
-    lora_targets = (
-        "attn.qkv",
-        "attn.proj",
-        "q_proj",
-        "k_proj",
-        "v_proj",
-        "o_proj",
-        "gate_proj",
-        "up_proj",
-        "down_proj",
-    )
-    lora_exclude = r"^core\."
-    PARTS: ClassVar[Mapping[str, str]] = {
-        "vision": r"vlm\.vision\.",
-        "vlm": r"vlm\.",
-        "memory": r"memory\.|core\.((cognition|perceptual)_(bank|retrieval)|compression)\.",
-        "action": "",
-    }
-
     acts_in_bfloat16 = True
+    finetune_spec = FineTuneSpec(
+        components={
+            "vision": r"vlm\.vision\.",
+            "vlm": r"vlm\.",
+            "memory": r"memory\.|core\.((cognition|perceptual)_(bank|retrieval)|compression)\.",
+            "action": "",
+        },
+        lora_targets=(
+            "attn.qkv", "attn.proj", "q_proj", "k_proj", "v_proj", "o_proj", "gate_proj", "up_proj", "down_proj",
+        ),
+        full_train=("core",),
+        lora_exclude=r"^core\.",
+    )  # fmt: skip
 
     def __init__(
         self,
@@ -72,27 +63,16 @@ class MemoryVlaPolicy(Policy):
         memory: Memory | None = None,
         processor: MemoryVlaProcessor | None = None,
         config: Mapping[str, Any] | None = None,
-        *,
-        compute_dtype: str = "float32",
-        history_dtype: str = "bfloat16",
-        augment: bool = True,
+        **options: Any,
     ) -> None:
-        """Put the parts together.
+        """Put the parts together; `processor`, `config` and `options` as for `NetworkPolicy`.
 
         Args:
             core: with banks, or for a memory (`build_core`).
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: what `from_config` was given; saved with the weights.
-            compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
-            history_dtype: dtype of stored vision tokens; banks hold what the network computes.
-            augment: crop and colour images while training.
         """
-        super().__init__()
-        self.vlm, self.core, self.memory, self.processor = vlm, core, memory, processor
-        self.config, self.sizes = dict(config or {}), core.config
-        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.augment = augment
+        super().__init__(processor, config, **options)
+        self.vlm, self.core, self.memory = vlm, core, memory
+        self.sizes = core.config
         self.horizon, self.action_dim = core.config.horizon, core.config.action_dim
         self.sample_steps = core.config.ddim_steps
 
@@ -111,7 +91,7 @@ class MemoryVlaPolicy(Policy):
             )
         if processor is not None and not isinstance(processor, MemoryVlaProcessor):
             raise UserError("MemoryVLA needs its own processor: set processor=memoryvla, or memoryvla_tiny to try it.")
-        if processor is not None and processor.group_size == 1 and not config.get("memory"):
+        if processor is not None and processor.samples.group_size == 1 and not config.get("memory"):
             raise UserError(
                 "processor.group_size=1: MemoryVLA's banks learn from moments that follow each other; give groups of 2 "
                 "or more, or a memory in place of the banks (memory=framesamp)."
@@ -127,11 +107,6 @@ class MemoryVlaPolicy(Policy):
             memory = build_memory(config["memory"], sizes.vision.width, sizes.vision.grid, sizes.perceptual_width)
             check_past(config, memory, frozenset())
         return cls(vlm, core, memory, processor, config, **policy_options(cls, config))
-
-    def autocast(self) -> torch.autocast:
-        """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
 
     # Moments
 
@@ -158,21 +133,14 @@ class MemoryVlaPolicy(Policy):
         assert isinstance(self.core, MemoryVlaCore)
         return self.core
 
-    def encode_memory(self, history: HistoryTokens | None) -> MemoryTokens | None:
-        """Memory tokens of selections, or None for a policy that has its banks."""
-        if self.memory is None or history is None:
-            return None
-        with self.autocast():
-            return self.memory(history)
-
     # Training
 
     @property
     def group_size(self) -> int:
         """Moments of a training sample: its processor's, else its configuration's."""
-        return self.config["processor"]["group_size"] if self.processor is None else self.processor.group_size
+        return self.config["processor"]["group_size"] if self.processor is None else self.processor.samples.group_size
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of m moments."""
         shape = (count, self.sizes.repeats, self.group_size)
         return {
@@ -181,31 +149,31 @@ class MemoryVlaPolicy(Policy):
             "drop": torch.rand(shape, generator=generator),
         }
 
-    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """While training with augmentation `changes` [n, m, 6]: what happens to the images of `count` groups."""
         if not (self.training and self.augment):
             return {}
         size = self.group_size
         return {"changes": draw_changes(count * size, generator).unflatten(0, (count, size))}
 
-    def forward(self, batch: GroupBatch, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
+    def forward(self, batch: GroupBatch, noise: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` and `picture_draws` make them; fresh ones by default.
+            batch: with `actions`. noise: of `training_noise` and `augmentation_params`; fresh ones by default.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
-        values = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
+        values = dict(noise or self.training_noise(len(batch.images), torch.default_generator))
         if "changes" not in values:
-            values |= self.image_draws(len(batch.images), torch.default_generator)
+            values |= self.augmentation_params(len(batch.images), torch.default_generator)
         changes = values.pop("changes", None)
         copies = batch.valid.shape[1]
 
         def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
             return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
 
-        sampled = map_draws(values, lambda value: repeat_batch(value.to(self.device)))
+        sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
         memory = self.encode_memory(batch.histories())
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
@@ -239,7 +207,7 @@ class MemoryVlaPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
         return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
 
@@ -247,7 +215,7 @@ class MemoryVlaPolicy(Policy):
     def sample_actions(
         self,
         batch: GroupBatch,
-        draws: Mapping[str, Tensor] | None = None,
+        noise: Mapping[str, Tensor] | None = None,
         steps: int | None = None,
         memory: MemoryTokens | None = None,
     ) -> Tensor:
@@ -256,8 +224,8 @@ class MemoryVlaPolicy(Policy):
         Args:
             memory: memory tokens of the last moments, encoded beforehand.
         """
-        if draws is None:
-            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.images))])
+        if noise is None:
+            noise = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))])
         if self.memory is not None:
             batch = batch.last()
             memory = self.encode_memory(batch.history) if memory is None else memory
@@ -265,7 +233,7 @@ class MemoryVlaPolicy(Policy):
         with self.autocast():
             read, perceptual = self.core.through(cognition, features, batch.times[batch.valid], groups, memory)
             last = [int(group[-1]) for group in groups]
-            return self.core.sample(draws["noise"].to(self.device), read[last], perceptual[last], steps)
+            return self.core.sample(noise["noise"].to(self.device), read[last], perceptual[last], steps)
 
     # Episodes
 
@@ -284,20 +252,18 @@ class MemoryVlaPolicy(Policy):
         return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
 
     def answer(
-        self, batch: GroupBatch, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: GroupBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""
         if self.memory is not None:
-            with torch.no_grad(), self.autocast():
-                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
-            return self.sample_actions(batch, draws, steps, memory)
+            return self.sample_actions(batch, noise, steps, self.encode_memories(episodes))
         with torch.no_grad():
             cognition, features, _ = self._of_batch(batch)
             with self.autocast():
                 read, perceptual = self.banked.read_banks(
                     [_memoryvla_episode(episode).banks for episode in episodes], cognition, features
                 )
-                chunk = self.core.sample(draws["noise"].to(self.device), read, perceptual, steps)
+                chunk = self.core.sample(noise["noise"].to(self.device), read, perceptual, steps)
         for i, episode in enumerate(episodes):
             _memoryvla_episode(episode).pending = (cognition[i], features[i])
         return chunk
@@ -314,46 +280,29 @@ class MemoryVlaPolicy(Policy):
                 banks = self.banked.store(banks, cognition[i], features[i])
         return banks
 
-    @torch.no_grad()
-    def prepare(self, episode: Episode) -> bool:
-        return prepare(self, episode)
-
-    def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """What the memory reads; banks may be shown any frame."""
-        return None if self.memory is None else self.memory.frames_read(steps, exec_start)
-
-    def encode_frames(self, frames: np.ndarray | Tensor, batch_size: int = 32) -> Tensor:
-        """Memory-view frames [n, H, W, 3] uint8 → pooled tokens [n, grid², d_vision] as a history stores them."""
-        return encode_frames(self, frames, self.vlm.pooled_tokens, self.sizes.vision.width, batch_size)
-
-    def vision_fingerprint(self) -> str:
-        """A hash of the towers, the dtype they run in, and what a memory's images go through before them."""
-        image_format = "" if self.processor is None else self.processor.memory_image_format
-        return tower_fingerprint(self.vlm.vision, self.compute_dtype, image_format, str(self.vlm.vision.dino_standard))
-
     def require_processor(self) -> MemoryVlaProcessor:
         """Return the processor, or say what it takes to have one."""
         processor = super().require_processor()
         assert isinstance(processor, MemoryVlaProcessor)
         return processor
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         processor, sizes = self.require_processor(), self.sizes
-        pairs = {
+        return {
             "image_size": (processor.image_size, sizes.vision.image_size),
             "action_dim": (processor.action_dim, sizes.action_dim),
-            "horizon": (processor.horizon, sizes.horizon),
+            "horizon": (processor.embodiment.action.horizon, sizes.horizon),
         }
-        for name, (actual, expected) in pairs.items():
-            if actual != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                    "from two checkpoints, or one was changed."
-                )
 
-    # Costs and parts
+    @property
+    def memory_tower(self) -> MemoryTower:
+        vlm = self.vlm
+        processor = self.processor
+        image_format = processor.memory_image_format if isinstance(processor, MemoryVlaProcessor) else ""
+        settings = (image_format, str(vlm.vision.dino_standard))
+        return MemoryTower(vlm.vision, vlm.pooled_tokens, self.sizes.vision.width, settings)
+
+    # Costs
 
     def full_batch(self, device: torch.device | str = "cpu") -> GroupBatch:
         """A group of one moment without content, with the longest prompt and a full memory.
@@ -370,17 +319,13 @@ class MemoryVlaPolicy(Policy):
             times=torch.zeros(1, 1, dtype=torch.int64, device=known),
             valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(self.sizes.vision.width, device),
+            history=None if self.memory is None else full_history(self.memory, self.sizes.vision.width, device),
         )
 
     def warm_up_vision(self) -> None:
         """Run the vision towers on one black frame."""
         size = self.sizes.vision.image_size
         self.vlm.encode_images(torch.zeros(1, 3, size, size, device=self.device))
-
-    def parts(self) -> Mapping[str, str]:
-        """Towers; projector and language model; memory or banks, retrieval and compression; the head."""
-        return self.PARTS
 
 
 def _memoryvla_episode(episode: Episode) -> MemoryVlaEpisode:

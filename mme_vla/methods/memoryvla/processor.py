@@ -14,7 +14,7 @@ from mme_vla.errors import UserError, brief
 from mme_vla.memory.base import stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaConfig
 from mme_vla.methods.openvla_oft.processor import ClippedQuantiles, OpenVlaProcessor
-from mme_vla.processing.base import Counted, Sample
+from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import HistoryTokens, TensorStruct
 
@@ -55,22 +55,23 @@ class GroupBatch(TensorStruct):
         return self.history.rows(index)
 
 
+GROUP_SIZE = 16
+
+
 @PROCESSORS.register("memoryvla")
 class MemoryVlaProcessor(OpenVlaProcessor):
     """As OpenVLA's, but for the prompt's end, the numbers that are commanded as −1 or 1, and groups."""
 
-    counted = Counted(horizon=1, every=True, extremes=True, exact=True, video=True)
-    full_chunks_only = False
-    group_size: int = 16
+    stats_spec = StatsSpec(horizon=1, every=True, extremes=True, exact=True, video=True)
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
         """As `OpenVlaProcessor.from_config`, with `group_size` beside the other settings."""
-        size = config.get("group_size", cls.group_size)
+        size = config.get("group_size", GROUP_SIZE)
         if isinstance(size, bool) or not isinstance(size, int) or size < 1:
             raise UserError(f"processor.group_size must be a positive whole number, not {brief(size)}.")
         built = super().from_config({key: value for key, value in config.items() if key != "group_size"})
-        built.group_size = size
+        built.samples = SampleSpec(group_size=size, cameras=(built.embodiment.memory_camera,))
         return built
 
     @classmethod
@@ -86,11 +87,6 @@ class MemoryVlaProcessor(OpenVlaProcessor):
                 f"backbone.vocab_size={sizes.vocab_size}: choose the processor that goes with the backbone."
             )
         return built
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """The one camera that this policy looks through."""
-        return (self.embodiment.memory_camera,)
 
     def prompt(self, *args: Any, **named: Any) -> tuple[Tensor, Tensor]:
         """As `OpenVlaProcessor.prompt`, with the end-of-sequence token behind the piece `▁`."""
@@ -167,4 +163,4 @@ class MemoryVlaProcessor(OpenVlaProcessor):
 
     def to_config(self) -> dict[str, Any]:
         """As `OpenVlaProcessor.to_config`."""
-        return {**super().to_config(), "name": "memoryvla", "group_size": self.group_size}
+        return {**super().to_config(), "name": "memoryvla", "group_size": self.samples.group_size}

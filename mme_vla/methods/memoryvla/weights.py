@@ -100,7 +100,9 @@ def memoryvla_adapter(policy: Policy) -> Adapter:
             "Set model=memoryvla."
         )
     names = policy.state_dict()
-    return Adapter(memoryvla_table(names), fresh=frozenset(n for n in names if policy.component_of(n) in _COMPONENTS))
+    return Adapter(
+        memoryvla_table(names), fresh=frozenset(n for n in names if policy.finetune_spec.component_of(n) in _COMPONENTS)
+    )
 
 
 def write_memoryvla(policy: Policy, folder: Path, dtype: torch.dtype, stats: NormStats | None) -> None:

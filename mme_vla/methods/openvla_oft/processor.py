@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
-from mme_vla.processing.augment import hsv_to_rgb, rgb_to_hsv
-from mme_vla.processing.base import Counted, Sample
-from mme_vla.processing.images import as_uint8_frames, to_unit_range
+from mme_vla.processing.base import Sample, SampleSpec, StatsSpec
+from mme_vla.processing.images import as_uint8_frames, hsv_to_rgb, rgb_to_hsv, to_unit_range
 from mme_vla.processing.processor import Processor
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import Batch
@@ -222,8 +221,8 @@ def shift_hue(pixels: Tensor, by: Tensor) -> Tensor:
 class OpenVlaProcessor(Processor):
     """Lanczos-3 images, Llama's words, clipped quantiles of raw numbers, and the state for the network."""
 
-    counted = Counted(horizon=1, every=True, extremes=True, exact=True)
-    full_chunks_only = True
+    stats_spec = StatsSpec(horizon=1, every=True, extremes=True, exact=True)
+    samples = SampleSpec(full_chunks_only=True)
     jpeg: bool = False
     """Write every image as JPEG and read it again before it is resized, as the original's data were."""
 

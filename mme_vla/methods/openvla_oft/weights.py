@@ -135,7 +135,8 @@ def openvla_adapter(policy: Policy) -> Adapter:
         )
     names = [name for name in policy.state_dict() if ".lora_" not in name and ".base_layer." not in name]
     return Adapter(
-        openvla_table(names), fresh=frozenset(name for name in names if policy.component_of(name) == "action")
+        openvla_table(names),
+        fresh=frozenset(name for name in names if policy.finetune_spec.component_of(name) == "action"),
     )
 
 

@@ -11,10 +11,11 @@ from torch import Tensor
 
 from mme_vla.errors import UserError
 from mme_vla.methods.sam2act.geometry import ZOOM, Cube, PointFinder, angles_of_bins, zoom_back
-from mme_vla.methods.sam2act.memory import BankState
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import SAM2ActProcessor, Shot, cloud_images, zoomed_images
-from mme_vla.policy.episode import Episode, Host, MemoryEntries
+from mme_vla.methods.sam2act.sam2 import BankState
+from mme_vla.policy.capabilities import MemoryEntries
+from mme_vla.policy.episode import Episode, Host
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from torch import Tensor, nn
 
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.geometry import VIEWS, project, read_maps
-from mme_vla.methods.sam2act.image_encoder import ImageEncoder
-from mme_vla.methods.sam2act.memory import BankState, KeyframeBank, released_positions
+from mme_vla.methods.sam2act.sam2 import BankState, ImageEncoder, KeyframeBank, released_positions
 from mme_vla.speed.recompute import Recompute, run_layer
 
 _NEIGHBOURS = 9
@@ -221,9 +220,9 @@ class Heads(nn.Module):
         self.rates: Tensor
         self.register_buffer("rates", code_rates(width), persistent=False)
 
-    def compute_rates(self, device: torch.device) -> None:
-        """Give the codes' rates their values, where the module was built on meta."""
-        self.rates = code_rates(2 * len(self.rates)).to(device)
+    def reset_buffers(self) -> None:
+        """Compute the codes' rates, if the module was built on meta."""
+        self.rates = code_rates(2 * len(self.rates)).to(self.norm.weight.device)
 
     def features(self, tokens: Tensor, waypoints: Tensor) -> Tensor:
         """What the heads read [b, f] of tokens [b·3, token, g, g] at waypoints [b, 3] of the closer look's cube."""

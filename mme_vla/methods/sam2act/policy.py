@@ -1,33 +1,134 @@
 """`SAM2ActPolicy`: from coloured points to the next waypoint, with a memory of keyframes."""
 
+import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Draws, map_draws
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.episode import KeyframeEpisode, SceneInputs, decide, watch
-from mme_vla.methods.sam2act.geometry import Cube, PointFinder
-from mme_vla.methods.sam2act.losses import augmentation_draws, augmented, first_loss, memory_loss
-from mme_vla.methods.sam2act.memory import BankState
+from mme_vla.methods.sam2act.geometry import ZOOM, Cube, PointFinder, heatmap_loss, shift_and_rotate, to_bins
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
-from mme_vla.methods.sam2act.processor import NAME, KeyframeBatch, SAM2ActProcessor
-from mme_vla.policy.base import Policy
+from mme_vla.methods.sam2act.processor import NAME, KeyframeBatch, SAM2ActProcessor, cloud_images, zoomed_images
+from mme_vla.methods.sam2act.sam2 import BankState
+from mme_vla.policy.finetune import FineTuneSpec
+from mme_vla.policy.network import NetworkPolicy
 from mme_vla.policy.saving import policy_options
-from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
+from mme_vla.types import Noise, map_noise
 
 if TYPE_CHECKING:
     from mme_vla.policy.episode import Episode
     from mme_vla.processing.base import PolicyProcessor
+
+
+SHIFT, ROTATION = 0.125, math.pi / 4
+"""Augmentation as released: shifts to this part of the cube's sides, turns to this angle."""
+_CLOSE_TO_EDGE = 1e-3  # metres that a shifted target keeps from the bounds
+_BIN_OFFSETS = (-2, 2)  # how far off the bins that the heads are told may be; the upper end is left out
+
+
+def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Noise:
+    """Random numbers of `count` samples: shifts and turns in [−1, 1], and how far off told bins are."""
+    return {
+        "shift": 2 * torch.rand(count, keyframes, 3, generator=generator) - 1,
+        "turn": 2 * torch.rand(count, keyframes, generator=generator) - 1,
+        "told": torch.randint(*_BIN_OFFSETS, (count, keyframes, 3), generator=generator),
+    }
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """A batch after augmentation, b·k keyframes one after the other; the points are in the world."""
+
+    points: Tensor
+    colours: Tensor
+    state: Tensor
+    language: Tensor
+    target: Tensor
+    bins: Tensor
+    gripper: Tensor
+    collision: Tensor
+
+
+@torch.no_grad()
+def augmented(
+    batch: KeyframeBatch, language: Tensor, noise: Mapping[str, Tensor] | None, cube: Cube, bins: int
+) -> Scenes:
+    """Shift each keyframe's cloud and turn it about its target, and the target's rotation with it.
+
+    Args:
+        language: [b, l, w] tokens of the goals. noise: as `augmentation_draws` makes them; None changes nothing.
+        bins: of a whole turn.
+    """
+    keyframes = batch.points.shape[1]
+    points, target, rotation = (x.flatten(0, 1) for x in (batch.points, batch.target, batch.rotation))
+    if noise is not None:
+        low, high = target.new_tensor(cube.low), target.new_tensor(cube.high)
+        shift = noise["shift"].flatten(0, 1).to(target) * SHIFT * (high - low)
+        shifted = (target + shift).clamp(low + _CLOSE_TO_EDGE, high - _CLOSE_TO_EDGE)
+        angle = noise["turn"].flatten().to(target) * ROTATION
+        points = shift_and_rotate(points, target, shifted - target, angle)
+        target, rotation = shifted, _turned(rotation, angle)
+    return Scenes(
+        points=points,
+        colours=batch.colours.flatten(0, 1).to(points) / 255,
+        state=batch.state.flatten(0, 1),
+        language=language.repeat_interleave(keyframes, 0),
+        target=cube.place(target),
+        bins=to_bins(rotation, bins),
+        gripper=batch.gripper.flatten(),
+        collision=batch.collision.flatten(),
+    )
+
+
+def memory_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, length: int) -> dict[str, Tensor]:
+    """The loss of the memory's stage: the coarse heatmaps of sequences of `length` keyframes."""
+    images = cloud_images(scenes.points, scenes.colours, cube, network.sizes.side)
+    logits = network.coarse_sequences(network.encode_views(images, scenes.state, scenes.language), length)
+    return {"heatmap": heatmap_loss(logits, scenes.target).mean()}
+
+
+def first_loss(network: SAM2ActNetwork, scenes: Scenes, cube: Cube, offsets: Tensor | None = None) -> dict[str, Tensor]:
+    """The losses of the first stage, each of weight 1; single keyframes, no memory.
+
+    The closer look stands at the true waypoint, and the heads read there.
+
+    Args:
+        offsets: [n, 3]; by how many bins the rotation that the heads are told differs from the true one.
+    """
+    side, centre = network.sizes.side, scenes.target
+    images = cloud_images(scenes.points, scenes.colours, cube, side)
+    coarse = network.coarse_alone(network.encode_views(images, scenes.state, scenes.language))
+    near = zoomed_images(scenes.points, scenes.colours, cube, centre, ZOOM, side)
+    fine, tokens = network.fine_step(network.encode_views(near, scenes.state, scenes.language))
+    here = torch.zeros_like(centre)  # the waypoint, in the closer look's cube
+    maps = torch.cat([heatmap_loss(coarse, centre), heatmap_loss(fine, here)], 1)
+    noisy_bins = scenes.bins if offsets is None else (scenes.bins + offsets) % network.sizes.rotation_bins
+    outputs = network.heads(tokens, here, noisy_bins)
+    entropy = nn.functional.cross_entropy
+    return {
+        "heatmap": maps.mean(),
+        **{f"rotation_{axis}": entropy(outputs[axis], scenes.bins[:, i]) for i, axis in enumerate("xyz")},
+        "gripper": entropy(outputs["gripper"], scenes.gripper),
+        "collision": entropy(outputs["collision"], scenes.collision),
+    }
+
+
+def _turned(rotation: Tensor, angle: Tensor) -> Tensor:
+    """Quaternions [n, 4] (x, y, z, w) after a further turn about the vertical."""
+    x, y, z, w = rotation.unbind(-1)
+    sin, cos = (angle / 2).sin(), (angle / 2).cos()
+    return torch.stack([cos * x - sin * y, cos * y + sin * x, cos * z + sin * w, cos * w - sin * z], -1)
 
 
 STAGES = {
@@ -60,19 +161,11 @@ WIDTH = 7
 
 
 @POLICIES.register(NAME)
-class SAM2ActPolicy(Policy):
+class SAM2ActPolicy(NetworkPolicy):
     """SAM2Act+ (RoboMME's fine-tuned model): one waypoint at a time, which the benchmark's planner moves to."""
 
     processor: SAM2ActProcessor | None
     memory = None  # its memory stands inside the network, between transformer and decoder
-    lora_targets = ("to_q", "to_kv")
-    heads = ("heads",)
-    PARTS: Mapping[str, str] = {
-        "vision": r"backbone\.encoder\.vision\.(?!.*\.linear_[ab]_[qv]\.)",
-        "adapters": r"backbone\.encoder\.vision\.",
-        "memory": r"backbone\.memory\.",
-        "action": "",
-    }
 
     def __init__(
         self,
@@ -81,26 +174,16 @@ class SAM2ActPolicy(Policy):
         config: Mapping[str, Any] | None = None,
         *,
         stage: str = "memory",
-        compute_dtype: str = "float32",
-        history_dtype: str = "bfloat16",
-        augment: bool = True,
+        **options: Any,
     ) -> None:
         """Put the parts together.
 
         Args:
-            processor: needed for episodes and data; the network alone runs on ready batches without it.
-            config: what `from_config` was given; saved with the weights.
             stage: which of the authors' two stages trains: `first` or `memory`.
-            compute_dtype: as for `MMEPolicy`; the authors train in float16. history_dtype: of no use here.
-            augment: shift and turn clouds while training.
+            processor, config, options: of `NetworkPolicy`. The authors train in float16.
         """
-        super().__init__()
-        self.backbone, self.processor = backbone, processor
-        self.config = dict(config or {})
-        self.stage, self.augment = check_stage(stage), augment
-        self.compute_dtype = dtype_of(compute_dtype, "policy.compute_dtype")
-        self.history_dtype = dtype_of(history_dtype, "policy.history_dtype")
-        self.frozen = rf"backbone\.(?!{STAGES[stage]})"
+        super().__init__(processor, config, **options)
+        self.backbone, self.stage = backbone, check_stage(stage)
         self.horizon, self.action_dim = 1, WIDTH
         # Single keyframes first, then one more than can be remembered.
         self.keyframes = 1 if stage == "first" else backbone.sizes.remembered + 1
@@ -122,14 +205,8 @@ class SAM2ActPolicy(Policy):
             raise UserError("SAM2Act+ needs its own processor: set processor=sam2act_plus.")
         return cls(SAM2ActNetwork(sizes), processor, config, **policy_options(cls, config))
 
-    def compute_unsaved(self) -> None:
-        """Give the heads' constants their values, where they were built on meta; nothing else is computed."""
-        heads = self.backbone.fine.heads
-        assert heads is not None
-        heads.compute_rates(self.device)
-
     @property
-    def max_actions(self) -> int | None:  # type: ignore[override]
+    def max_actions(self) -> int | None:
         """Waypoints of an episode, which its clock counts to."""
         return None if self.processor is None else self.processor.waypoints
 
@@ -143,23 +220,18 @@ class SAM2ActPolicy(Policy):
         """The part of the world that is looked at: its processor's, else its configuration's."""
         return Cube.of(self.config["processor"]["bounds"]) if self.processor is None else self.processor.cube
 
-    def autocast(self) -> torch.autocast:
-        """The context all network code runs in."""
-        kind = self.device.type if self.device.type != "meta" else "cpu"
-        return torch.autocast(kind, self.compute_dtype, enabled=self.compute_dtype != torch.float32)
-
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Shifts and turns of `count` samples' clouds, and how far off the told rotations are."""
         return augmentation_draws(count, self.keyframes, generator)
 
     def forward(
-        self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None
+        self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The stage's loss, and its parts to log (detached)."""
-        values = self.loss_draws(len(batch.points), torch.default_generator) if draws is None else draws
-        sampled = map_draws(values, lambda value: value.to(self.device))
+        values = self.training_noise(len(batch.points), torch.default_generator) if noise is None else noise
+        sampled = map_noise(values, lambda value: value.to(self.device))
         cube, sizes = self.cube, self.backbone.sizes
         augmentation = sampled if self.training and self.augment else None
         scenes = augmented(batch, batch.language, augmentation, cube, sizes.rotation_bins)
@@ -186,7 +258,7 @@ class SAM2ActPolicy(Policy):
 
     @torch.no_grad()
     def sample_actions(
-        self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None, steps: int | None = None
+        self, batch: KeyframeBatch, noise: Mapping[str, Tensor] | None = None, steps: int | None = None
     ) -> Tensor:
         """The waypoint [b, 1, 7] after the last keyframe of each sequence; those before it are remembered."""
         waypoints = []
@@ -232,7 +304,7 @@ class SAM2ActPolicy(Policy):
         self,
         batch: list[SceneInputs],
         episodes: "Sequence[Episode]",
-        draws: Mapping[str, Tensor],
+        noise: Mapping[str, Tensor],
         steps: int | None = None,
     ) -> Tensor:
         """The next waypoints [n, 1, 7]; what is remembered of these keyframes counts from the next frames on."""
@@ -250,18 +322,26 @@ class SAM2ActPolicy(Policy):
         assert isinstance(processor, SAM2ActProcessor)
         return processor
 
-    def check_processor(self, source: str) -> None:
-        """See `Saved`."""
-        super().check_processor(source)
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
         text, sizes = self.require_processor().text, self.backbone.sizes
-        for name, actual, expected in (("language", text.width, sizes.language), ("words", text.words, sizes.words)):
-            if actual != expected:
-                raise UserError(
-                    f"{source}: the processor's {name} is {brief(actual)}, the network's {expected}. The files are "
-                    "from two checkpoints, or one was changed."
-                )
+        return {"language": (text.width, sizes.language), "words": (text.words, sizes.words)}
 
-    # Costs and parts
+    @property
+    def finetune_spec(self) -> FineTuneSpec:
+        """`vision` is SAM2's encoder, of which only the `adapters` are trained."""
+        return FineTuneSpec(
+            components={
+                "vision": r"backbone\.encoder\.vision\.(?!.*\.linear_[ab]_[qv]\.)",
+                "adapters": r"backbone\.encoder\.vision\.",
+                "memory": r"backbone\.memory\.",
+                "action": "",
+            },
+            lora_targets=("to_q", "to_kv"),
+            full_train=("heads",),
+            frozen=rf"backbone\.(?!{STAGES[self.stage]})",
+        )
+
+    # Costs
 
     def full_batch(self, device: torch.device | str = "cpu") -> KeyframeBatch:
         """A batch of one without content, as the stage trains on it."""
@@ -283,7 +363,3 @@ class SAM2ActPolicy(Policy):
         """Run the encoder on the virtual images of nothing."""
         side = self.backbone.encoder.side
         self.backbone.encoder(torch.zeros(3, 3, side, side, device=self.device))
-
-    def parts(self) -> Mapping[str, str]:
-        """`vision` is SAM2's encoder, which never learns but for its `adapters`."""
-        return self.PARTS

@@ -15,9 +15,16 @@ from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, missing_extra
 from mme_vla.methods.goal_encoders import HASHED, GoalEncoder, direction_of, load_with_goal_encoder
-from mme_vla.methods.sam2act.geometry import VIEWS, Cube, constant_channels, quaternions_of, unproject
-from mme_vla.methods.sam2act.render import EMPTY, virtual_images
-from mme_vla.processing.base import STATS_FILE, PolicyProcessor
+from mme_vla.methods.sam2act.geometry import (
+    EMPTY,
+    VIEWS,
+    Cube,
+    constant_channels,
+    quaternions_of,
+    unproject,
+    virtual_images,
+)
+from mme_vla.processing.base import STATS_FILE, PolicyProcessor, PromptSpec, SampleSpec
 from mme_vla.processing.normalise import NormStats, QuantileStats
 from mme_vla.registry import PROCESSORS
 from mme_vla.types import TensorStruct
@@ -212,7 +219,7 @@ class Recorded(Protocol):
 class SAM2ActProcessor(PolicyProcessor):
     """Nothing here is normalised: points are metres, and the network's answer is a waypoint in the world."""
 
-    samples = "keyframes"
+    samples = SampleSpec(kind="keyframes")
 
     def __init__(
         self,
@@ -298,9 +305,8 @@ class SAM2ActProcessor(PolicyProcessor):
         return self.text(goal)
 
     @property
-    def words_from(self) -> str:
-        """The encoder of goals."""
-        return self.text_name
+    def prompt_spec(self) -> PromptSpec:
+        return PromptSpec(self.text_name)
 
     def shots(self, views: Mapping[str, np.ndarray], index: int) -> list[Shot]:
         """The cameras' shots of one of the frames that an environment delivers, at the size that points are made of.
@@ -351,7 +357,7 @@ class SAM2ActProcessor(PolicyProcessor):
 
     # Batches
 
-    def keyframe_item(self, sample: Recorded) -> dict[str, Any]:
+    def item(self, sample: Recorded) -> dict[str, Any]:
         """A run of keyframes without a batch axis, for `collate`."""
         clouds = [cloud_of(shots, self.side) for shots in sample.shots]
         targets = np.asarray(sample.targets, np.float32)

@@ -19,8 +19,7 @@ import numpy as np
 
 from mme_vla.data.console import progress
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.data.hdf5 import find_files, list_episodes, open_episode
-from mme_vla.data.hdf5_episode import EpisodeRef
+from mme_vla.data.hdf5 import EpisodeRef, find_files, list_episodes, open_episode
 from mme_vla.data.lerobot_files import SAMPLE
 from mme_vla.embodiment.robomme import ARM_JOINTS
 from mme_vla.errors import UserError, brief

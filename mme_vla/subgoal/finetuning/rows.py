@@ -26,7 +26,7 @@ from mme_vla.subgoal.text import (
     subgoal_user,
     write_boxes,
 )
-from mme_vla.utils import Sums, inside, is_text, read_json_lines
+from mme_vla.utils import Sums, inside, is_text, read_lines
 
 Row = dict[str, Any]
 SETS = {"simple": ("qwenvl", "simple"), "grounded": ("qwenvl", "grounded"), "memer": ("memer", "grounded")}
@@ -38,8 +38,8 @@ SETS |= {"memer_simple": ("memer", "simple")}
 class RowOptions:
     """How rows are made.
 
-    noise: lowest and highest integer added to every coordinate, drawn anew for each row; None adds none.
-    repeat_changes: repeat rows at changes of subgoal (as released only while drawing figures).
+    noise: lowest and highest integer added to every coordinate, sampled for each row; None adds none.
+    repeat_changes: repeat rows at changes of subgoal (as the released code does for figures).
     short_segments: a row for segments shorter than the stride too (not as released).
     second_keyframe: find a second keyframe in one window (as released it is missed, and all that follow with it).
     substring_match: give ButtonUnmask the extra keyframes of ButtonUnmaskSwap, as released.
@@ -150,14 +150,16 @@ def read_rows(file: str | Path) -> list[Row]:
     if not path.is_file():
         raise UserError(f"{path} does not exist. Build it: mme-vla subgoal-build input=… output={path.parent}")
     Sums(path.parent, remedy="Build the training data again").check(path.name)
-    rows: list[Row] = []
-    for number, row in read_json_lines(path, "rows of training data", _LIMIT):
-        if reason := _fault(row):
-            raise UserError(f"{path}, line {number}, is no row: {reason}. Build the training data again.")
-        rows.append(row)
+    rows = read_lines(path, _checked, "rows of training data", limit=_LIMIT)
     if not rows:
         raise UserError(f"{path} holds no row.")
     return rows
+
+
+def _checked(row: Row) -> Row:
+    if reason := _fault(row):
+        raise UserError(f"no row of training data: {reason}. Build the training data again.")
+    return row
 
 
 def _fault(row: Row) -> str:

@@ -1,92 +1,74 @@
-"""Questions to a model behind an API: retries, rate limit, time limit, cache of answers, cost. No secret is logged."""
+"""Questions to a model behind an API: retries, rate limit, time limit, cache of replies, cost. No secret is logged."""
 
 import hashlib
 import json
 import logging
-import queue
 import threading
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from functools import partial
+from multiprocessing.pool import ThreadPool
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.subgoal.base import Usage
-from mme_vla.subgoal.models.connection import Connection, MediaPart, Message, Settings
-from mme_vla.subgoal.models.google import GoogleConnection
-from mme_vla.subgoal.models.openai_chat import OpenAIConnection
+from mme_vla.subgoal.models.connection import (
+    Connection,
+    GoogleConnection,
+    MediaPart,
+    Message,
+    OpenAIConnection,
+    Settings,
+)  # fmt: skip
 from mme_vla.utils import read_json, verified, with_checksum
 
 
 def start[T](call: Callable[[], T]) -> Future[T]:
-    """Begin a call in a thread of its own."""
+    """Begin a call in a daemon thread, which does not keep an interrupted process alive."""
     future: Future[T] = Future()
-    threading.Thread(target=_fill, args=(future, call), name="subgoals", daemon=True).start()
+
+    def work() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=work, name="subgoals", daemon=True).start()
     return future
 
 
-def within[T](seconds: float, call: Callable[[], T]) -> T:
-    """Call, waiting no longer than that; a call that hangs is left behind in its thread.
-
-    Raises:
-        TimeoutError: it took longer. Exception: what the call raised.
-    """
-    future = start(call)
-    try:
-        return future.result(seconds)
-    except TimeoutError:
-        if future.done():  # the call's own
-            raise
-        raise TimeoutError(f"no answer within {seconds:g} s") from None
-
-
 def side_by_side[A, T](call: Callable[[A], T], items: Sequence[A], workers: int) -> list[T]:
-    """Call with each item, so many at a time; the results in the items' order.
+    """Call with each item, `workers` at a time; the results in the items' order.
 
     Raises:
-        Exception: what the first item that failed raised; no further call is begun then.
+        Exception: of the first item that failed; no further call begins then.
     """
-    waiting: queue.SimpleQueue[tuple[Future[T], A]] = queue.SimpleQueue()
-    futures: list[Future[T]] = [Future() for _ in items]
-    for pair in zip(futures, items, strict=True):
-        waiting.put(pair)
-    stopped = threading.Event()
+    failed = threading.Event()
 
-    def work() -> None:
-        while not stopped.is_set():
-            try:
-                future, item = waiting.get_nowait()
-            except queue.Empty:
-                return
-            _fill(future, partial(call, item))
-            if future.exception() is not None:
-                stopped.set()  # what comes after it in the queue is never looked at
+    def guarded(item: A) -> T | None:
+        if failed.is_set():
+            return None  # the error of an earlier item is raised
+        try:
+            return call(item)
+        except BaseException:
+            failed.set()
+            raise
 
-    for _ in range(min(workers, len(items))):
-        threading.Thread(target=work, name="subgoals", daemon=True).start()
-    try:
-        return [future.result() for future in futures]
-    finally:
-        stopped.set()
-
-
-def _fill[T](future: Future[T], call: Callable[[], T]) -> None:
-    try:
-        future.set_result(call())
-    except BaseException as error:  # whoever waits for the result gets it
-        future.set_exception(error)
+    if not items:
+        return []
+    with ThreadPool(min(workers, len(items))) as pool:  # daemon threads
+        return cast(list[T], list(pool.imap(guarded, items)))
 
 
 log = logging.getLogger(__name__)
 CONNECTIONS: dict[str, type[Connection]] = {"gemini": GoogleConnection, "openai": OpenAIConnection}
-"""Ways to speak to models, by the word that settings choose them with."""
+"""Clients by the name of their API."""
 
 _PASSING = (408, 429, 500, 502, 503, 504)  # HTTP: worth another try
 _FATAL = (401, 403, 404)  # the key or the model's name is wrong: no question will ever be answered
@@ -118,7 +100,7 @@ class Api:
     client: what the connection asks, such as google-genai's; None makes one: at once, but with a cache and no key when
         the first question comes that the cache does not hold.
     clock, sleep: of the rate limit and the pauses.
-    speaks: a key of `CONNECTIONS`.
+    provider: a key of `CONNECTIONS`.
     """
 
     settings: Settings
@@ -126,7 +108,7 @@ class Api:
     client: Any = None
     clock: Callable[[], float] = time.monotonic
     sleep: Callable[[float], None] = time.sleep
-    speaks: str = "gemini"
+    provider: str = "gemini"
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _next: float = 0.0
 
@@ -138,7 +120,7 @@ class Api:
     def _connected(self) -> Connection:
         with self._lock:
             if self._connection is None:
-                self._connection = CONNECTIONS[self.speaks](self.settings, self.client)
+                self._connection = CONNECTIONS[self.provider](self.settings, self.client)
             return self._connection
 
     def _needed(self) -> Connection:
@@ -204,7 +186,7 @@ class Api:
 
     def _once(self, connection: Connection, system: str, messages: Sequence[Message]) -> Reply:
         started = self.clock()
-        raw = within(self.settings.timeout, lambda: connection.ask(system, messages))
+        raw = start(lambda: connection.ask(system, messages)).result(self.settings.timeout)
         prices = self.settings.input_price, self.settings.output_price
         with self._lock:
             self.usage.calls += 1
@@ -230,7 +212,7 @@ class Api:
     def _cache_file(self, system: str, messages: Sequence[Message]) -> Path | None:
         if self.settings.cache is None:
             return None
-        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.speaks].cached_as(self.settings), system]).encode())
+        digest = hashlib.sha256(json.dumps([*CONNECTIONS[self.provider].cached_as(self.settings), system]).encode())
         for role, parts in messages:
             digest.update(f"\n{role}".encode())
             for item in parts:
@@ -279,12 +261,12 @@ def _code(error: Exception) -> int:
     return next((code for code in codes if isinstance(code, int) and code), 0)
 
 
-def make_api(speaks: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
+def make_api(provider: str, settings: Mapping[str, Any], where: str, usage: Usage, client: Any = None) -> Api:
     """An `Api` out of plain settings.
 
     Args:
-        speaks: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
+        provider: a key of `CONNECTIONS`. settings: of its kind. where: the section they stand in, for messages.
     """
-    if speaks not in CONNECTIONS:
-        raise UserError(f"{where}.api={speaks!r}. {did_you_mean(str(speaks), CONNECTIONS)}")
-    return Api(read_section(CONNECTIONS[speaks].settings_type, settings, where), usage, client, speaks=speaks)
+    if provider not in CONNECTIONS:
+        raise UserError(f"{where}.api={provider!r}. {did_you_mean(str(provider), CONNECTIONS)}")
+    return Api(read_section(CONNECTIONS[provider].settings_type, settings, where), usage, client, provider=provider)

@@ -1,4 +1,4 @@
-"""Qwen3-VL through transformers: questions with images and videos in, answers out, in batches."""
+"""Qwen3-VL through transformers: questions with images and videos in, completions out, in batches."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -123,17 +123,17 @@ class VLM:
     @torch.inference_mode()
     def generate(self, questions: Sequence[Question], max_new_tokens: int = 128) -> list[Completion]:
         """Answer greedily. What is asked together does not change an answer beyond rounding."""
-        answers: list[Completion] = []
+        completions: list[Completion] = []
         for start in range(0, len(questions), self.batch_size):
             batch = self.encode(questions[start : start + self.batch_size]).to(self.model.device)
             sequences = self.model.generate(
                 **batch, max_new_tokens=max_new_tokens, do_sample=False, temperature=None, top_p=None, top_k=None
             )
             read = batch["attention_mask"].sum(1).tolist()
-            answers += [
+            completions += [
                 self._reply(ids, n) for ids, n in zip(sequences[:, batch["input_ids"].shape[1] :], read, strict=True)
             ]
-        return answers
+        return completions
 
     def _reply(self, ids: torch.Tensor, read: int) -> Completion:
         tokenizer = self.processor.tokenizer

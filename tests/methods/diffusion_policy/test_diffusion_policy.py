@@ -2,6 +2,7 @@
 
 import sys
 import time
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -133,7 +134,7 @@ def test_the_window_holds_consecutive_frames_or_those_it_was_asked_at() -> None:
     processor = policy.require_processor()
     found = {}
     for consecutive in (True, False):
-        processor.consecutive = consecutive
+        processor.samples = replace(processor.samples, consecutive=consecutive)
         episode = policy.start_episode("push the button")
         episode.observe({name: of[:3] for name, of in pictures.items()}, states[:3], np.array([True, True, False]))
         first = episode.window[1]

@@ -57,7 +57,7 @@ def test_any_memory_joins_the_condition(memory: str) -> None:
 
 def test_what_is_remembered_changes_the_answer_and_learns(policy: DiffusionPolicy) -> None:
     batch = policy.full_batch()
-    draws = {name: value[None] for name, value in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    draws = {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
     chunks = []
     for seed in (0, 1, 1):
         batch.history = history(policy, seed)
@@ -66,7 +66,7 @@ def test_what_is_remembered_changes_the_answer_and_learns(policy: DiffusionPolic
     assert not torch.allclose(chunks[0], chunks[1])
     policy.zero_grad()
     policy(batch)[0].backward()
-    learnt = [p for name, p in policy.named_parameters() if policy.component_of(name) == "memory"]
+    learnt = [p for name, p in policy.named_parameters() if policy.finetune_spec.component_of(name) == "memory"]
     assert learnt and all(p.grad is not None and p.grad.abs().sum() > 0 for p in learnt)
     policy.zero_grad()
 
@@ -87,8 +87,8 @@ def test_an_episode_remembers(policy: DiffusionPolicy) -> None:
     def answer(seed: int) -> np.ndarray:
         episode = policy.start_episode("find the cube")
         past = moving_frames(8, seed=seed)
-        episode.remember(past, np.arange(8) < 7)
-        episode.look({"front": moving_frames(1)[0], "wrist": moving_frames(1)[0]}, np.zeros(8, np.float32))
+        episode.add_frames(past, np.arange(8) < 7)
+        episode.set_view({"front": moving_frames(1)[0], "wrist": moving_frames(1)[0]}, np.zeros(8, np.float32))
         return policy.act(episode, 2)
 
     same, again, other = answer(0), answer(0), answer(5)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -317,7 +318,7 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
     policy = built({**fitting[0][2], **{key: about[key] for key in ("weight_seed",) if key in about}})
     processor = policy.require_processor()
     processor.stats = NormStats(statistics_of(arrays, "state"), statistics_of(arrays, "action"))
-    processor.consecutive = False  # as that server does
+    processor.samples = replace(processor.samples, consecutive=False)  # as that server does
     processor.text = lambda goal: arrays["in/text_emb"]
     seen: list[Tensor] = []
     condition = policy.condition
@@ -335,7 +336,7 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
         draws = {"noise": arrays[f"{call}/sample_noise"][0], "added": arrays[f"{call}/step_noise"][:, 0]}
         monkeypatch.setattr(episode, "draw", lambda draws=draws: draws)
         views = {name: arrays[f"{call}/{name}"].numpy() for name in ROBOMME_JOINT.camera_names}
-        episode.look(views, arrays[f"{call}/state"].float().numpy())
+        episode.set_view(views, arrays[f"{call}/state"].float().numpy())
         actions = policy.act(episode)[: about["action_exec_horizon"]]
         close(seen[-1], arrays[f"{call}/global_cond"], SAMPLES)
         close(torch.from_numpy(actions).double(), arrays[f"{call}/actions"].double(), SAMPLES)

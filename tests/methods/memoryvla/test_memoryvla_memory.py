@@ -36,7 +36,7 @@ from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames
 from mme_vla.training.data import check_frozen, prepare_data
 from mme_vla.types import HistoryTokens
 from mme_vla.weights.load import transfer
-from mme_vla.weights.writers import WRITERS
+from mme_vla.weights.writers import write_policy
 
 
 def recalling(memory: Any = "framesamp", **options: Any) -> MemoryVlaPolicy:
@@ -56,11 +56,11 @@ def histories(policy: MemoryVlaPolicy, count: int, seed: int = 0) -> HistoryToke
 
 
 def draws(policy: MemoryVlaPolicy, groups: int = 1) -> dict[str, torch.Tensor]:
-    return policy.loss_draws(groups, torch.Generator().manual_seed(0))
+    return policy.training_noise(groups, torch.Generator().manual_seed(0))
 
 
 def noise(policy: MemoryVlaPolicy) -> dict[str, torch.Tensor]:
-    return {name: value[None] for name, value in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    return {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
 
 
 @pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt", *BEYOND_MEMORIES, "bank"])
@@ -85,7 +85,8 @@ def test_the_loss_depends_on_what_is_remembered_and_teaches_the_memory(policy: M
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
     policy.zero_grad()
     found[0].backward()
-    still = [n for n, p in policy.named_parameters() if policy.component_of(n) == "memory" and not p.grad.any()]  # type: ignore[union-attr]
+    component = policy.finetune_spec.component_of
+    still = [n for n, p in policy.named_parameters() if component(n) == "memory" and not p.grad.any()]  # type: ignore[union-attr]
     assert all(name.endswith("key.bias") for name in still), still  # a bias of all keys alike changes no weight
     policy.zero_grad()
     with pytest.raises(ValueError, match="has a memory"):
@@ -158,7 +159,7 @@ def test_an_episode_remembers_as_a_sample_does_and_writes_nothing(policy: Memory
     episode.noise_state = start
     np.testing.assert_array_equal(policy.act(episode, 2), chunk)
     episode.noise_state = start
-    batch = replace(policy.observation([episode]), history=stack_history([episode.recall()]))
+    batch = replace(policy.observation([episode]), history=stack_history([episode.gather_selection()]))
     drawn = {name: value[None] for name, value in episode.draw().items()}
     expected = policy.require_processor().absolute_actions(policy.sample_actions(batch, drawn, 2), torch.zeros(1, 8))
     np.testing.assert_allclose(chunk, expected[0], atol=1e-5)
@@ -241,7 +242,7 @@ def test_what_cannot_stand_there_is_refused_in_words() -> None:
 
 def test_the_memory_learns_in_full_beside_adapters(policy: MemoryVlaPolicy) -> None:
     counts = apply_finetuning(policy, "expert_only")
-    of_memory = sum(p.numel() for n, p in policy.named_parameters() if policy.component_of(n) == "memory")
+    of_memory = sum(p.numel() for n, p in policy.named_parameters() if policy.finetune_spec.component_of(n) == "memory")
     assert counts["memory"] == of_memory > sum(p.numel() for p in policy.require_memory().parameters())
     assert counts["vision"] == counts["vlm"] == 0
     apply_finetuning(policy, freeze_vision=False)
@@ -261,7 +262,8 @@ def test_what_a_checkpoint_to_start_from_lacks_is_drawn(model: str, words: dict[
         policy = build_from_config(compose("policy", policy_words(model, words)), fresh_backbone=False)
     finally:
         torch.use_deterministic_algorithms(False)
-    waiting = {policy.component_of(name) for name, value in policy.state_dict().items() if value.isnan().any()}
+    component = policy.finetune_spec.component_of
+    waiting = {component(name) for name, value in policy.state_dict().items() if value.isnan().any()}
     assert waiting == {"vision", "vlm"}
 
 
@@ -270,11 +272,11 @@ def test_it_starts_from_a_policy_with_banks_whose_banks_stay_behind(tmp_path: Pa
     assert isinstance(banked.core, MemoryVlaCore)  # type: ignore[union-attr]
     banked.save_pretrained(tmp_path / "ours")
     (tmp_path / "theirs").mkdir()
-    WRITERS["memoryvla"](banked, tmp_path / "theirs", torch.float32, None)
+    write_policy(banked, tmp_path / "theirs", "memoryvla", torch.float32, None)
     for source in ("ours", "theirs"):
         took = transfer(policy, tmp_path / source)
         assert all("_bank" in name for name in took.left) and took.left
-        assert {policy.component_of(name) for name in took.new} == {"memory"}
+        assert {policy.finetune_spec.component_of(name) for name in took.new} == {"memory"}
         assert torch.equal(policy.core.head.output.bias, banked.core.head.output.bias)  # type: ignore[union-attr]
     with pytest.raises(UserError, match="no name in this format"):
-        WRITERS["memoryvla"](policy, tmp_path / "theirs", torch.float32, None)
+        write_policy(policy, tmp_path / "theirs", "memoryvla", torch.float32, None)

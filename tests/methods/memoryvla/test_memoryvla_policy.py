@@ -67,14 +67,13 @@ def batch_of(policy: MemoryVlaPolicy, count: int = 2) -> GroupBatch:
 def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
     policy = tiny()
     batch = batch_of(policy)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     loss, metrics = policy(batch, draws)
     assert torch.equal(loss, policy(batch, draws)[0]) and metrics["loss"] == loss
     loss.backward()
+    component = policy.finetune_spec.component_of
     for part in ("vision", "vlm", "memory", "action"):
-        learned = [
-            p for name, p in policy.named_parameters() if policy.component_of(name) == part and p.grad is not None
-        ]
+        learned = [p for name, p in policy.named_parameters() if component(name) == part and p.grad is not None]
         assert any(p.grad.abs().sum() > 0 for p in learned), part  # type: ignore[union-attr]
 
 
@@ -82,15 +81,15 @@ def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
 def test_pictures_are_changed_by_given_draws_alone_whatever_stands_beside_them() -> None:
     policy = tiny().train()
     batch = batch_of(policy)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
-    drawn = [draws | policy.image_draws(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
+    drawn = [draws | policy.augmentation_params(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     assert drawn[0]["changes"].shape == (2, 4, 6)
     first, again, other = (policy(batch, each)[0] for each in drawn)
     assert torch.equal(first, again) and not torch.equal(first, other)
     halves = [policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in drawn[0].items()}) for i in range(2)]
     apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
     assert abs(apart - first) < abs(other - first) / 20
-    assert policy.eval().image_draws(2, torch.Generator()) == {}
+    assert policy.eval().augmentation_params(2, torch.Generator()) == {}
 
 
 @torch.no_grad()
@@ -218,7 +217,7 @@ def test_it_comes_back_from_its_folder(tmp_path: Path) -> None:
     policy = tiny()
     policy.save_pretrained(tmp_path)
     again = Policy.from_pretrained(tmp_path)
-    assert isinstance(again, MemoryVlaPolicy) and again.require_processor().group_size == 4
+    assert isinstance(again, MemoryVlaPolicy) and again.require_processor().samples.group_size == 4
     batch, noise = batch_of(policy), {"noise": torch.randn(2, policy.horizon, policy.action_dim)}
     assert torch.equal(policy.sample_actions(batch, noise), again.sample_actions(batch, noise))
     with pytest.raises(ValueError, match="actions"):

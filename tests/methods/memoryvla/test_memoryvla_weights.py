@@ -12,12 +12,12 @@ from mme_vla.methods.openvla_oft.weights import VLA, openvla_adapter
 from mme_vla.policy.base import Policy
 from mme_vla.weights.load import load_weights, transfer
 from mme_vla.weights.source import detect_format
-from mme_vla.weights.writers import WRITERS, check_target
+from mme_vla.weights.writers import check_target, write_policy
 
 
 def test_a_checkpoint_is_written_by_parts_and_read_again(tmp_path: Path) -> None:
     policy, other = (build_policy("memoryvla", seed=seed) for seed in (1, 2))
-    WRITERS["memoryvla"](policy, tmp_path, torch.float32, None)
+    write_policy(policy, tmp_path, "memoryvla", torch.float32, None)
     file = tmp_path / "model.pt"
     model = torch.load(file, weights_only=True)["model"]
     assert model["per_compr"]["reduce.weight"].ndim == 4

@@ -68,7 +68,7 @@ def test_adapters_are_the_published_ones_and_all_that_learns_beside_head_and_sta
 
 def test_under_a_memory_the_towers_have_no_adapters(published: dict[str, Any]) -> None:
     policy = build_policy("openvla_oft_framesamp_context", backbone="openvla", device="meta")
-    targets = ["projector.fc1", "projector.fc2", "projector.fc3", *policy.lora_targets[-8:]]
+    targets = ["projector.fc1", "projector.fc2", "projector.fc3", *policy.finetune_spec.lora_targets[-8:]]
     with torch.device("meta"):
         learning = apply_finetuning(policy, "lora", targets=targets, **OFT)
     counts = published["counts"]

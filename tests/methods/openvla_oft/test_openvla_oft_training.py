@@ -68,8 +68,8 @@ def test_only_steps_with_a_full_chunk_are_learned_from_and_quantiles_are_exact()
     processor, robot = policy.require_processor(), policy.embodiment
     sources = open_sources(["sample"], robot)
     processor.stats = compute_norm_stats(
-        sources, horizon=1, robot=robot, every=processor.counted.every, extremes=processor.counted.extremes,
-        exact=processor.counted.exact,
+        sources, horizon=1, robot=robot, every=processor.stats_spec.every, extremes=processor.stats_spec.extremes,
+        exact=processor.stats_spec.exact,
     )  # fmt: skip
     dataset = TrainingDataset(sources, processor)
     left_out = sum(min(len(sources[0].decisions(e)), robot.action.horizon - 1) for e in range(len(sources[0])))

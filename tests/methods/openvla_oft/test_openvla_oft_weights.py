@@ -14,7 +14,7 @@ from mme_vla.policy.finetune import apply_finetuning, merge_adapters
 from mme_vla.testing.small import unit_stats
 from mme_vla.weights.load import load_weights, transfer
 from mme_vla.weights.source import detect_format
-from mme_vla.weights.writers import WRITERS, check_target
+from mme_vla.weights.writers import check_target, write_policy
 
 
 def built(name: str = "openvla_oft", seed: int = 1) -> Policy:
@@ -25,7 +25,7 @@ def built(name: str = "openvla_oft", seed: int = 1) -> Policy:
 
 def written(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
     folder.mkdir()
-    WRITERS[fmt](policy, folder, torch.float32, policy.require_processor().stats)
+    write_policy(policy, folder, fmt, torch.float32, policy.require_processor().stats)
     return folder
 
 
@@ -64,7 +64,7 @@ def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_pa
     for name in ("openvla_oft", "openvla_oft_framesamp_context"):
         policy = built(name, seed=2)
         took = transfer(policy, folder)
-        assert took.new and all(policy.component_of(new) in ("action", "memory") for new in took.new)
+        assert took.new and all(policy.finetune_spec.component_of(new) in ("action", "memory") for new in took.new)
         assert not took.left
     with pytest.raises(UserError, match="action_head/model"):
         load_weights(built(seed=2), folder)
@@ -111,4 +111,4 @@ def test_what_the_format_has_no_name_for_is_refused(tmp_path: Path) -> None:
     for policy in (built("openvla_oft_framesamp_context"), lora_targets):
         (folder := tmp_path / policy.config["name"]).mkdir(exist_ok=True)
         with pytest.raises(UserError, match="no name in this format"):
-            WRITERS["openvla"](policy, folder, torch.float32, None)
+            write_policy(policy, folder, "openvla", torch.float32, None)

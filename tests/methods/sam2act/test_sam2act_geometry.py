@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from helpers.sam2act_golden import load, meta, relative_error
-from mme_vla.methods.sam2act import geometry, render
+from mme_vla.methods.sam2act import geometry
 from mme_vla.methods.sam2act.geometry import Cube, shift_and_rotate, unproject, zoom, zoom_back
 
 TOLERANCE = 1e-5
@@ -105,31 +105,33 @@ def test_rotations_go_to_bins_and_back_within_half_a_bin() -> None:
 def test_the_renderer_follows_its_rules_to_the_pixel() -> None:
     golden = load("render")
     points, features, side = tensor(golden["points"]), tensor(golden["features"]), int(golden["resolution"])
-    plain = render.z_buffer(points, features, side)
-    splats = render.splat(*plain, float(golden["radius"]))
+    plain = geometry.z_buffer(points, features, side)
+    splats = geometry.splat(*plain, float(golden["radius"]))
     for kind, (picture, depth) in {"plain": plain, "splat": splats}.items():
         assert relative_error(picture, golden[f"{kind}_image"]) < TOLERANCE
         assert relative_error(depth, golden[f"{kind}_depth"]) < TOLERANCE
-    assert relative_error(render.render(points, features, side, float(golden["radius"])), golden["output"]) < TOLERANCE
+    assert (
+        relative_error(geometry.render(points, features, side, float(golden["radius"])), golden["output"]) < TOLERANCE
+    )
 
 
 def test_what_is_behind_a_camera_stands_before_everything() -> None:
     points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]])  # the second is above the eye of the view from the top
-    pictures, depth = render.z_buffer(points, torch.tensor([[1.0], [2.0]]), 4)
+    pictures, depth = geometry.z_buffer(points, torch.tensor([[1.0], [2.0]]), 4)
     assert pictures[0, 2, 2].item() == 2.0
     assert depth[0, 2, 2].item() == 0.0
 
 
 def test_points_that_are_no_numbers_or_out_of_sight_leave_no_trace() -> None:
     points = torch.tensor([[float("nan"), 0.0, 0.0], [3.0, 3.0, 3.0]])
-    pictures, depth = render.z_buffer(points, torch.ones(2, 1), 8)
+    pictures, depth = geometry.z_buffer(points, torch.ones(2, 1), 8)
     assert not pictures.any()
-    assert (depth == render.EMPTY).all()
+    assert (depth == geometry.EMPTY).all()
 
 
 def test_virtual_pictures_have_ten_channels_of_known_meaning() -> None:
     points = torch.rand(50, 3) - 0.5
-    seen = render.virtual_images(points, torch.rand(50, 3), 14)
+    seen = geometry.virtual_images(points, torch.rand(50, 3), 14)
     assert seen.shape == (geometry.VIEWS, 10, 14, 14)
     assert seen[:, 7].flatten(1).unique(dim=1).flatten().tolist() == [-1, 0, 1]
     assert torch.equal(seen[0, 8, :, 3], torch.linspace(-1, 1, 14))

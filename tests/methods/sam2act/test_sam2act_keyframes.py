@@ -43,7 +43,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Plain:
     """Hands samples on as they are."""
 
-    def keyframe_item(self, sample: KeyframeSample) -> dict[str, Any]:
+    def item(self, sample: KeyframeSample) -> dict[str, Any]:
         return {"sample": sample}
 
 

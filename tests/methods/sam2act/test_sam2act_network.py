@@ -10,12 +10,17 @@ from torch import Tensor, nn
 
 from helpers.sam2act_golden import drawn, drawn_weight, load, meta, relative_error
 from mme_vla.methods.sam2act.config import EncoderSizes, SAM2ActSizes
-from mme_vla.methods.sam2act.geometry import VIEWS, PointFinder, heatmap_loss
-from mme_vla.methods.sam2act.image_encoder import LoraProjection
-from mme_vla.methods.sam2act.memory import BankState, KeyframeBank, MemoryAttention, MemoryEncoder, sine_positions
+from mme_vla.methods.sam2act.geometry import VIEWS, PointFinder, constant_channels, heatmap_loss
 from mme_vla.methods.sam2act.model import ConvexUp, EncodedViews, SAM2ActNetwork
-from mme_vla.methods.sam2act.names import RATES, released_names
-from mme_vla.methods.sam2act.render import constant_channels
+from mme_vla.methods.sam2act.sam2 import (
+    BankState,
+    KeyframeBank,
+    LoraProjection,
+    MemoryAttention,
+    MemoryEncoder,
+    sine_positions,
+)
+from mme_vla.methods.sam2act.weights import RATES, released_names
 from mme_vla.weights.tables import read
 
 MODULE, NETWORK, GRADIENT = 1e-4, 5e-4, 2e-3

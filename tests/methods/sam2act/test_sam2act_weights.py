@@ -10,15 +10,17 @@ from torch import nn
 from mme_vla.errors import UserError
 from mme_vla.methods.sam2act.config import SAM2ActSizes
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
-from mme_vla.methods.sam2act.names import (
+from mme_vla.methods.sam2act.policy import STAGES, SAM2ActPolicy, select_trained
+from mme_vla.methods.sam2act.weights import (
     IMAGE_PREFIX,
     RATES,
+    WEIGHTS,
     released_copies,
     released_names,
     released_unread,
+    sam2act_adapter,
+    write_sam2act,
 )
-from mme_vla.methods.sam2act.policy import STAGES, SAM2ActPolicy, select_trained
-from mme_vla.methods.sam2act.weights import WEIGHTS, sam2act_adapter, write_sam2act
 from mme_vla.policy.build import build_policy
 from mme_vla.weights.load import load_weights
 from mme_vla.weights.source import detect_format

@@ -10,7 +10,7 @@ from lerobot_policy_mme_vla.configuration_mme_vla import STATE, MMEVLAConfig
 from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 from lerobot_policy_mme_vla.processor_mme_vla import make_mme_vla_pre_post_processors
 from mme_vla import Policy
-from mme_vla.config.composition import print_user_errors
+from mme_vla.cli.errors import print_user_errors
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import SIDE
 from mme_vla.errors import UserError

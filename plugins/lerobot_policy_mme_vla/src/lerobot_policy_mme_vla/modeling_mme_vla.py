@@ -20,7 +20,13 @@ from mme_vla.config.plugins import import_trusted
 from mme_vla.errors import UserError
 from mme_vla.policy.build import build_from_config
 from mme_vla.policy.finetune import apply_finetuning
-from mme_vla.policy.saving import local_folder, policy_class
+from mme_vla.policy.saving import (
+    build_saved,
+    check_processor,
+    local_folder,
+    policy_class,
+    recompute_buffers,
+)
 from mme_vla.policy.tensor_files import WEIGHTS, assign_tensors, load_tensors
 from mme_vla.processing.base import load_processor
 from mme_vla.training.data import check_frozen
@@ -134,7 +140,7 @@ class MMEVLAPolicy(PreTrainedPolicy):
 
     def supports_rtc(self) -> bool:
         """Whether a chunk can be chosen while another is executed: of flows that need not know what was executed."""
-        return self.model.supports_rtc and self.model.require_processor().past_actions == 0
+        return self.model.supports_rtc and self.model.require_processor().prompt_spec.past_actions == 0
 
     def _see(self, batch: Mapping[str, Any]) -> list[Row]:
         states = batch[STATE].float().cpu().numpy()
@@ -144,7 +150,7 @@ class MMEVLAPolicy(PreTrainedPolicy):
             demo = batch[IS_DEMO].reshape(len(states), -1)[:, 0].cpu().numpy() > 0.5
         goals = batch.get("task") or [""] * len(states)
         if self._rows is None:
-            if self.model.require_processor().reads_subgoal:
+            if self.model.require_processor().prompt_spec.reads_subgoal:
                 raise UserError(
                     "This policy reads a subgoal, and LeRobot's loops have no place for one: evaluate it with "
                     "python -m mme_vla.evaluate."
@@ -187,12 +193,12 @@ class MMEVLAPolicy(PreTrainedPolicy):
             raise UserError(f"{folder} holds no configuration of mme-vla: its config.json lacks 'composition'.")
         sections = json.loads(settings.composition)
         import_trusted(sections, str(folder), False)
-        model = policy_class(sections).from_saved(sections, str(folder))
+        model = build_saved(policy_class(sections), sections, str(folder))
         tensors = {name.removeprefix(PREFIX): tensor for name, tensor in load_tensors(folder).items()}
         assign_tensors(model, tensors, str(folder))
-        model.compute_unsaved()
+        recompute_buffers(model)
         model.processor = load_processor(folder)
-        model.check_processor(str(folder))
+        check_processor(model, str(folder))
         loaded = cls(settings, dataset_stats=dataset_stats, dataset_meta=dataset_meta, model=model)
         return loaded.to(settings.device).eval()
 

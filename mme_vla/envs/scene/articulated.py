@@ -6,7 +6,7 @@ import numpy as np
 import sapien
 from transforms3d.euler import euler2quat
 
-from mme_vla.envs.scene.objects.shapes import RGB, XY, Shapes, at
+from mme_vla.envs.scene.objects import RGB, XY, Shapes, at
 from mme_vla.envs.scene.things import Thing, pose_of
 
 if TYPE_CHECKING:
@@ -25,12 +25,7 @@ X_UP = euler2quat(0, -np.pi / 2, 0)
 
 
 class Button(Thing):
-    """A cap on a spring that is pressed down into its base; the cap's foot is its position and goes down with it.
-
-    Args:
-        name: unique in the scene.
-        articulation: base and cap.
-    """
+    """A cap on a spring that is pressed down into its base; the cap's foot is its position and goes down with it."""
 
     def __init__(self, name: str, articulation: Any) -> None:
         self.articulation = articulation
@@ -64,12 +59,10 @@ class Button(Thing):
 
 
 class Peg(Thing):
-    """A rod of two halves; its place is the middle of the head half, and the tail lies behind that along x.
+    """A rod of two halves; its position is the middle of the head half, and the tail lies behind that along x.
 
     Args:
-        name: unique in the scene.
-        articulation: head and tail.
-        length: of each half, metres. radius: half the thickness.
+        length: of each half, metres. radius: half the thickness, metres.
     """
 
     def __init__(self, name: str, articulation: Any, length: float, radius: float) -> None:
@@ -138,14 +131,8 @@ def build_peg(
     """A peg on the table.
 
     Args:
-        env: whose scene it goes into.
-        name: unique in the scene.
-        length: of each half, metres.
-        radius: half the thickness, metres.
-        head_colour: RGB in 0 … 1. tail_colour: likewise.
-        xy: middle of the head half.
-        yaw: radians.
-        z: height of the middle.
+        length: of each half, metres. radius: half the thickness, metres.
+        xy: middle of the head half. yaw: radians. z: height of the middle.
     """
     half, touched = [length / 2, radius, radius], [0.9 * length / 2, radius, radius]
     builder = env.scene.create_articulation_builder()

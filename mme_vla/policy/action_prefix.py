@@ -42,7 +42,7 @@ def prefix_overlap(
     """What the next chunks of n episodes, at raw states [n, s], are to agree with; None where nothing is promised."""
     if all(prefix is None for prefix in prefixes):
         return None
-    horizon, width = processor.horizon, processor.embodiment.action.width
+    horizon, width = processor.embodiment.action.horizon, processor.embodiment.action.width
     actions, weight = torch.zeros(2, len(prefixes), horizon, action_dim)
     for i, prefix in enumerate(prefixes):
         if prefix is None:

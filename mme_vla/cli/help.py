@@ -1,4 +1,4 @@
-"""What a command answers to `--help`: what it does, examples, and each key with its meaning, from the YAML files.
+"""The text of `--help`: what a command does, examples, and each key with its meaning, from the YAML files.
 
 `--help` alone shows the command's own keys and the groups with their choices; `--help memory` the files of a group with
 their keys, `--help model=framesamp_modul` the keys under these choices. Nothing here imports PyTorch.

@@ -1,13 +1,14 @@
-"""What a cube or a peg is shown to suffer: pushing, hooking, grasping by one end, inserting."""
+"""The demonstrator: primitives for the gripper, for cubes and pegs, and for the stick, in one class."""
 
 from typing import Literal
 
 import numpy as np
 import sapien
 
-from mme_vla.envs.robot.control import CLOSE, OPEN, RobotControl
-from mme_vla.envs.robot.gripper_skills import pointing_down, turned
-from mme_vla.envs.scene.objects import H, Peg
+from mme_vla.envs.robot.control import CLOSE, OPEN, PlanningError, RobotControl
+from mme_vla.envs.robot.gripper_skills import GripperPrimitives, pointing_down, turned
+from mme_vla.envs.scene.articulated import Peg
+from mme_vla.envs.scene.objects import H
 from mme_vla.envs.scene.things import Thing
 
 PegEnd = Literal["head", "tail"]
@@ -43,10 +44,8 @@ class PegPrimitives(RobotControl):
         """Draw a cube to a goal with a peg that is held by its tail, then let go.
 
         Args:
-            cube: what is moved.
-            goal: where to.
             side: +1 if the gripper passes the cube on the right of the way (the peg reaches to the left), -1 for the
-                other; by default the one that the cube's place asks for.
+                other; by default by the sides of cube and goal.
         """
         if side is None:
             side = 1 if cube.position[1] > goal.position[1] else -1
@@ -66,7 +65,6 @@ class PegPrimitives(RobotControl):
         """Grasp a peg by one of its ends and lift it.
 
         Args:
-            peg: the peg.
             end: `peg.head` or `peg.tail`, or its name.
             flip: hold the hand the other way round.
         """
@@ -85,7 +83,6 @@ class PegPrimitives(RobotControl):
         `insert_peg_fully` makes up for that.
 
         Args:
-            peg: the peg.
             grasped_end: the end that is held; the other one goes in.
             side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
             box: its hole runs along its x axis, which points to the left.
@@ -96,13 +93,13 @@ class PegPrimitives(RobotControl):
         flip = head_first != (side > 0)
 
         def station(along: float, raised: float = 0.0) -> sapien.Pose:
-            # The peg may slip: how it is held is looked at before every motion.
+            # The peg may slip, so the grip is read before every motion.
             grip = free.pose.inv() * self.env.tcp_pose
             inserted = box.pose * grip
             if flip:
-                # The tool is turned where it is, which puts the peg's other end into the box ...
+                # The tool is turned in place, which puts the peg's other end into the box ...
                 inserted = sapien.Pose(inserted.p, turned(inserted.q, "z", np.pi))
-                # ... and only in this case is that synthetic for.
+                # ... and only in this case is that compensated.
                 along += grip.p[0] if head_first and along < 0 else 0.0
             return inserted * sapien.Pose([along, 0, -raised])
 
@@ -117,11 +114,7 @@ class PegPrimitives(RobotControl):
         """Put the free end of a held peg into the middle of a box, whichever way the hand holds it.
 
         Args:
-            peg: the peg.
-            grasped_end: the end that is held; the other one goes in.
-            side: +1 from the right (smaller y) as the robot sees it, -1 from the left.
-            box: its hole runs along its x axis, which points to the left.
-            begun: the peg is in the hole already, and only has to continue.
+            begun: the peg is in the hole already; the other arguments are those of `insert_peg`.
         """
         head_first = grasped_end in ("tail", peg.tail)
         free = peg.head if head_first else peg.tail
@@ -171,3 +164,81 @@ def _peg_grasp(end: Thing, flip: bool, outward: float = 0.0) -> sapien.Pose:
 def _direction(cube: Thing, goal: Thing) -> np.ndarray:
     way = goal.position[:2] - cube.position[:2]
     return way / np.linalg.norm(way)
+
+
+STICK_Z = 0.07
+"""Height of the tip while it moves from target to target, metres."""
+ARC_OFFSET = 0.2
+"""How far the control point of an arc lies beside the middle of its chord, metres."""
+ARC_SAMPLES, ARC_HOLD = 45, 5
+
+
+class StickPrimitives(RobotControl):
+    """The primitives of tasks in which a stick is moved over targets."""
+
+    def stick_to(self, target: Thing, store: bool = False) -> None:
+        """Move the tip over a target, in a straight line and then once more to be exact.
+
+        Args:
+            store: keep the joint angles reached as the start of the execution.
+        """
+        pose = self.at([*target.position[:2], STICK_Z])
+        self.move_to(pose)
+        self.move_to(pose, CLOSE)
+        if store:
+            self.env.stored_qpos = np.array(self.env.qpos, np.float64)
+
+    def stick_arc(self, target: Thing, direction: Literal["clockwise", "counterclockwise"]) -> None:
+        """Move the tip over a target along an arc, one point of it a control step.
+
+        Raises:
+            PlanningError: a point of the arc is out of reach; nothing has moved.
+        """
+        here = self.env.tcp_pose
+        poses = [self.at(point, here.q) for point in arc(here.p, target.position, direction)]
+        targets, joints = [], self.env.qpos
+        for pose in poses:
+            solution = self.arm.ik(pose, joints)
+            if solution is None:
+                raise PlanningError(f"The arc to {target.name} leaves the arm's reach at {pose.p.tolist()}.")
+            targets.append(solution)
+            joints = solution
+        middle = len(poses) // 2
+        targets += [targets[-1]] * ARC_HOLD
+        self._half(poses[middle], targets[:middle])
+        self._half(poses[-1], targets[middle:])
+
+    def _half(self, waypoint: sapien.Pose, targets: list[np.ndarray]) -> None:
+        self.announce(waypoint, CLOSE)
+        self.follow(targets)
+
+
+def arc(start: np.ndarray, end: np.ndarray, direction: Literal["clockwise", "counterclockwise"]) -> np.ndarray:
+    """Points of a quadratic Bezier curve between two places at the stick's height.
+
+    Args:
+        start: [2] or [3]. end: likewise, metres.
+        direction: the side on which the curve leaves the chord; clockwise: to the left of the way.
+
+    Returns:
+        Points [45, 3], both ends included.
+    """
+    a, b = np.asarray(start, float)[:2], np.asarray(end, float)[:2]
+    way = b - a
+    left = np.array([-way[1], way[0]]) / np.linalg.norm(way)
+    control = (a + b) / 2 + ARC_OFFSET * (left if direction == "clockwise" else -left)
+    t = np.linspace(0, 1, ARC_SAMPLES)[:, None]
+    points = (1 - t) ** 2 * a + 2 * t * (1 - t) * control + t**2 * b
+    return np.column_stack([points, np.full(ARC_SAMPLES, STICK_Z)])
+
+
+class Demonstrator(GripperPrimitives, PegPrimitives, StickPrimitives):
+    """Performs the primitives that demonstrations and multi-choice options are made of.
+
+    Motions are planned from where the arm is and carried out without looking; the same scene gives the same steps.
+    Waypoints are announced before the motion that leads there.
+
+    Example:
+        >>> demonstrator = Demonstrator(env, env.step)  # doctest: +SKIP
+        >>> demonstrator.pick(env.cubes[0])  # doctest: +SKIP
+    """

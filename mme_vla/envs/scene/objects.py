@@ -1,16 +1,115 @@
-"""Objects without joints: cubes, targets, containers, the board with a hole, the box with an aperture, obstacles."""
+"""Objects without joints, and how each is built; without a renderer they have no visual shapes.
 
+`env` is the task whose scene an object goes into, `name` is unique in it, `xy` is the centre on the table. Lengths are
+in metres, angles in radians, colours RGB in 0 … 1.
+"""
+
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sapien
+import sapien.render
 from transforms3d.euler import euler2quat
 
-from mme_vla.envs.scene.objects.shapes import BELOW_TABLE, RGB, UPRIGHT, XY, Shapes, at
 from mme_vla.envs.scene.things import Thing
 
 if TYPE_CHECKING:
     from mme_vla.envs.scene.stage import Stage
+
+
+type RGB = tuple[float, float, float]
+type XY = Sequence[float] | np.ndarray
+"""A place on the table [2] (or [3], whose height does not count), metres."""
+
+DENSITY = 1000.0  # kg/m³
+BELOW_TABLE = (0.0, 0.0, -10.0)
+"""Where things that are only shown at times wait."""
+UPRIGHT = tuple(euler2quat(0, np.pi / 2, 0))
+"""Turns a cylinder, whose axis is x, upright; wxyz."""
+
+
+def at(xy: XY, z: float, yaw: float = 0.0) -> sapien.Pose:
+    """Pose on the table, turned about the vertical; metres and radians."""
+    return sapien.Pose([float(xy[0]), float(xy[1]), z], euler2quat(0, 0, yaw))
+
+
+class Shapes:
+    """Adds shapes to an actor's or a link's builder.
+
+    Args:
+        env: whose scene the object goes into.
+        builder: collects the shapes; by default that of a new actor.
+    """
+
+    def __init__(self, env: "Stage", builder: Any = None) -> None:
+        self._visible = env.scene.can_render()
+        self._builder = env.scene.create_actor_builder() if builder is None else builder
+
+    def box(
+        self,
+        half_size: Sequence[float],
+        colour: RGB | None,
+        centre: Sequence[float] = (0, 0, 0),
+        collision: Sequence[float] | None = None,
+        density: float = DENSITY,
+        glossy: bool = False,
+    ) -> "Shapes":
+        """A box to be seen, and, with half sizes `collision`, to be touched; no colour is white."""
+        pose = sapien.Pose(centre)
+        if collision is not None:
+            self._builder.add_box_collision(pose, half_size=tuple(collision), density=density)
+        if self._visible:
+            self._builder.add_box_visual(pose, half_size=tuple(half_size), material=_material(colour, glossy))
+        return self
+
+    def solid_box(self, half_size: Sequence[float], colour: RGB | None, **options: Any) -> "Shapes":
+        """A box that is touched where it is seen."""
+        return self.box(half_size, colour, collision=half_size, **options)
+
+    def cylinder(
+        self,
+        radius: float,
+        half_length: float,
+        colour: RGB,
+        pose: sapien.Pose | None = None,
+        collision: bool = False,
+        density: float = DENSITY,
+    ) -> "Shapes":
+        """A cylinder along the x axis of `pose`, by default in the object's own frame."""
+        pose = pose or sapien.Pose()
+        if collision:
+            self._builder.add_cylinder_collision(pose, radius, half_length, density=density)
+        if self._visible:
+            self._builder.add_cylinder_visual(pose, radius, half_length, _material(colour))
+        return self
+
+    def sphere(self, radius: float, colour: RGB) -> "Shapes":
+        """A ball to be seen."""
+        if self._visible:
+            self._builder.add_sphere_visual(radius=radius, material=_material(colour))
+        return self
+
+    def rings(self, radius: float, half_length: float, colour: RGB) -> "Shapes":
+        """Five cylinders one in the other, of the colour and white by turns; inner ones are a little longer."""
+        for k in range(5):
+            self.cylinder(radius * (1 - 0.2 * k), half_length + k * 1e-5, colour if k % 2 == 0 else (1.0, 1.0, 1.0))
+        return self
+
+    def build(self, name: str, pose: sapien.Pose, kinematic: bool = False) -> Any:
+        """The actor, at its pose; a kinematic one moves only when told to."""
+        self._builder.set_initial_pose(pose)
+        return self._builder.build_kinematic(name) if kinematic else self._builder.build(name)
+
+
+def _material(colour: RGB | None, glossy: bool = False) -> sapien.render.RenderMaterial:
+    material = sapien.render.RenderMaterial()
+    if colour is not None:
+        material.base_color = [*colour, 1.0]
+    if glossy:
+        material.roughness = material.specular = 0.5
+    return material
+
 
 H = 0.02
 """Half the edge of a cube, metres."""
@@ -41,14 +140,7 @@ APERTURE_COLOUR: RGB = tuple((np.array([0xFF, 0xD2, 0x89]) / 255) ** 2.2)
 
 
 class Cube(Thing):
-    """A cube of one colour.
-
-    Args:
-        name: unique in the scene.
-        entity: its actor.
-        colour: name of the colour, or RGB in 0 … 1.
-        half_size: half its edge, metres.
-    """
+    """A cube of one colour, which is a name or RGB; `half_size` is half its edge."""
 
     def __init__(self, name: str, entity: Any, colour: str | RGB, half_size: float = H) -> None:
         super().__init__(name, entity)
@@ -56,13 +148,7 @@ class Cube(Thing):
 
 
 class Disc(Thing):
-    """A flat round target; its axis is the actor's x axis.
-
-    Args:
-        name: unique in the scene.
-        entity: its actor.
-        radius: metres.
-    """
+    """A flat round target; its axis is the actor's x axis."""
 
     def __init__(self, name: str, entity: Any, radius: float) -> None:
         super().__init__(name, entity)
@@ -107,15 +193,9 @@ def build_disc(
     xy: XY,
     z: float | None = None,
 ) -> Disc:
-    """A target: five rings, of one of `TARGET_COLOURS` and white by turns, that nothing can touch.
+    """A target without collision: five rings, alternately of a colour of `TARGET_COLOURS` and white.
 
     Args:
-        env: whose scene it goes into.
-        name: unique in the scene.
-        radius: metres.
-        thickness: metres.
-        colour: key of `TARGET_COLOURS`.
-        xy: centre on the table.
         z: height of the centre; by default the thickness.
     """
     pose = sapien.Pose([float(xy[0]), float(xy[1]), thickness if z is None else z], UPRIGHT)
@@ -126,16 +206,7 @@ def build_disc(
 def build_highlight(
     env: "Stage", name: str, radius: float, half_length: float, colour: RGB = WHITE, rings: bool = False
 ) -> Disc:
-    """A disc that marks something for a while; it waits below the table.
-
-    Args:
-        env: whose scene it goes into.
-        name: unique in the scene.
-        radius: metres.
-        half_length: half its thickness, metres.
-        colour: RGB in 0 … 1.
-        rings: alternate with white like a target.
-    """
+    """A disc that marks something for a while; it waits below the table. With `rings` it looks like a target."""
     shapes = Shapes(env)
     shapes = shapes.rings(radius, half_length, colour) if rings else shapes.cylinder(radius, half_length, colour)
     return Disc(name, shapes.build(name, sapien.Pose(BELOW_TABLE, UPRIGHT), kinematic=True), radius)
@@ -187,13 +258,7 @@ def build_aperture_box(
     """A box with a square hole along its x axis, standing on the table.
 
     Args:
-        env: whose scene it goes into.
-        xy: centre on the table.
-        yaw: radians.
-        inner: half the width of the hole, metres.
-        outer: half the width of the box, metres.
-        half_depth: half its length along the hole, metres.
-        name: unique in the scene.
+        inner: half the width of the hole. outer: half the width of the box. half_depth: half its length along the hole.
     """
     wall = (outer - inner) / 2
     shapes = Shapes(env)
