@@ -64,7 +64,7 @@ def usual_interrupt() -> Iterator[None]:
 def test_a_second_signal_ends_the_process_as_usual() -> None:
     with pytest.raises(KeyboardInterrupt), stop_requests() as stop:
         signal.raise_signal(signal.SIGINT)
-        assert asked()
+        assert stop()
         signal.raise_signal(signal.SIGINT)
 
 
