@@ -19,7 +19,7 @@ from mme_vla.policy.mme import MMEPolicy, mme_of
 from mme_vla.processing.normalise import NormStats
 from mme_vla.processing.processor import STATS_FILE
 from mme_vla.training.checkpoint import checkpoints_in
-from mme_vla.training.logging import JsonLines, Loggers, ProgressLine
+from mme_vla.training.logging import ProgressLine, open_loggers
 from mme_vla.training.loop import Trainer
 from mme_vla.training.order import Validation
 from mme_vla.training.runs import claim_run
@@ -99,7 +99,7 @@ def train(
         trainer = Trainer(
             policy, samples, samples.collate, validation, train_settings, run, full_config, Accelerator(cpu=True)
         )
-        line, loggers = ProgressLine(train_settings.steps, run.step), Loggers([JsonLines(folder, run.step)])
+        line, loggers = ProgressLine(train_settings.steps, run.step), open_loggers(folder, {}, run.step)
         line.say(f"{trainer.describe()}; {len(samples)} decisions of {len(files)} demonstrations")
         try:
             with line:
