@@ -29,9 +29,6 @@ FOLDER = REPOSITORY / "tests" / "extras"
 NEW = "uv sync --inexact --extra {}"
 
 
-pytestmark = pytest.mark.timeout(600)
-
-
 class Case(NamedTuple):
     """A command, the extras that are there, and how it ends: `says` is a text it prints."""
 

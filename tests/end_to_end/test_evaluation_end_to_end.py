@@ -54,7 +54,6 @@ def group_is_empty(group: int) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
 def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(tmp_path: Path) -> None:
     try:
         render_backend()

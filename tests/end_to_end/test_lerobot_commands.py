@@ -12,7 +12,7 @@ from mme_vla.data.hdf5 import find_files, list_episodes
 
 pytest.importorskip("mani_skill", reason="lerobot-eval runs the simulator: uv sync --inexact --extra sim")
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = pytest.mark.slow
 
 SMALL_ACT = (
     "--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false", "--policy.chunk_size=4",

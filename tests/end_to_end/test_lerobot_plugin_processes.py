@@ -21,7 +21,7 @@ def test_the_first_process_builds_the_cache_and_the_others_open_it(tmp_path: Pat
     started = [
         commands.start(*words, env={**rendezvous, "RANK": str(rank), "LOCAL_RANK": str(rank)}) for rank in range(2)
     ]
-    ended = [commands.finish(process, 120) for process in started]
+    ended = [commands.finish(process) for process in started]
     assert [end.returncode for end in ended] == [0, 0], ended[0].stderr + ended[1].stderr
     first, second = (json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2))
     assert (first["built"], second["built"]) == (1, 0)

@@ -20,7 +20,7 @@ def start(
     return subprocess.Popen(command, cwd=cwd, env=variables, stdout=subprocess.PIPE, stderr=stderr, text=True)
 
 
-def finish(process: "subprocess.Popen[str]", timeout: float = 280.0) -> "subprocess.CompletedProcess[str]":
+def finish(process: "subprocess.Popen[str]", timeout: float = 1500.0) -> "subprocess.CompletedProcess[str]":
     """Exit code and output of a process. One that takes longer than `timeout` seconds is killed, and an error."""
     with process:
         try:
@@ -31,7 +31,7 @@ def finish(process: "subprocess.Popen[str]", timeout: float = 280.0) -> "subproc
 
 
 def run(
-    *words: str, cwd: Path = REPOSITORY, env: Mapping[str, str] | None = None, timeout: float = 280.0
+    *words: str, cwd: Path = REPOSITORY, env: Mapping[str, str] | None = None, timeout: float = 1500.0
 ) -> "subprocess.CompletedProcess[str]":
     """Run a command to its end."""
     return finish(start(*words, cwd=cwd, env=env), timeout)

@@ -4,7 +4,6 @@ import importlib.util
 from types import ModuleType
 
 import pytest
-from helpers.mock_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 
 from helpers import REPOSITORY
 from mme_vla.testing.small import MODELS

@@ -208,7 +208,7 @@ def test_the_command_serves_and_stops_when_told(tmp_path):
             assert client.metadata["model"] == "framesamp_modul"
             assert client.infer(challenge(*course()[0], first=True))["actions"].shape == (16, 8)
             server.terminate()
-            done = commands.finish(server, 30)
+            done = commands.finish(server)
         assert done.returncode == 0
         assert "stopped · 0 clients · 1 inferences" in done.stderr
     finally:

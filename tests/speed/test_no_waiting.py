@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.mock_gpu import NoopGpu, needs_noop_gpu, noop_gpu  # noqa: F401  (a fixture)
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 

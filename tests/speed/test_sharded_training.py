@@ -37,7 +37,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     Beside them one that did all 8.
     """
     folder = tmp_path_factory.mktemp("shared")
-    done = commands.run("helpers.sharded_runs", str(folder), env={"OMP_NUM_THREADS": "1"}, timeout=500)
+    done = commands.run("helpers.sharded_runs", str(folder), env={"OMP_NUM_THREADS": "1"})
     ended = answer(folder, "ended") if done.returncode == 0 else {}
     codes = [(1, -9) if "die" in what else (0,) * processes for processes, what in RUNS]
     assert [tuple(code) for code in ended.values()] == codes, (done.stdout + done.stderr)[-3000:]

@@ -49,7 +49,7 @@ def test_all_processes_stop_after_the_same_update_when_one_is_asked(tmp_path: Pa
     (tmp_path / "asked.py").write_text(ASKED_ONCE)
     words = (str(tmp_path / "asked.py"), str(tmp_path / "meeting"))
     started = [commands.start(*words, str(rank)) for rank in range(2)]
-    assert [commands.finish(process, 100).stdout.strip() for process in started] == ["stopped after 3"] * 2
+    assert [commands.finish(process).stdout.strip() for process in started] == ["stopped after 3"] * 2
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from accelerate import Accelerator
 from omegaconf import OmegaConf
 
 from helpers.trainings import RECIPE, SMALL, Samples, collate, loggers, policy, trainer
