@@ -10,7 +10,7 @@ only guess: `pi05` is always trained beside what is named. Prints the open-loop 
 not seen, and draws it.
 
 The recipe is the same for all: 64 memory tokens, remembered frames of 4×4 tokens; all but FrameSamp read every 4th
-frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot looks at every token and
+frame, recurrent ones pad to no chunk; RMT has 16 slots and attends in float32. At first a slot reads every token and
 every slot alike, and slots begin at random: with many slots and few tokens the frame is a small part of what a slot
 takes in, and what all slots have in common is learned late.
 

@@ -91,7 +91,7 @@ class _Run:
     """Frames returned since the reset."""
     count: int = 0
     """Control steps that count towards the limit."""
-    return_so_far: float = 0.0
+    total_reward: float = 0.0
     options: dict[str, Any] = field(default_factory=dict)
     actions: list[Any] = field(default_factory=list)
     """All since the reset."""
@@ -137,7 +137,7 @@ class RoboMMEEnv(gymnasium.Env):
             raise UserError(f"max_steps is {max_steps!r}; expected a positive integer.")
         if reward not in REWARDS:
             raise UserError(f"Unknown reward {reward!r}. {did_you_mean(str(reward), REWARDS)}")
-        self._space, self._return_so_far = action_space(action), REWARDS[reward]
+        self._space, self._total_reward = action_space(action), REWARDS[reward]
         self.include = include or Include()
         self.max_steps = max_steps
         self.on_frame: FrameHook | None = None
@@ -349,8 +349,8 @@ class RoboMMEEnv(gymnasium.Env):
     def _reward(self, run: _Run) -> torch.Tensor:
         """Increase of the return in the present step."""
         success = bool(run.info.get("success", False))
-        before, run.return_so_far = run.return_so_far, self._return_so_far(self.task.progress, success)
-        return torch.tensor(run.return_so_far - before)
+        before, run.total_reward = run.total_reward, self._total_reward(self.task.progress, success)
+        return torch.tensor(run.total_reward - before)
 
     # Info and status ---------------------------------------------------------------------------------------------
 

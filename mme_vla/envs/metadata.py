@@ -157,7 +157,7 @@ def episodes(task: str, split: str = "test", folder: str | Path | None = None) -
 
     Args:
         task: one of the 16 task names, or a task of the user's own registered in `TASKS`.
-        split: `train`, `val` or `test`; a variant of the latter (`variants.py`), whose seeds are the same; or `more`,
+        split: `train`, `val` or `test`; a variant of the latter (`Variant`), whose seeds are the same; or `more`,
             900 episodes a task that the benchmark does not have, or `further`, 100 that the rule of the test split
             gives after its own 50 (number 0 is what number 50 would be; no seed was raised), or `further_easy`,
             `further_medium`, `further_hard`, 400 of one difficulty by the same rule.

@@ -26,7 +26,7 @@ class Task(Stage):
         seed: fixes the scene and the script; the `seed` of `reset` has no effect.
         difficulty: `easy`, `medium` or `hard`; by default seed % 3 decides.
         recovery: `z` or `xy` samples the pick that a recovery demonstration fails once.
-        stress: how far dials are turned (`variants.DIALS`); at 0 the scene is the benchmark's.
+        stress: how far dials are turned (`metadata.DIALS`); at 0 the scene is the benchmark's.
         in_view: the fact that is to be remembered stays in view, as `split=twin` has it.
         second_tries: the demonstrator continues where the benchmark's own gives up; without it, it fails where that
         does. robomme_failure_recovery, robomme_failure_recovery_mode: the benchmark's names for `recovery`.
@@ -43,7 +43,7 @@ class Task(Stage):
     """The failed pick is sampled in every initialisation (there are two), not once after the scene."""
 
     dials: ClassVar[frozenset[str]] = frozenset()
-    """Dials of `variants.DIALS` that the task heeds."""
+    """Dials of `metadata.DIALS` that the task has."""
 
     def __init__(
         self,

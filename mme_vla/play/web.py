@@ -14,7 +14,7 @@ from mme_vla.serving.settings import is_local, listen
 from mme_vla.utils import parse_json
 
 log = logging.getLogger("mme_vla.play")
-PAGE = {"": "index.html", "play.css": "play.css", "play.js": "play.js", "film.js": "film.js", "icon.svg": "icon.svg"}
+PAGE = {"": "index.html"} | {name: name for name in ("play.css", "play.js", "player.js", "icon.svg")}
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 MOST = 4096  # bytes of a request's body
 ARRIVAL_S = 10  # seconds that headers may take, and a body

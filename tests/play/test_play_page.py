@@ -141,7 +141,7 @@ def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_pa
             assert page.ask("GET", "/state", Host=host)[0].status == 421
         for host in ("localhost:1", "127.0.0.1", "[::1]:80"):
             assert page.ask("GET", "/state", Host=host)[0].status == 200
-        for name in ("", "play.js", "film.js", "play.css"):
+        for name in ("", "play.js", "player.js", "play.css"):
             answer, content = page.ask("GET", f"/{name}")
             assert answer.status == 200
             assert b"://" not in content
@@ -223,7 +223,7 @@ def test_a_person_plays_with_mouse_and_keyboard(tmp_path):
         browser.wait("document.querySelector('#badge').innerText === 'Present'")
         assert browser.run("document.querySelector('#do').disabled")
         row, column = BLOCKS["blue"]
-        browser.click("#picture", ((row + 0.5) / 256, (column + 0.5) / 256))
+        browser.click("#image", ((row + 0.5) / 256, (column + 0.5) / 256))
         browser.wait(f"document.querySelector('#hint').innerText === 'Point: row {row}, column {column}.'")
         browser.click("#do")
         browser.wait("document.querySelectorAll('#history li').length === 1")
@@ -313,7 +313,7 @@ def test_the_page_says_when_the_server_is_gone(tmp_path):
         with served(tmp_path / "run") as page:
             browser.open(f"http://127.0.0.1:{page.port}/")
             browser.wait("document.querySelectorAll('.option:not(:disabled)').length === 3")
-        browser.wait("document.querySelector('#error').innerText.includes('does not answer')")
+        browser.wait("document.querySelector('#error').innerText.includes('does not respond')")
 
 
 def ended(connection):

@@ -51,8 +51,8 @@ class PickXtimes(Task):
         steps = []
         for i in range(self.repetitions):
             steps += [self._pick(i), self._place()]
-        still_held = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
-        return [*steps, press(self.button, "press the button to stop", "c", **still_held)]
+        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
+        return [*steps, press(self.button, "press the button to stop", "c", **stop)]
 
     def _pick(self, i: int) -> SubTask:
         text = f"pick up the {self.cube.colour} cube for the {ordinal(i)} time"

@@ -111,9 +111,9 @@ class VideoRepick(Task):
         return [first, drop, *home, *swaps, end_video(self)]
 
     def _execution(self) -> list[SubTask]:
-        still_held = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
+        stop = {"failed": lambda: any_picked_up(self, self.cubes), "operation": "how many"}
         steps = [step for i in range(self.repetitions) for step in (self._pick(i), self._put())]
-        return [*steps, press(self.button, "press the button to finish", "c", **still_held)]
+        return [*steps, press(self.button, "press the button to finish", "c", **stop)]
 
     def _pick(self, i: int) -> SubTask:
         def strayed() -> bool:

@@ -1,8 +1,8 @@
-// The frames of an episode: fetched clip by clip, drawn one at a time, played within bounds.
+// The frames of an episode: fetched clip by clip, shown one at a time, played within bounds.
 
 export const RATE = 30; // frames a second at speed 1
 
-export class Film {
+export class Player {
   constructor(canvas, changed) {
     this.context = canvas.getContext("2d");
     this.changed = changed; // called whenever the frame or the playing state is another
@@ -10,31 +10,31 @@ export class Film {
   }
 
   clear() {
-    this.pictures = [];
+    this.images = [];
     this.at = 0;
     this.stop = 0; // the frame at which playing ends
     this.playing = false;
     this.speed = this.speed ?? 1;
-    this.wanted = null;
-    this.drawing = false;
+    this.requested = null;
+    this.rendering = false;
   }
 
   get last() {
-    return this.pictures.length - 1;
+    return this.images.length - 1;
   }
 
   // Adds the frames of one clip; `false` if the server no longer has them.
   async fetch(session, number, still) {
-    const answer = await fetch(`frames/${session}/${number}`);
-    if (!answer.ok) return false;
-    const packed = await answer.arrayBuffer();
+    const response = await fetch(`frames/${session}/${number}`);
+    if (!response.ok) return false;
+    const packed = await response.arrayBuffer();
     if (!still()) return false; // another episode began meanwhile
     const view = new DataView(packed);
     const count = view.getUint32(0, true);
     let start = 4 * (count + 1);
     for (let i = 1; i <= count; i++) {
       const size = view.getUint32(4 * i, true);
-      this.pictures.push(new Blob([packed.slice(start, start + size)], { type: "image/jpeg" }));
+      this.images.push(new Blob([packed.slice(start, start + size)], { type: "image/jpeg" }));
       start += size;
     }
     return true;
@@ -76,20 +76,20 @@ export class Film {
     requestAnimationFrame((next) => this.tick(next));
   }
 
-  // Decoding takes a moment: of the frames asked for meanwhile only the newest is drawn.
+  // Decoding takes time: of the frames requested meanwhile only the newest is shown.
   async draw() {
     this.changed();
-    this.wanted = this.at;
-    if (this.drawing) return;
-    this.drawing = true;
-    while (this.wanted !== null) {
-      const picture = this.pictures[this.wanted];
-      this.wanted = null;
-      if (!picture) continue;
-      const bitmap = await createImageBitmap(picture);
+    this.requested = this.at;
+    if (this.rendering) return;
+    this.rendering = true;
+    while (this.requested !== null) {
+      const image = this.images[this.requested];
+      this.requested = null;
+      if (!image) continue;
+      const bitmap = await createImageBitmap(image);
       this.context.drawImage(bitmap, 0, 0);
       bitmap.close();
     }
-    this.drawing = false;
+    this.rendering = false;
   }
 }
