@@ -39,7 +39,7 @@ class MadeUpSource:
     def decisions(self, episode: int) -> range:
         return range(int(self.exec_starts[episode]), int(self.lengths[episode]))
 
-    def drawn(self, episode: int) -> np.ndarray:
+    def rendered(self, episode: int) -> np.ndarray:
         return np.ones(self.lengths[episode], bool)
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:

@@ -13,7 +13,7 @@ from mme_vla.evaluation.store import find_records, read_records
 
 
 def earlier_records(output: Path, named: Path | None) -> list[EpisodeRecord]:
-    """Records of episodes that ended by themselves: in a file or folder that was named, else in `output` and beside it."""
+    """Records without errors of a file or folder, by default of `output` and the folders beside it."""
     if named is not None:
         records = [record for path in find_records([named]) for record in read_records(path)]
     else:

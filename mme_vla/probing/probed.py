@@ -54,7 +54,7 @@ class ProbedEpisode(Episode):
         states: np.ndarray,
         is_demo: bool | np.ndarray = False,
         actions: np.ndarray | None = None,
-        drawn: Mapping[str, np.ndarray] | None = None,
+        rendered: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         """Take frames as `Episode.observe` does."""
         self.inner.goal = self.goal
@@ -65,7 +65,7 @@ class ProbedEpisode(Episode):
             self._show_sessions()
         if self.exec_start is None and video < count:
             self.exec_start = self.n_observed_frames + video
-        chunk = _Frames(frames, np.asarray(states), demo, actions, drawn, self._robot.action.frames is None)
+        chunk = _Frames(frames, np.asarray(states), demo, actions, rendered, self._robot.action.frames is None)
         if feed.video:
             chunk.show(self.inner, 0, video)
         pause = -1 if self.exec_start is None else self.exec_start + feed.at - self.n_observed_frames
@@ -124,11 +124,11 @@ class _Frames:
         states: np.ndarray,
         demo: np.ndarray,
         actions: np.ndarray | None,
-        drawn: Mapping[str, np.ndarray] | None,
+        rendered: Mapping[str, np.ndarray] | None,
         motions: bool,
     ) -> None:
         self._frames, self._states, self._demo = frames, states, demo
-        self._actions, self._rendered, self._motions = actions, drawn, motions
+        self._actions, self._rendered, self._motions = actions, rendered, motions
         self._video, self._has_motions = int(demo.sum()), False
 
     def show(self, episode: Episode, start: int, stop: int) -> None:
@@ -151,7 +151,7 @@ class _Frames:
         views = {name: np.repeat(view, count, 0) for name, view in views.items()}
         if rendered:
             rendered = {
-                "drawn": {n: np.arange(count) if len(views[n]) else places for n, places in rendered["drawn"].items()}
+                "rendered": {n: np.arange(count) if len(views[n]) else places for n, places in rendered["rendered"].items()}
             }
         led = self._actions
         if led is not None:
@@ -166,7 +166,7 @@ class _Frames:
         views = {
             name: view[inside[name]] if name in inside else view[start:stop] for name, view in self._frames.items()
         }
-        return views, {"drawn": {name: places[name][inside[name]] - start for name in places}}
+        return views, {"rendered": {name: places[name][inside[name]] - start for name in places}}
 
 
 ALIKE = 3  # of the other episodes, so many with the most similar goals lend

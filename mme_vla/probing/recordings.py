@@ -114,7 +114,7 @@ class Recording:
             actions = self.source.actions(self.episode)[np.maximum(executed - 1, 0)]
         demo = np.ones(len(frames), bool) if video else frames < self.exec_start
         states = self.source.states(self.episode, start, stop)
-        running.observe(views, states, demo, actions, **({} if rendered is None else {"drawn": rendered}))
+        running.observe(views, states, demo, actions, **({} if rendered is None else {"rendered": rendered}))
 
 
 def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:

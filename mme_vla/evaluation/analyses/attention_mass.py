@@ -33,7 +33,7 @@ class AttentionMass:
     layers: Tensor
 
     def share(self, part: str) -> Tensor:
-        """Mass by layer [depth] of what does not lie on the actions themselves, as the paper's table adds up to 100 %."""
+        """Mass by layer [depth] outside the actions themselves, so that it adds up to 100 % as in the paper's table."""
         if part not in self.parts:
             raise UserError(f"No attention on {part!r}: the sequence holds {', '.join(self.parts)}.")
         self_mass = self.layers[:, self.parts.index("action")]

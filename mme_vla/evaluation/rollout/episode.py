@@ -112,7 +112,9 @@ class RunningEpisode:
         led = self._led
         if led is not None:  # one action a frame; or some motions, all told with the first of their frames
             led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
-        some = {} if all(len(places) == len(self._demo[part]) for places in rendered.values()) else {"drawn": rendered}
+        some = (
+            {} if all(len(places) == len(self._demo[part]) for places in rendered.values()) else {"rendered": rendered}
+        )
         self.episode.observe(views, self._frames["state"][part], self._demo[part], led, **some)
         if self.watched is not None and not self._demo[part][-1:].any():
             camera, demo = self._robot.memory_camera, self._demo[part]
