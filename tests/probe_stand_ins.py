@@ -8,11 +8,11 @@ from rollout_stand_ins import quick_policy
 from torch import Tensor
 
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing.arms import Arm, read_arms
 from mme_vla.probing.lines import Line
 from mme_vla.probing.offline import OfflineSettings, probe_offline
-from mme_vla.probing.recordings import Recording
 
 SIDE = 64
 

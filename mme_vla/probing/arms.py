@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError, brief
+from mme_vla.evaluation.feed import Feed
 from mme_vla.policy.base import Policy
 from mme_vla.probing.channels import Channel, NoChannel, Remembered
-from mme_vla.probing.interventions import NEEDS, Feed, Intervention, Moment
+from mme_vla.probing.interventions import NEEDS, Intervention, Moment
 from mme_vla.registry import INTERVENTIONS
 
 DEFAULT_ARMS = (

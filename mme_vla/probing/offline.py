@@ -12,15 +12,16 @@ from torch import Tensor
 
 from mme_vla.backbone.base import Draws
 from mme_vla.config.sections import read_section
+from mme_vla.evaluation.feed import Feed
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.policy.base import Policy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import UNPROBED, Arm
 from mme_vla.probing.channels import MemorySnapshot
-from mme_vla.probing.interventions import Feed, check_integer
+from mme_vla.probing.interventions import check_integer
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
-from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy
-from mme_vla.probing.recordings import Recording, others
+from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy, others
 from mme_vla.processing.prompt import subgoal_kind
 
 
@@ -155,14 +156,14 @@ class _Moments:
             episode.subgoals.append(episode.subgoal)
             for probed in arms:
                 result += self._probe(probed, episode, step)
-            episode.set_subgoal(episode.subgoal)
+            episode.inner.subgoal = episode.subgoal
             self._policy.act([episode.inner], self._settings.flow_steps)  # banks are written where chunks are chosen
         return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:
         """What an arm does at a moment; of the unprobed one, what it is compared with."""
         arm, draws, steps = probed.arm, self._draws[step], self._settings.flow_steps
-        episode.set_subgoal(arm.say(episode.subgoal, probed.moment(episode)))
+        episode.inner.subgoal = arm.say(episode.subgoal, probed.moment(episode))
         snapshot, edited = probed.snapshot(episode, draws[0])
         if arm is UNPROBED:
             self._baseline[step] = probed.ask(episode, snapshot, [edited], draws, steps)[0]

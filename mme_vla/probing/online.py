@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.envs.make import make_env
-from mme_vla.envs.metadata import SESSIONS, read_variant
 from mme_vla.envs.vector.pool import Job
-from mme_vla.errors import UserError
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
@@ -18,10 +17,8 @@ from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.store import find_records, read_folders
 from mme_vla.policy.base import Policy
-from mme_vla.probing.arms import UNPROBED, Arm, lacking, read_arm, slug
-from mme_vla.probing.channels import channel_of
+from mme_vla.probing.arms import UNPROBED, Arm, slug
 from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
-from mme_vla.probing.recordings import Recording
 from mme_vla.subgoal import SubgoalPredictor
 
 FOLDER = "online"
@@ -85,26 +82,3 @@ def paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Com
     if baseline is None:
         return []
     return compare_all([(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)], protocol)
-
-
-def with_sessions(policy: Policy, split: str, recordings: Sequence[Recording]) -> Policy:
-    """The policy as a split evaluates it: where that asks for sessions before each episode, it sees them first.
-
-    They are the first of the recordings, the same before every episode, and seem to be part of its video.
-
-    Args:
-        recordings: episodes to show.
-    """
-    variant = read_variant(split)
-    if variant is None or variant.dial != SESSIONS:
-        if recordings:
-            raise UserError(f"recordings=…: split={split} shows none; they are for split=stress:sessions=<n>.")
-        return policy
-    if not variant.sessions:
-        return policy
-    arm = read_arm(f"distract:{variant.sessions}")
-    if why := lacking(arm, policy, channel_of(policy), len(recordings), boundaries=False):
-        raise UserError(f"split={split} needs {why}.")
-    probed = ProbedPolicy(policy, arm, recordings, of_split=True).eval()
-    probed.config["sessions"] = [recording.name for recording in probed.sessions]
-    return probed

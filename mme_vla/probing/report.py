@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
 from mme_vla.evaluation.results.report import document, html_table, pair, section
 from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
-from mme_vla.probing.recordings import Recording
 from mme_vla.utils import write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
 

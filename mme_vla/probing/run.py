@@ -12,6 +12,7 @@ from mme_vla.envs.make import make_env, require_simulator
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.api import load
+from mme_vla.evaluation.recordings import Recording, all_recordings
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.rollout.evaluation import Shard, checkpoint_label, choose_episodes, memory_budget
 from mme_vla.evaluation.rollout.runner import RunFacts
@@ -23,7 +24,6 @@ from mme_vla.probing.arms import Arm, choose_arms, options_of
 from mme_vla.probing.channels import channel_of
 from mme_vla.probing.offline import OfflineSettings, probe_offline
 from mme_vla.probing.online import online_records, paired, probe_online
-from mme_vla.probing.recordings import Recording, all_recordings
 from mme_vla.probing.report import Findings, write_images, write_page
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 
