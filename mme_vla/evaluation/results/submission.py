@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from mme_vla.evaluation.results.aggregate import Method
-from mme_vla.evaluation.results.tables import escape_markdown
 from mme_vla.evaluation.store import RUN_FILE, read_run
+from mme_vla.utils.pages import render
 
 UNKNOWN = "not recorded with these results: state it manually"
 RECIPE = {
@@ -32,7 +32,7 @@ def read_runs(records: Iterable[Path]) -> list[dict[str, Any]]:
 
 def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]]) -> str:
     """The section `Training details` of a submission, in Markdown."""
-    parts = ["## Training details\n"]
+    policies = []
     for method in methods:
         for checkpoint in dict.fromkeys(run.key.checkpoint for run in method.runs):
             about = [
@@ -42,15 +42,14 @@ def training_details(methods: Sequence[Method], runs: Sequence[Mapping[str, Any]
             ]  # fmt: skip
             facts = next((run["notes"]["policy"] for run in about if (run.get("notes") or {}).get("policy")), None)
             seeds = sorted({run.key.model_seed for run in method.runs if run.key.checkpoint == checkpoint})
-            parts.append(f"**{escape_markdown(method.label)}, checkpoint {escape_markdown(str(checkpoint))}**\n")
-            parts += [f"- {name}: {escape_markdown(text)}" for name, text in _lines(facts)]
             record = next(r for run in method.runs if run.key.checkpoint == checkpoint for r in run.records.values())
             evaluation = (
                 f"split {record.split}, {record.action_space} actions, at most {record.max_steps} steps, "
                 f"model seeds {', '.join(map(str, seeds))}"
             )
-            parts.append(f"- evaluation: {escape_markdown(evaluation)}\n")
-    return "\n".join(parts)
+            title = f"{method.label}, checkpoint {checkpoint}"
+            policies.append({"title": title, "facts": [*_lines(facts), ("evaluation", evaluation)]})
+    return render("training.md", policies=policies)
 
 
 def _lines(facts: Mapping[str, Any] | None) -> list[tuple[str, str]]:
