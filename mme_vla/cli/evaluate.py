@@ -38,7 +38,7 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.envs.make import require_simulator
     from mme_vla.evaluation.feed import with_sessions
     from mme_vla.evaluation.recordings import all_recordings
-    from mme_vla.evaluation.results.submission import policy_facts
+    from mme_vla.evaluation.results.report import policy_facts
     from mme_vla.evaluation.rollout.evaluation import (
         RunFacts,
         checkpoint_label,

@@ -16,9 +16,9 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.curves import Curves, process_tables, stress_curves, stress_figures, stress_table
-from mme_vla.evaluation.results.demo import demo_records
+from mme_vla.evaluation.results.paper import demo_records
+from mme_vla.evaluation.results.report import read_runs, training_details
 from mme_vla.evaluation.results.scopes import TEST_EPISODES, Protocol, tasks_of
-from mme_vla.evaluation.results.submission import read_runs, training_details
 from mme_vla.evaluation.results.tables import (
     Table,
     comparison_table,

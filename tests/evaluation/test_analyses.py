@@ -17,12 +17,10 @@ from mme_vla import UserError, build_policy
 from mme_vla.backbone import gemma
 from mme_vla.cli.analyse import main
 from mme_vla.data.episodes import EpisodeSource
-from mme_vla.evaluation.analyses.attention_mass import AttentionWatch
 from mme_vla.evaluation.analyses.cost import RememberedShapes, count_model
-from mme_vla.evaluation.analyses.modulation import ModulationWatch
-from mme_vla.evaluation.analyses.recurrence import recurrence_curves, recurrence_plot
-from mme_vla.evaluation.analyses.replay import replay
+from mme_vla.evaluation.analyses.replay import recurrence_curves, recurrence_plot, replay
 from mme_vla.evaluation.analyses.rerun_log import RerunLog
+from mme_vla.evaluation.analyses.watches import AttentionWatch, ModulationWatch
 from mme_vla.evaluation.results.paper import counted
 from mme_vla.testing.small import random_batch, small_policy, unit_stats
 from mme_vla.utils.media import of_one_size, write_video

@@ -10,11 +10,11 @@ import pytest
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
 from mme_vla.evaluation import store
-from mme_vla.evaluation.forecast import Durations, earlier_records
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.progress import Durations, earlier_records
 from mme_vla.evaluation.rollout.runner import Waiting
 from mme_vla.evaluation.store import Claims, RecordLog
 from mme_vla.utils import write_json

@@ -15,10 +15,9 @@ from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing.arms import read_arm
 from mme_vla.probing.lines import LINES
 from mme_vla.probing.offline import OfflineSettings
-from mme_vla.probing.online import named
 from mme_vla.probing.probed import ProbedPolicy
 from mme_vla.probing.report import Findings, table_of
-from mme_vla.probing.run import Probe, ProbePlan, probed_folder, run_probe
+from mme_vla.probing.run import Probe, ProbePlan, named, probed_folder, run_probe
 
 JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
 
