@@ -77,7 +77,7 @@ class FeedHost(Host, Protocol):
 
 
 class FedEpisode(Episode):
-    """Passes frames on to `inner`, the policy's own episode, as a feed says.
+    """Passes frames on to `inner`, the policy's own episode, through a feed.
 
     exec_start: the first execution frame, once it is observed. boundaries: observed frames at which sub-tasks began,
     where the environment reports them.

@@ -11,7 +11,7 @@ from mme_vla.data.keyframes import EpisodeKeyframes, file_of
 from mme_vla.policy.base import Policy
 
 SUBGOAL = "simple_subgoal"
-"""The column that tells sub-tasks apart."""
+"""The column whose changes separate sub-tasks."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Recording:
 
         Args:
             required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
-                robot that reads depth is shown the frames that the dataset keeps depth of.
+                robot that reads depth observes the frames that the dataset keeps depth of.
         """
         robot = self.source.robot
         if robot.readings:

@@ -35,7 +35,7 @@ from mme_vla.utils import (
 RUN_FILE = "run.json"
 INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base_url", "timeout", "retries", "backoff",
                "requests_per_minute", "input_price", "output_price")  # fmt: skip
-"""Options of a model that predicts or plays which do not decide what it says, and may differ when a run continues."""
+"""Options of a model that predicts or plays which do not affect its output, and may differ when a run continues."""
 
 
 def fingerprint(settings: Mapping[str, Any]) -> str:

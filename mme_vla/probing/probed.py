@@ -69,7 +69,7 @@ class DonorEpisode:
         if self._episode is None:
             recording, policy = self.recording, self._policy
             running, seen = policy.start_episode(recording.goal), 0
-            # A bank is written where chunks are chosen; of stored frames any moment can be asked for afterwards.
+            # A bank is written where chunks are chosen; stored frames can be read at any step afterwards.
             stops = [] if self._channel.chooses else recording.decisions(policy.embodiment.action.execute, None)
             for stop in stops:
                 recording.show(running, seen, stop + 1)

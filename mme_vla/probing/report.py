@@ -37,9 +37,9 @@ AGES = (0, 16, 32, 64, 128, 256, 512)
 
 @dataclass(frozen=True)
 class Effect:
-    """What an arm, or an entry, did over some moments.
+    """The effect of an arm, or an entry, over some steps.
 
-    change, spread, distance: means, as in `Change`. beyond: share of moments at which the change exceeds the spread.
+    change, spread, distance: means, as in `Change`. beyond: share of steps at which the change exceeds the spread.
     """
 
     moments: int
@@ -110,7 +110,7 @@ class Findings:
         return sum(entry.change for entry in self.entries if entry.video) / total if total > 0 else None
 
     def matters_most(self) -> dict[str, list[EntryLine]]:
-        """For each task the moment at which a single entry mattered most: all entries of that moment."""
+        """For each task the step at which a single entry mattered most: all entries of that step."""
         strongest: dict[str, list[EntryLine]] = {}
         moments = _grouped(self.entries, lambda e: (e.task, e.recording, e.step))
         for (task, *_), lines in moments.items():
@@ -134,7 +134,7 @@ def show(effect_of: Effect | None) -> str:
 
 
 def arms_table(findings: Findings) -> Table:
-    """Every arm over all moments."""
+    """Every arm over all steps."""
     rows = []
     for name, effect_of in findings.arms().items():
         lines = [line for line in findings.moments if line.arm == name]
@@ -232,10 +232,10 @@ UNITS = (
 
 
 def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
-    """The frames remembered at a moment, each with its age and how the chunk changes without it; the current one last.
+    """The frames remembered at a step, each with its age and how the chunk changes without it; the current one last.
 
     Args:
-        lines: of one moment. recording: of which they are.
+        lines: of one step. recording: theirs.
     """
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):
@@ -247,7 +247,7 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image
 
 
 def write_images(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
-    """Draw the moment of each task at which an entry mattered most; entries that are frames alone."""
+    """Render the step of each task at which an entry mattered most; entries that are frames alone."""
     by_name = {recording.name: recording for recording in recordings}
     paths = []
     for task, lines in findings.matters_most().items():
@@ -280,7 +280,7 @@ def write_page(
                      for i, (title, curve, caption) in enumerate(curves)]  # fmt: skip
         sections += [Section(table.title, tables=[table]) for table in tables[1:]]
     if images := [(path.stem, _encoded(path)) for path in sorted((folder / IMAGES).glob("*.png"))]:
-        caption = "The moment of each task at which a single entry mattered most."
+        caption = "The step of each task at which a single entry mattered most."
         sections.append(Section("What was remembered", images=images, caption=caption))
     verdicts = [comparison.verdict for comparison in comparisons]
     if comparisons:

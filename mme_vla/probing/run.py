@@ -43,7 +43,7 @@ NO_DATA = (
 class ProbePlan:
     """What is probed.
 
-    arms: as `with` says them; None for the usual ones. recordings: episodes to probe; lend: to take from.
+    arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
     jobs: episodes of the closed loop, none for none. source: where the weights are from.
     """
 
@@ -58,7 +58,7 @@ class ProbePlan:
 
 @dataclass(frozen=True)
 class Probe:
-    """What a probe found. notes: what a reader has to know, such as arms that were left out."""
+    """The results of a probe. notes: what a reader has to know, such as arms that were left out."""
 
     findings: Findings
     comparisons: list[Comparison]
@@ -82,16 +82,16 @@ def run_probe(
     if plan.recordings:
         has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
         names = {recording.name for recording in plan.lend}
-        donors = len(names) - any(recording.name in names for recording in plan.recordings)  # not the probed one itself
-        arms, notes = choose_arms(plan.arms, policy, channel, donors, boundaries=has_boundaries)
+        n_donors = len(names) - any(recording.name in names for recording in plan.recordings)  # never the probed one
+        arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
         _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
     if plan.jobs:
         has_boundaries = base is make_env and settings.env == "mme_vla"
         arms, left_out = choose_arms(plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries)
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
-        lent = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
+        donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
         for arm in [UNPROBED, *arms]:
-            probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, lent).eval()
+            probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, donors).eval()
             evaluate(
                 probed, plan.jobs, folder / ONLINE / slug(arm.name), replace(facts, model=named(facts.model, arm)),
                 settings, subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
@@ -155,7 +155,7 @@ def probe(
     show_progress: bool = True,
     **settings: Any,
 ) -> Probe:
-    """Ask what a policy takes from its memory; what `output` holds already is not asked again.
+    """Measure what a policy takes from its memory; what `output` holds already is not run again.
 
     Args:
         policy: one with statistics; or a folder or hub repository to load one from.
@@ -163,8 +163,8 @@ def probe(
         arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that are possible.
         output: the probe's folder, for its lines and its page.
         tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
-        seed: of noise and of what is drawn at random.
-        draws: chunks sampled at each moment. moments: most of an episode.
+        seed: of noise and of random choices.
+        draws: chunks sampled at each step. moments: most steps of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
         show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.

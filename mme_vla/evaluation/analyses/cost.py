@@ -25,7 +25,7 @@ from mme_vla.policy.build import build_policy
 
 
 class RememberedShapes(TorchDispatchMode):
-    """While entered, an operation on meta tensors that was asked before with such tensors gives its result at once.
+    """While entered, an operation on meta tensors that ran before with such tensors returns its result at once.
 
     Only results that are new tensors, one each; views and changes in place are made as ever.
     """

@@ -28,7 +28,7 @@ def replay(
 ) -> Iterator[tuple[int, Episode]]:
     """Show a recorded episode frame by frame and let the policy act at every `stride`-th execution step.
 
-    The recorded actions continue being executed, whatever the policy answers. Subgoals, where the policy reads them,
+    The recorded actions are executed, not the policy's. Subgoals, where the policy reads them,
     are the recorded ones.
 
     Args:
@@ -87,7 +87,7 @@ def replay_all(
 
 
 def give_statistics(policy: MMEPolicy, source: EpisodeSource) -> None:
-    """Normalisation statistics for a fresh policy, which has none: those of the data it is shown."""
+    """Normalisation statistics for a fresh policy, which has none: those of the data."""
     processor = policy.require_processor()
     if processor.stats is None:
         processor.stats = compute_norm_stats([source], horizon=processor.horizon, robot=processor.embodiment)

@@ -110,7 +110,7 @@ RECIPE = {
 
 
 def policy_facts(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What a policy's configuration tells of it and of its training, for the notes of a run."""
+    """What a policy's configuration states of it and of its training, for the notes of a run."""
     card = config.get("card")
     card = card if isinstance(card, Mapping) else {}
     parts = {part: _section(config.get(part)) for part in ("memory", "integration")}

@@ -30,7 +30,7 @@ class Table:
 def show(figure: Figure, short: bool = False) -> str:
     """A figure as text: mean ± deviation, or how far it is.
 
-    A mean that leaves incomplete runs out says of how many it is.
+    A mean without the incomplete runs states its number of runs.
     """
     if figure.mean is None:
         if short:

@@ -45,7 +45,7 @@ def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, sp
 
 
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
-    """Read `0/4` (the first of four), or what torchrun says of this process.
+    """Read `0/4` (the first of four), or the rank of this process under torchrun.
 
     Args:
         text: wins over the environment. environment: by default the process's own.
@@ -102,10 +102,10 @@ def evaluate(
     Args:
         policy: in eval mode, on its device, with statistics.
         jobs: the episodes of the run. shard: which of how many processes this is; each takes the next episode that is
-            free when it has room (`claims.py`).
+            free when it has room (`store.Claims`).
         output: the run's folder; one that holds a part of the same run is gone on with.
         facts: what the records say of the policy.
-        subgoals: who says the subgoal, where the policy reads one.
+        subgoals: predicts the subgoal, where the policy reads one.
         source: where the weights are from; part of what makes a run the same.
         base: makes an environment with the benchmark's interface; importable by name.
         notes: kept in `run.json` and never compared.
@@ -216,7 +216,7 @@ def _end_of(place: str | None) -> str | None:
 
 
 def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
-    """Refuse a predictor that says what this policy was not trained to read."""
+    """Refuse a predictor whose subgoals this policy was not trained to read."""
     if subgoals is None:
         return
     if not policy.require_processor().reads_subgoal:

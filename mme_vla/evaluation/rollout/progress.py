@@ -127,7 +127,7 @@ class Durations:
     def forecast(self, jobs: Sequence[Job], workers: int, processes: int = 1) -> "Forecast | None":
         """What running the jobs will take; None without records.
 
-        Environments run side by side, and while they do the policy answers: the slower of the two decides, and the
+        Environments run side by side while the policy acts: the slower of the two decides, and the
         longest episode is waited for in any case.
 
         Args:
