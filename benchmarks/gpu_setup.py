@@ -11,7 +11,7 @@ from torch import Tensor, distributed
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla import MMEPolicy, build_policy
-from mme_vla.evaluation.analyses.cost import RememberedShapes, flops
+from mme_vla.evaluation.analyses.cost import flops
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.types import Batch
 
@@ -93,7 +93,7 @@ def sample_flops(model: str, backbone: str) -> tuple[int, int]:
     """
     policy = built(model, backbone, torch.device("meta"))
     batch = policy.full_batch("meta")
-    with RememberedShapes(), FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False) as counter:
         policy(batch, draws_of(policy, 1, torch.device("meta")))[0].backward()
     computed = counter.get_total_flops()
     again = 0

@@ -349,8 +349,8 @@ def tidy(folder: Path) -> None:
     (folder / "probe" / "page.html").unlink()
     for file in (folder / "training").glob("*/summary.json"):
         file.write_text(file.read_text().replace(f"{REPOSITORY}/", ""))
-    claims = folder / "evaluation" / "shared" / "claims.jsonl"
-    claims.write_text(claims.read_text().replace(socket.gethostname(), "host"))
+    for claim in (folder / "evaluation" / "shared" / "claims").glob("*.json"):
+        claim.write_text(claim.read_text().replace(socket.gethostname(), "host"))
 
 
 def figures(folder: Path, scratch: Path) -> dict[str, Any]:

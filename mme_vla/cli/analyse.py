@@ -26,7 +26,7 @@ from mme_vla.utils import safe_name
 
 if TYPE_CHECKING:
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.evaluation.analyses.recurrence import RecurrenceCurves
+    from mme_vla.evaluation.analyses.replay import RecurrenceCurves
     from mme_vla.evaluation.analyses.rerun_log import RerunLog
     from mme_vla.policy.mme import MMEPolicy
 
@@ -48,8 +48,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def attention(args: argparse.Namespace) -> None:
     """Print the table of attention mass; the paper's beside it, where it has this model."""
-    from mme_vla.evaluation.analyses.attention_mass import AttentionWatch
     from mme_vla.evaluation.analyses.replay import replay_all
+    from mme_vla.evaluation.analyses.watches import AttentionWatch
 
     policy, source, name = _subject(args)
     with AttentionWatch(policy) as watch, _rerun(args) as log:
@@ -74,8 +74,8 @@ def attention(args: argparse.Namespace) -> None:
 
 def modulation(args: argparse.Namespace) -> None:
     """Print mean and deviation of scale and bias, by layer and over all."""
-    from mme_vla.evaluation.analyses.modulation import ModulationWatch
     from mme_vla.evaluation.analyses.replay import replay_all
+    from mme_vla.evaluation.analyses.watches import ModulationWatch
 
     policy, source, name = _subject(args)
     with ModulationWatch(policy) as watch, _rerun(args) as log:
@@ -103,7 +103,7 @@ def modulation(args: argparse.Namespace) -> None:
 
 def recurrence(args: argparse.Namespace) -> None:
     """Draw a recurrent memory's numbers along episodes, and write them as CSV."""
-    from mme_vla.evaluation.analyses.recurrence import recurrence_curves, recurrence_plot
+    from mme_vla.evaluation.analyses.replay import recurrence_curves, recurrence_plot
 
     policy, source, name = _subject(args)
     numbers = range(len(source)) if args.episodes is None else args.episodes
@@ -142,7 +142,7 @@ def selection(args: argparse.Namespace) -> None:
     from mme_vla.cli.inspect import build_memory
     from mme_vla.config.composition import compose
     from mme_vla.data.episodes import EpisodeSource
-    from mme_vla.evaluation.analyses.selection import selection_sheets
+    from mme_vla.evaluation.analyses.replay import selection_sheets
     from mme_vla.utils.media import of_one_size, write_video
 
     source = EpisodeSource(args.dataset)

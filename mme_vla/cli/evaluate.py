@@ -36,7 +36,9 @@ def main(cfg: DictConfig) -> None:
     from mme_vla.data.sources import open_sources
     from mme_vla.envs.episodes import named_tasks
     from mme_vla.envs.make import require_simulator
-    from mme_vla.evaluation.results.submission import policy_facts
+    from mme_vla.evaluation.feed import with_sessions
+    from mme_vla.evaluation.recordings import all_recordings
+    from mme_vla.evaluation.results.report import policy_facts
     from mme_vla.evaluation.rollout.evaluation import (
         RunFacts,
         checkpoint_label,
@@ -47,8 +49,6 @@ def main(cfg: DictConfig) -> None:
         memory_budget,
     )
     from mme_vla.evaluation.rollout.settings import RolloutSettings
-    from mme_vla.probing.online import with_sessions
-    from mme_vla.probing.recordings import all_recordings
 
     config = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(config, dict)

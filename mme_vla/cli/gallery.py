@@ -12,6 +12,7 @@ from mme_vla.envs.episodes import choose_episodes, named_tasks
 from mme_vla.envs.make import make_task, require_simulator
 from mme_vla.errors import UserError
 from mme_vla.utils.media import RED, Tile, contact_sheet, evenly_spaced
+from mme_vla.utils.pages import render
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -71,20 +72,6 @@ def strip(snapshots: Sequence[Snapshot], tiles: int) -> "Image":
     return contact_sheet(images, COLUMNS)
 
 
-def page(entries: Sequence[tuple[str, str, str]]) -> str:
-    """The page's Markdown; each entry is a task, its goal and the name of its image."""
-    lines = [
-        "# The sixteen tasks",
-        "",
-        "One demonstrated episode each, front camera; images with a red border belong to the conditioning video.",
-        "Rendered by `mme-vla gallery`.",
-        "",
-    ]
-    for task, goal, image in entries:
-        lines += [f"## {task}", "", f"*{goal}*", "", f"![{task}]({image})", ""]
-    return "\n".join(lines)
-
-
 def run(cfg: "DictConfig") -> None:
     """Draw the gallery as configs/show.yaml and the command line say."""
     from mme_vla.data.console import progress
@@ -105,7 +92,7 @@ def run(cfg: "DictConfig") -> None:
             entries.append((spec.task, env.goals()[0], image_name))
             env.close()
             advance(1)
-    (folder / "README.md").write_text(page(entries))
+    (folder / "README.md").write_text(render("gallery.md", entries=entries))
     print(f"{folder / 'README.md'}: {len(entries)} tasks.")
 
 

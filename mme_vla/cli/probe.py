@@ -13,8 +13,8 @@ from mme_vla.cli.loading import load_policy
 from mme_vla.errors import UserError
 
 if TYPE_CHECKING:
+    from mme_vla.evaluation.recordings import Recording
     from mme_vla.policy.base import Policy
-    from mme_vla.probing.recordings import Recording
 
 # Threads that wait asleep leave their cores to the environments; it counts only when set before PyTorch is imported.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -83,7 +83,7 @@ def main(cfg: DictConfig) -> None:
 
 def _recordings(data: Any, policy: "Policy") -> "list[Recording]":
     from mme_vla.data.sources import open_sources
-    from mme_vla.probing.recordings import all_recordings
+    from mme_vla.evaluation.recordings import all_recordings
 
     return [] if data is None else all_recordings(open_sources(data, policy.embodiment))
 

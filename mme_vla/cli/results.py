@@ -6,7 +6,6 @@ RUN is a file of episode records, or a folder with `episodes*.jsonl` in it or be
 import argparse
 import sys
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 
 from mme_vla.cli.errors import print_user_errors
@@ -17,14 +16,13 @@ from mme_vla.evaluation.records import EpisodeRecord
 from mme_vla.evaluation.results.aggregate import Method, Results, aggregate
 from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
 from mme_vla.evaluation.results.curves import Curves, process_tables, stress_curves, stress_figures, stress_table
-from mme_vla.evaluation.results.demo import demo_records
+from mme_vla.evaluation.results.paper import demo_records
+from mme_vla.evaluation.results.report import read_runs, training_details
 from mme_vla.evaluation.results.scopes import TEST_EPISODES, Protocol, tasks_of
-from mme_vla.evaluation.results.submission import read_runs, training_details
 from mme_vla.evaluation.results.tables import (
     Table,
     comparison_table,
     detail,
-    escape_markdown,
     leaderboard,
     overview,
     print_table,
@@ -35,6 +33,7 @@ from mme_vla.evaluation.results.tables import (
 )
 from mme_vla.evaluation.rollout.subgoals import subgoal_tables
 from mme_vla.evaluation.store import find_records, read_folders
+from mme_vla.utils.pages import render
 
 DEMO = (
     ("pi05", None),
@@ -98,7 +97,7 @@ def _episodes(records: Sequence[EpisodeRecord], split: str | None) -> int:
 
 def show_curves(curves: Curves, args: argparse.Namespace) -> None:
     """Print success over the dials, and write it where a file is named."""
-    from mme_vla.evaluation.results.report import document, html_table, section
+    from mme_vla.evaluation.results.report import Section, html_page
 
     table = stress_table(curves)
     print_table(table, 200)
@@ -106,10 +105,10 @@ def show_curves(curves: Curves, args: argparse.Namespace) -> None:
         args.markdown.parent.mkdir(parents=True, exist_ok=True)
         args.markdown.write_text(to_markdown(table), encoding="utf-8")
     if args.html:
-        boxes = [section(name, figure, "Episodes that every place of the dial has.") for name, figure in
-                 stress_figures(curves).items()]  # fmt: skip
+        caption = "Episodes that every place of the dial has."
+        boxes = [Section(name, figure, caption=caption) for name, figure in stress_figures(curves).items()]
         args.html.parent.mkdir(parents=True, exist_ok=True)
-        page = document(args.title, [f"<h1>{escape(args.title)}</h1>", *boxes, section(table.title, html_table(table))])
+        page = html_page(args.title, [*boxes, Section(table.title, tables=[table])])
         args.html.write_text(page, encoding="utf-8")
 
 
@@ -123,12 +122,13 @@ def write(results: Results, comparisons: list[Comparison], args: argparse.Namesp
     if args.markdown:
         boards = [table for method in results.methods for table in leaderboard(method, results)]
         tables = [overview(results), *boards, *process_tables(results), *subgoal_tables(results)]
-        parts = ["## Results\n", *map(to_markdown, tables)]
-        parts.append(training_details(results.methods, read_runs(find_records(args.runs))))
-        if comparisons:
-            parts.append(to_markdown(comparison_table(comparisons)))
-        parts += [f"- {escape_markdown(note)}" for note in results.notes]
-        texts[args.markdown] = "\n".join(parts) + ("\n" if results.notes else "")
+        texts[args.markdown] = render(
+            "results.md",
+            tables=map(to_markdown, tables),
+            training=training_details(results.methods, read_runs(find_records(args.runs))),
+            comparisons=[to_markdown(comparison_table(comparisons))] if comparisons else [],
+            notes=results.notes,
+        )
     if args.html:
         from mme_vla.evaluation.results.report import html_report
 

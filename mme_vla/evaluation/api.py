@@ -8,6 +8,8 @@ from typing import Any
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.make import make_env, require_simulator
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.feed import with_sessions
+from mme_vla.evaluation.recordings import all_recordings
 from mme_vla.evaluation.rollout.evaluation import (
     Evaluation,
     checkpoint_label,
@@ -19,8 +21,6 @@ from mme_vla.evaluation.rollout.evaluation import evaluate as evaluate_run
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.policy.base import Policy
-from mme_vla.probing.online import with_sessions
-from mme_vla.probing.recordings import all_recordings
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 
 

@@ -41,7 +41,7 @@ class EpisodeKey(NamedTuple):
 class Seconds:
     """Where an episode's wall time went.
 
-    sim: building and stepping the environment, without its images. render: those (0 where they cannot be told apart).
+    sim: building and stepping the environment, without its images. render: those (0 where they cannot be separated).
     policy: the episode's share of the policy's batches. total: from its beginning to its end, waiting included.
     """
 
@@ -226,7 +226,7 @@ def by_run(records: Iterable[EpisodeRecord]) -> dict[RunKey, list[EpisodeRecord]
 
 
 def finished(records: Iterable[EpisodeRecord], retry_errors: bool = True) -> set[EpisodeKey]:
-    """The episodes of one run that need not be run again; those that ended in an error do, unless told otherwise."""
+    """The episodes of one run that need not be run again; those that ended in an error do by default."""
     return {record.key for record in records if not (retry_errors and record.outcome == "error")}
 
 

@@ -1,32 +1,29 @@
-"""Who runs which episode, where several processes share a run: they take the next one from a common file.
-
-`claims.jsonl` lies in the run's folder and is only appended to, under a lock. A claim holds as long as whoever made it
-writes the records file of its shard, which the operating system tells (`RecordLog` locks it): what a killed process had
-claimed and not finished is taken again.
-"""
+"""The files of a run's folder: settings (`run.json`), records (`episodes.jsonl`) and claims (`claims/`)."""
 
 import fcntl
 import hashlib
 import json
 import os
+import re
 import socket
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import IO, Any, Self
-from uuid import uuid4
+from urllib.parse import quote, unquote
 
+from mme_vla.config.sections import read_section
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, brief
 from mme_vla.evaluation.records import EpisodeKey, EpisodeRecord, complete_compositions, finished
 from mme_vla.utils import (
     draft_of,
+    is_alive,
     name_place,
-    parse_json,
     read_json,
     read_lines,
     remove_drafts,
@@ -38,7 +35,7 @@ from mme_vla.utils import (
 RUN_FILE = "run.json"
 INDIFFERENT = ("workers", "batch_size", "device", "cache", "key_variable", "base_url", "timeout", "retries", "backoff",
                "requests_per_minute", "input_price", "output_price")  # fmt: skip
-"""Options of a model that predicts or plays which do not decide what it says, and may differ when a run continues."""
+"""Options of a model that predicts or plays which do not affect its output, and may differ when a run continues."""
 
 
 def fingerprint(settings: Mapping[str, Any]) -> str:
@@ -228,10 +225,6 @@ def find_records(paths: Iterable[Path]) -> list[Path]:
 
 def _lock(file: IO[bytes], path: Path) -> None:
     try:
-        import fcntl
-    except ImportError:  # not on this system
-        return
-    try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise UserError(
@@ -241,104 +234,125 @@ def _lock(file: IO[bytes], path: Path) -> None:
         return
 
 
-CLAIMS = "claims.jsonl"
+CLAIMS = "claims"
+"""Folder of a run's claims."""
+_CLAIM = re.compile(r"(?P<task>.+)-(?P<episode>\d+)\.(?P<number>\d+)\.json")
+_RECORDS = re.compile(r"episodes(-\d+of\d+)?\.jsonl")
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One process's claim on an episode.
+
+    records: name of the file that the process holds and writes its records to; None gives the episode back.
+    host, process: of the writer, for file systems without locks.
+    """
+
+    records: str | None
+    host: str = field(default_factory=socket.gethostname)
+    process: int = field(default_factory=os.getpid)
+
+    def __post_init__(self) -> None:
+        if self.records is not None and not _RECORDS.fullmatch(self.records):
+            raise UserError(f"records={brief(self.records)} must name a file of records, such as {RECORDS}.")
+        if self.process < 1:
+            raise UserError(f"process={self.process} must be a process number.")
 
 
 class Claims:
-    """The claims on a run's episodes, seen by one of its processes."""
+    """The claims on a run's episodes, as one of its processes sees them.
+
+    `claims/<task>-<episode>.<n>.json` is claim number n on an episode. Each is created exclusively and never changed
+    or removed, so that two processes never hold the same one, on network file systems too. The newest claim counts.
+    It holds while its process locks its file of records, and where that file has the episode's result.
+    """
 
     def __init__(self, folder: Path, records: str) -> None:
-        """Join the run; whatever an earlier process claimed under the same name is free again.
+        """Join the run. Gives back what an earlier process with the same file of records had not finished.
 
         Args:
             folder: of the run. records: the name of the file that this process holds and writes its records to.
         """
-        self.folder, self.path, self.records = folder, folder / CLAIMS, records
-        self.session = f"{socket.gethostname()}-{os.getpid()}-{uuid4().hex[:8]}"
-        self._owners: dict[EpisodeKey, str] = {}
-        self._files: dict[str, str] = {}  # session → its records
-        self._newest: dict[str, str] = {}  # records → the session that holds them
-        self._finished: dict[str, set[EpisodeKey]] = {}  # of sessions that have ended
-        self._read = 0
-        with self._locked() as file:
-            self._append(file, {"begin": self.session, "records": records})
+        self.folder, self.records = folder, records
+        self._newest: dict[EpisodeKey, tuple[int, Claim]] = {}
+        for path in sorted((folder / CLAIMS).glob("[!.]*.json")):
+            if match := _CLAIM.fullmatch(path.name):
+                key, number = EpisodeKey(unquote(match["task"]), int(match["episode"])), int(match["number"])
+                if number > self._newest.get(key, (-1, None))[0]:
+                    self._newest[key] = number, _read_claim(path)
+        done = _finished_in(folder / records)
+        for key, (number, claim) in list(self._newest.items()):
+            if claim.records == records and key not in done:
+                self._create(key, number + 1, Claim(None))
 
     def take(self, waiting: Sequence[Job]) -> Job | None:
-        """Claim the first episode that nobody runs or has finished; None where all are taken."""
-        alive: dict[str, bool] = {}
-        with self._locked() as file:
-            for job in waiting:
-                key = EpisodeKey(job.task, job.episode)
-                owner = self._owners.get(key)
-                if owner is not None:
-                    if owner not in alive:
-                        alive[owner] = self._is_alive(owner)
-                    if alive[owner] or key in self._done_by(owner):
-                        continue
-                self._append(file, {"by": self.session, "task": job.task, "episode": job.episode})
-                return job
+        """Claim the first episode that no process runs or has finished; None where all are taken."""
+        finished_by: dict[str, set[EpisodeKey] | None] = {}
+        for job in waiting:
+            key = EpisodeKey(job.task, job.episode)
+            while True:
+                number, claim = self._newest.get(key, (-1, None))
+                if claim is not None and self._holds(claim, key, finished_by):
+                    break
+                if self._create(key, number + 1, Claim(self.records)):
+                    return job
         return None
 
-    def _is_alive(self, session: str) -> bool:
-        records = self._files[session]
-        if self._newest[records] != session:
+    def _holds(self, claim: Claim, key: EpisodeKey, finished_by: dict[str, set[EpisodeKey] | None]) -> bool:
+        """Whether the claim's process is alive (None in `finished_by`) or has finished the episode."""
+        records = claim.records
+        if records is None:
             return False
-        return session == self.session or _is_locked(self.folder / records)
+        if records not in finished_by:
+            path = self.folder / records
+            finished_by[records] = None if records == self.records or _is_held(path, claim) else _finished_in(path)
+        done = finished_by[records]
+        return done is None or key in done
 
-    def _done_by(self, session: str) -> set[EpisodeKey]:
-        """What a session that has ended finished; its file may have gone on under another session."""
-        if session not in self._finished:
-            path = self.folder / self._files[session]
-            self._finished[session] = finished(read_records(path)) if path.exists() else set()
-        return self._finished[session]
-
-    @contextmanager
-    def _locked(self) -> Iterator[int]:
-        """Hold the file, and know all that is in it."""
-        file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            new = os.pread(file, os.fstat(file).st_size - self._read, self._read)
-            complete, _, incomplete = new.rpartition(b"\n")
-            if incomplete:  # a process was killed while it wrote
-                os.ftruncate(file, self._read + len(new) - len(incomplete))
-            for line in complete.split(b"\n") if complete else ():
-                self._note(line)
-            self._read += len(new) - len(incomplete)
-            yield file
-        finally:
-            os.close(file)
-
-    def _note(self, line: bytes) -> None:
-        claim = parse_json(line, "a claim on an episode")
-        if isinstance(claim, dict) and isinstance(claim.get("records"), str):
-            self._files[claim["begin"]] = claim["records"]
-            self._newest[claim["records"]] = claim["begin"]
-        elif isinstance(claim, dict) and claim.get("by") in self._files:
-            self._owners[EpisodeKey(claim["task"], claim["episode"])] = claim["by"]
-        else:
-            raise UserError(
-                f"{self.path} is damaged. Remove it while no process of the run is alive: nothing of the run is lost."
-            )
-
-    def _append(self, file: int, claim: dict[str, object]) -> None:
-        line = json.dumps(claim).encode() + b"\n"
-        os.write(file, line)
-        os.fsync(file)
-        self._note(line)
-        self._read += len(line)
+    def _create(self, key: EpisodeKey, number: int, claim: Claim) -> bool:
+        """Write a claim; False where another process was first, whose claim is noted."""
+        path = self.folder / CLAIMS / f"{quote(key.task, safe='')}-{key.episode}.{number}.json"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        is_first = not path.exists()
+        if is_first:
+            try:
+                _write_new(path, json.dumps(asdict(claim)) + "\n")
+            except FileExistsError:
+                is_first = False
+        self._newest[key] = number, claim if is_first else _read_claim(path)
+        return is_first
 
 
-def _is_locked(path: Path) -> bool:
-    """Whether a process writes to a records file. Where the disk knows no locks, whoever began is taken to continue."""
+def _read_claim(path: Path) -> Claim:
+    _await_content(path)
+    try:
+        return read_section(Claim, read_json(path, "a claim on an episode", limit=4096))
+    except UserError as error:
+        raise UserError(
+            f"{path} is damaged: {error} Remove the folder {path.parent} while no process of the run is alive: "
+            "nothing of the run is lost."
+        ) from None
+
+
+def _finished_in(path: Path) -> set[EpisodeKey]:
+    return finished(read_records(path)) if path.exists() else set()
+
+
+def _is_held(path: Path, claim: Claim) -> bool:
+    """Whether a process writes to a file of records.
+
+    Where the file system has no locks, a process of this machine is looked up by its number, and others are alive.
+    """
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
     except FileNotFoundError:
         return False
     try:
         fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:  # held by another, or no locks
+    except BlockingIOError:
         return True
+    except OSError:
+        return claim.host != socket.gethostname() or is_alive(claim.process)
     finally:
         os.close(file)
     return False

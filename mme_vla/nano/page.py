@@ -14,6 +14,7 @@ from mme_vla.evaluation.results.tables import comparison_table, to_markdown
 from mme_vla.nano.evaluating import NAME as PLANNER
 from mme_vla.nano.fitting import DONE, learning_curve
 from mme_vla.utils import read_json, write_atomically
+from mme_vla.utils.pages import render
 
 PAGE, CURVES = "page.md", "learning.png"
 LEVELS = ("easy", "medium", "hard")
@@ -37,31 +38,23 @@ def write_page(
     trained = [model for model in records if model != PLANNER]
     results, comparisons = compared(records, config["task"], config["split"], without)
     plot_curves({model: learning_curve(folder / model) for model in trained}, folder / CURVES)
-    parts = [
-        f"# {config['task']} on two cores",
-        "",
-        f"{sum(config['demonstrations'].values())} demonstrations, {config['train']['steps']} updates, split "
-        f"`{config['split']}`; each episode once for each of the seeds {', '.join(map(str, config['policy_seeds']))} "
-        f"of the policy's noise. Brackets: `{PLANNER}` is the demonstrator, which knows where everything is, through "
-        f"the policies' actions; {f'`{without}` has no memory' if without else 'no policy without memory was run'}.",
-        "",
-        success_table(records, {model: read_json(folder / model / DONE, "a training's end") for model in trained}),
-        "",
-        *([to_markdown(comparison_table(comparisons))] if comparisons else []),
-        *[f"- {comparison.verdict}" for comparison in comparisons],
-        *[f"- {note}" for note in results.notes],
-        "",
-        "| stage | minutes | of the command's own process on a processor |",
-        "| --- | ---: | ---: |",
-        *[f"| {stage} | {wall:.1f} | {processors:.1f} |" for stage, (wall, processors) in minutes.items()],
-        "",
-        f"![Loss on held-out demonstrations]({CURVES})",
-        "",
-        *[f"- video: [{video.stem}](<{video.relative_to(folder)}>)" for video in videos],
-        "",
-    ]
+    text = render(
+        "nano.md",
+        config=config,
+        demonstrations=sum(config["demonstrations"].values()),
+        seeds=", ".join(map(str, config["policy_seeds"])),
+        planner=PLANNER,
+        without=without,
+        success=success_table(records, {m: read_json(folder / m / DONE, "a training's end") for m in trained}),
+        comparison=to_markdown(comparison_table(comparisons)) if comparisons else "",
+        verdicts=[comparison.verdict for comparison in comparisons],
+        notes=results.notes,
+        minutes=minutes,
+        curves=CURVES,
+        videos=[(video.stem, video.relative_to(folder)) for video in videos],
+    )
     with write_atomically(folder / PAGE) as draft:
-        draft.write_text("\n".join(parts), encoding="utf-8")
+        draft.write_text(text, encoding="utf-8")
     return folder / PAGE
 
 

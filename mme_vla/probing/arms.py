@@ -1,4 +1,4 @@
-"""Arms of a probe: interventions alone or together, as words say them (`drop:2`, `nodemo+shuffle`)."""
+"""Arms of a probe: interventions alone or together (`drop:2`, `nodemo+shuffle`)."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass
@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 
 from mme_vla.errors import UserError, brief
+from mme_vla.evaluation.feed import Feed
 from mme_vla.policy.base import Policy
 from mme_vla.probing.channels import Channel, NoChannel, Remembered
-from mme_vla.probing.interventions import NEEDS, Feed, Intervention, Moment
+from mme_vla.probing.interventions import NEEDS, Intervention, Moment
 from mme_vla.registry import INTERVENTIONS
 
 DEFAULT_ARMS = (
     "drop:all", "nodemo", "swap", "shuffle", "recent", "oracle", "delay:16", "delay:64", "delay:256", "pause",
     "distract:1", "distract:3", "subgoal_swap", "subgoal_delay", "subgoal_count",
 )  # fmt: skip
-"""What a probe does unless told otherwise, as far as the policy and the data allow it."""
+"""The default arms, as far as the policy and the data allow them."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Arm:
 
     @property
     def feed(self) -> Feed:
-        """What episodes are shown."""
+        """What the policy observes."""
         feed = Feed()
         for part in self.parts:
             feed = part.feed(feed)
@@ -40,7 +41,7 @@ class Arm:
 
     @property
     def edits(self) -> bool:
-        """Whether what is remembered is changed on its way, and not only what is shown or told."""
+        """Whether the memory is changed, and not only frames or subgoals."""
         return "entries" in self.needs
 
     def only(self, moment: Moment) -> np.ndarray | None:
@@ -62,7 +63,7 @@ class Arm:
         return store
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        """What the policy is told instead."""
+        """The subgoal that the policy reads instead."""
         for part in self.parts:
             subgoal = part.say(subgoal, moment)
         return subgoal
@@ -115,7 +116,7 @@ def read_arms(specs: Any) -> list[Arm]:
 
 
 def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool) -> str | None:
-    """What an arm asks for and does not find, in words; None where it can be probed.
+    """What an arm needs and lacks, for a message; None where it can be probed.
 
     Args:
         recordings: recorded episodes to take from. boundaries: whether sub-tasks are recorded.
@@ -141,7 +142,7 @@ def lacking(arm: Arm, policy: Policy, channel: Channel, recordings: int, *, boun
 def choose_arms(
     specs: Any, policy: Policy, channel: Channel, recordings: int, *, boundaries: bool
 ) -> tuple[list[Arm], list[str]]:
-    """The arms asked for; unasked, those of `USUAL` that this policy and these data allow, and why not the others."""
+    """The arms of `specs`; by default those of `DEFAULT_ARMS` that policy and data allow, and why not the others."""
     arms, left_out = [], []
     for arm in read_arms(DEFAULT_ARMS if specs is None else specs):
         why = lacking(arm, policy, channel, recordings, boundaries=boundaries)

@@ -1,6 +1,6 @@
-"""Where each kind of policy keeps what it remembers, and how to ask it as if it remembered something else.
+"""Where each kind of policy keeps its memory, and how to sample chunks with other entries.
 
-Nothing here touches a network: a channel hands the policy other entries through the door that its own come through.
+No network is changed: a channel gives the policy other entries in place of its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,10 +21,10 @@ from mme_vla.types import HistoryTokens
 
 @dataclass(frozen=True)
 class Entry:
-    """One thing that is remembered: a frame's tokens, a moment in a bank.
+    """One entry of a memory: a frame's tokens, a row of a bank.
 
-    time: when it was, in frames of what the policy was shown (in moments, for banks that count those). content: what
-    stands there; only the channel it came from knows how to read it.
+    time: in frames that the policy observed (in chunks, for banks that count those). content: what it holds; only the
+    channel it came from can read it.
     """
 
     time: int
@@ -35,7 +35,7 @@ class Entry:
 class Remembered:
     """The entries of one store, in the order they are read; None where an intervention took one away.
 
-    now: the current moment, on the clock of the entries' times. name: which store, for policies that have several.
+    now: the current time, on the clock of the entries' times. name: which store, for policies that have several.
     """
 
     entries: tuple[Entry | None, ...]
@@ -147,7 +147,7 @@ class Exchanged(History):
 
 @dataclass(frozen=True)
 class MemorySnapshot:
-    """What an episode remembers now: its stores, and what the channel needs to give them back."""
+    """An episode's memory now: its stores, and what the channel needs to write them back."""
 
     stores: tuple[Remembered, ...]
     source: Any = None
@@ -255,7 +255,7 @@ class WritableChannel(Channel):
 
 
 class NoChannel(Channel):
-    """A policy without a memory that a probe can reach: what it is shown can be changed, and what it is told."""
+    """A policy without a memory that a probe can reach: its frames and its subgoal can be changed."""
 
     clock, chooses = None, False
 

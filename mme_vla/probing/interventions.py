@@ -1,4 +1,4 @@
-"""What a probe changes: each a small class with a dial, of what a policy is shown, remembers or is told.
+"""What a probe changes in a policy's frames, memory or subgoal: each a small class with a dial.
 
 One of your own is a class registered with `register("intervention", name)` in a module that `plugins` names.
 """
@@ -11,53 +11,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mme_vla.errors import UserError, did_you_mean
+from mme_vla.evaluation.feed import Feed
 from mme_vla.probing.channels import Remembered, same_progress
 from mme_vla.registry import INTERVENTIONS
-
-
-@dataclass(frozen=True)
-class Feed:
-    """Frames of an episode on their way to a policy. The default shows what happened.
-
-    sessions: unrelated episodes that come first, as if they were part of the video. video: whether the conditioning
-    video is shown. stills: how often one frame is repeated; at: which, counted from the first execution frame.
-    """
-
-    sessions: int = 0
-    video: bool = True
-    stills: int = 0
-    at: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("sessions", "stills", "at"):
-            if getattr(self, name) < 0:
-                raise UserError(f"A probe cannot show {getattr(self, name)} {name}: the number must not be negative.")
-
-    def displayed(self, frames: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
-        """Where frames [n] of the episode stand among the shown ones, int64 [n]; −1 where one is left out.
-
-        Args:
-            exec_start: the episode's first execution frame. before: frames of the sessions.
-        """
-        frames = np.asarray(frames, np.int64)
-        video = exec_start if self.video else 0
-        later = np.where(frames >= exec_start + self.at, self.stills, 0)  # the frame that stands still: its last repeat
-        executed = before + video + frames - exec_start + later
-        return np.where(frames >= exec_start, executed, before + frames if self.video else -1)
-
-    def first_executed(self, exec_start: int, before: int = 0) -> int:
-        """The first execution frame among the shown ones."""
-        return before + (exec_start if self.video else 0)
-
-    def source_frames(self, displayed: np.ndarray, exec_start: int, before: int = 0) -> np.ndarray:
-        """The episode's own frames behind shown ones [m], ascending, each once; those of sessions are left out."""
-        displayed = np.asarray(displayed, np.int64) - before
-        displayed = displayed[displayed >= 0]
-        video = exec_start if self.video else 0
-        past = displayed - video
-        executed = np.where(past > self.at, np.maximum(past - self.stills, self.at), past)
-        return np.unique(np.where(displayed < video, displayed, exec_start + executed))
-
 
 NEEDS = {
     "entries": "something remembered that the probe can reach",
@@ -68,7 +24,7 @@ NEEDS = {
     "recordings": "recorded episodes to take from: name them with recordings=…",
     "boundaries": "sub-tasks whose beginnings are told: by recordings with subgoals, in closed loop by env=mme_vla",
 }
-"""What an intervention can ask for, in words."""
+"""What an intervention can need, for messages."""
 
 
 def _nothing(name: str) -> Remembered:
@@ -77,11 +33,11 @@ def _nothing(name: str) -> Remembered:
 
 @dataclass(frozen=True)
 class Moment:
-    """What an intervention may know of the moment at which it is asked.
+    """What an intervention may know of the current step.
 
-    rng: of this episode, this moment and this intervention alone. now: the current frame, as it is shown. kept: frames
-    up to now that are stored, ascending. boundaries: frames at which a sub-task began. said: earlier subgoals, the
-    current one last. donor: the store of that name of another episode that is as far along, and what was said there.
+    rng: of this episode, this step and this intervention alone. now: the current frame, as observed. stored: stored
+    frames up to now, ascending. boundaries: frames at which a sub-task began. subgoals: earlier ones, the current
+    one last. donor: the store of a name of another episode that is as far along. donor_subgoal: the subgoal there.
     weigh: for each slot of a store, by how much the chunk changes without it.
     """
 
@@ -105,7 +61,7 @@ class Intervention:
     needs: ClassVar[frozenset[str]] = frozenset()
 
     def feed(self, feed: Feed) -> Feed:
-        """What the episode is shown."""
+        """What the policy observes."""
         return feed
 
     def only(self, moment: Moment) -> np.ndarray | None:
@@ -117,7 +73,7 @@ class Intervention:
         return store
 
     def say(self, subgoal: str | None, moment: Moment) -> str | None:
-        """What the policy is told instead."""
+        """The subgoal that the policy reads instead."""
         return subgoal
 
 
@@ -203,7 +159,7 @@ class Swap(Intervention):
 class Delay(Intervention):
     """All entries seem to be from `frames` later, the current one too: a clock that runs ahead. Negative: behind.
 
-    Of banks that count moments, so many moments.
+    Of banks that count chunks, so many chunks.
     """
 
     frames: int = 64
@@ -248,7 +204,7 @@ class Oracle(Intervention):
 @INTERVENTIONS.register("pause")
 @dataclass(frozen=True)
 class Pause(Intervention):
-    """One frame is seen `frames` times more: the scene stands still. `at`: which, from the first execution frame on."""
+    """One frame is repeated `frames` times more. `at`: which, from the first execution frame on."""
 
     frames: int = 64
     at: int = 0
@@ -325,7 +281,7 @@ class SubgoalSwap(Intervention):
 @INTERVENTIONS.register("subgoal_delay")
 @dataclass(frozen=True)
 class SubgoalDelay(Intervention):
-    """The subgoal that was said `decisions` chunks ago; the first one until then."""
+    """The subgoal of `decisions` chunks ago; the first one until then."""
 
     decisions: int = 2
     dial: ClassVar = "decisions"

@@ -1,27 +1,25 @@
-"""The JSON lines beneath a probe: one a moment and arm, one an entry, and one where a recorded episode is done."""
+"""The JSON lines of a probe: one a step and arm, one an entry, and one where a recorded episode is done."""
 
 import json
 import os
-import warnings
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from mme_vla.errors import UserError
-from mme_vla.utils import parse_json, read_bytes
+from mme_vla.config.sections import read_section
+from mme_vla.errors import UserError, brief
+from mme_vla.evaluation.store import read_lines
+from mme_vla.utils import parse_json, verified, with_checksum
 
 LINES = "offline*.jsonl"
 """The files of all shards."""
-LIMIT = 2**30
-DONE = b'{"kind":"done"'
 
 
 @dataclass(frozen=True)
 class MomentLine:
-    """An arm at a moment of a recorded episode.
+    """An arm at a step of a recorded episode.
 
-    phase: number of the sub-task, 0 for the first; subgoal: its words. dial: where the arm stands on its dial.
+    phase: number of the sub-task, 0 for the first; subgoal: its text. dial: the arm's value of its dial.
     entries: how many there were. touched: ages of those that the arm changed. change, spread, distance: see `Change`.
     """
 
@@ -38,12 +36,16 @@ class MomentLine:
     spread: float
     distance: float
 
+    def __post_init__(self) -> None:
+        if not all(type(age) is int for age in self.touched):
+            raise UserError(f"touched={brief(self.touched)} must be a list of whole numbers.")
+
 
 @dataclass(frozen=True)
 class EntryLine:
-    """What one entry matters at a moment: how the chunk changes without it.
+    """How the chunk changes without one entry.
 
-    slot: its place; time: its frame; age: how long ago. video: whether it is from the conditioning video.
+    slot: its index; time: its frame; age: frames since then. video: whether it is from the conditioning video.
     """
 
     recording: str
@@ -59,48 +61,56 @@ class EntryLine:
     spread: float
 
 
+@dataclass(frozen=True)
+class DoneLine:
+    """The end of a recorded episode's lines."""
+
+    recording: str
+
+
 Line = MomentLine | EntryLine
-_KINDS: dict[str, type[Line]] = {"moment": MomentLine, "entry": EntryLine}
+_KINDS: dict[str, type[Line | DoneLine]] = {"moment": MomentLine, "entry": EntryLine, "done": DoneLine}
 _NAMES = {kind: name for name, kind in _KINDS.items()}
 
 
 def append(path: Path, lines: Iterable[Line], recording: str) -> None:
     """Add all lines of a recorded episode at once, and that it is done."""
-    rows = [{"kind": _NAMES[type(line)], **asdict(line)} for line in lines]
-    rows.append({"kind": "done", "recording": recording})
+    rows = [with_checksum({"kind": _NAMES[type(line)], **asdict(line)}) for line in [*lines, DoneLine(recording)]]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
-        file.truncate(_complete_length(path.read_bytes()))
-        file.write("".join(json.dumps(row, separators=(",", ":")) + "\n" for row in rows).encode())
+        content = path.read_bytes()
+        length = _complete_length(content)
+        file.truncate(length)
+        text = "".join(json.dumps(row, separators=(",", ":")) + "\n" for row in rows)
+        file.write(b"\n" * (length > 0 and content[length - 1 : length] != b"\n") + text.encode())
         file.flush()
         os.fsync(file.fileno())
 
 
 def _complete_length(content: bytes) -> int:
     """How many bytes there are up to the last recorded episode that is done: what follows was cut off."""
-    end = length = 0
-    for line in content.splitlines(keepends=True):
-        end += len(line)
-        length = end if line.startswith(DONE) and line.endswith(b"\n") else length
-    return length
+    start = content.rfind(b'{"kind":"done"')
+    if start < 0:
+        return 0
+    end = content.find(b"\n", start) + 1
+    if end:
+        return end
+    try:
+        _parse(content[start:])
+    except UserError:
+        return _complete_length(content[:start])
+    return len(content)
 
 
 def read(path: Path) -> tuple[list[Line], set[str]]:
     """The lines of recorded episodes that are done, and which these are; nothing where there is no file."""
-    if not path.is_file():
-        return [], set()
-    *complete, incomplete = read_bytes(path, "lines of a probe", LIMIT).split(b"\n")
-    if incomplete.strip():
-        warnings.warn(f"{path}: ignored a half-written last line.", stacklevel=2)
     pending: dict[str, list[Line]] = {}
     done: dict[str, list[Line]] = {}
-    for number, line in enumerate(complete, 1):
-        row = parse_json(line, f"{path}, line {number},")
-        if row.get("kind") == "done":
-            done[row["recording"]] = pending.pop(row["recording"], [])
+    for line in read_lines(path, _parse, "a line of a probe") if path.exists() else []:
+        if isinstance(line, DoneLine):
+            done[line.recording] = pending.pop(line.recording, [])
         else:
-            read_line = _line(row, f"{path}, line {number}")
-            pending.setdefault(read_line.recording, []).append(read_line)
+            pending.setdefault(line.recording, []).append(line)
     return [line for lines in done.values() for line in lines], set(done)
 
 
@@ -109,8 +119,9 @@ def read_all(folder: Path) -> list[Line]:
     return [line for path in sorted(folder.glob(LINES)) for line in read(path)[0]]
 
 
-def _line(row: dict[str, Any], where: str) -> Line:
-    kind = _KINDS.get(str(row.pop("kind", "")))
-    if kind is None or set(row) != {field.name for field in fields(kind)}:
-        raise UserError(f"{where} is no line of a probe: its fields are {', '.join(sorted(row))}.")
-    return kind(**row)
+def _parse(text: bytes) -> Line | DoneLine:
+    row = verified(parse_json(text, "the line"), "the line")
+    name = row.pop("kind", None)
+    if name not in _NAMES.values():
+        raise UserError(f"kind={brief(name)} must be {', '.join(_KINDS)}.")
+    return read_section(_KINDS[name], row, "line")

@@ -11,15 +11,16 @@ import torch
 from torch import Tensor
 
 from mme_vla.config.sections import read_section
+from mme_vla.evaluation.feed import Feed
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.policy.base import Policy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import UNPROBED, Arm
 from mme_vla.probing.channels import MemorySnapshot
-from mme_vla.probing.interventions import Feed, check_integer
+from mme_vla.probing.interventions import check_integer
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
-from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy
-from mme_vla.probing.recordings import Recording, others
+from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy, others
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.types import Noise
 
@@ -57,9 +58,9 @@ def _distances(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class OfflineSettings:
-    """How a probe on recorded episodes looks.
+    """Settings of a probe on recorded episodes.
 
-    draws: chunks sampled at each moment, of the same noise in every arm. moments: most moments of an episode.
+    draws: chunks sampled at each step, of the same noise in every arm. moments: most steps of an episode.
     scan: whether each entry is left out by itself. flow_steps: of the sampler; None for the policy's own.
     """
 
@@ -93,7 +94,7 @@ def probe_offline(
 
     Args:
         recordings: episodes to probe. lend: episodes to take from, the same or others. path: of the lines.
-        after: told of each episode that is done.
+        after: called after each episode with 1.
     """
     _, done = lines.read(path)
     donors = DonorEpisodes(policy, ProbedPolicy(policy).channel, lend) if len(lend) > 1 else None
@@ -131,7 +132,7 @@ class _Moments:
         """Unprobed chunks [draws, h, w] of each step."""
 
     def lines(self) -> list[Line]:
-        """Everything that is found."""
+        """All lines."""
         return [line for probed in self._by_feed.values() for line in self._watch(probed)]
 
     def _shared_noise(self) -> dict[int, list[Noise]]:
@@ -140,7 +141,7 @@ class _Moments:
         return {step: [self._policy.sampling_noise(generator) for _ in range(count)] for step in self._steps}
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
-        """Show the episode once to arms that are shown the same."""
+        """Run the episode once for arms with the same feed."""
         result: list[Line] = []
         recording, first = self._recording, arms[0]
         episode = first.start_episode(recording.goal, self._seed)
@@ -155,14 +156,14 @@ class _Moments:
             episode.subgoals.append(episode.subgoal)
             for probed in arms:
                 result += self._probe(probed, episode, step)
-            episode.set_subgoal(episode.subgoal)
+            episode.inner.subgoal = episode.subgoal
             self._policy.act([episode.inner], self._settings.flow_steps)  # banks are written where chunks are chosen
         return result
 
     def _probe(self, probed: ProbedPolicy, episode: ProbedEpisode, step: int) -> list[Line]:
-        """What an arm does at a moment; of the unprobed one, what it is compared with."""
+        """The effect of an arm at a step; of the unprobed one, the baseline."""
         arm, draws, steps = probed.arm, self._draws[step], self._settings.flow_steps
-        episode.set_subgoal(arm.say(episode.subgoal, probed.moment(episode)))
+        episode.inner.subgoal = arm.say(episode.subgoal, probed.moment(episode))
         snapshot, edited = probed.snapshot(episode, draws[0])
         if arm is UNPROBED:
             self._baseline[step] = probed.ask(episode, snapshot, [edited], draws, steps)[0]
@@ -199,12 +200,12 @@ class _Moments:
         return sum(self._recording.exec_start < frame <= step for frame in self._boundaries)
 
     def _boundary_frames(self, probed: ProbedPolicy) -> list[int]:
-        """Where sub-tasks began, among the frames as they are shown."""
+        """Where sub-tasks began, as numbers of observed frames."""
         displayed = probed.arm.feed.displayed(np.array(self._boundaries), self._recording.exec_start, probed.before)
         return sorted({int(frame) for frame in displayed if frame >= 0})
 
     def _required_frames(self, arms: Sequence[ProbedPolicy]) -> np.ndarray | None:
-        """Frames that any of these arms looks at; None for all."""
+        """Frames that any of these arms reads; None for all."""
         parts = [probed.frames_read(np.array(self._steps), self._recording.exec_start) for probed in arms]
         known = [part for part in parts if part is not None]
         return np.unique(np.concatenate(known)) if len(known) == len(parts) else None

@@ -1,183 +1,43 @@
-"""A policy under an arm of a probe: it is shown, remembers or is told something else, and is itself untouched."""
+"""A policy under an arm of a probe: its frames, its memory or its subgoal are changed, its weights are not."""
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.evaluation.feed import FedEpisode, FedPolicy
+from mme_vla.evaluation.recordings import SUBGOAL, Recording, stored_frames
 from mme_vla.policy.base import Policy
-from mme_vla.policy.capabilities import LimitsActions, SamplesInSteps, frames_read, with_vision_memory
-from mme_vla.policy.episode import Episode, Host
+from mme_vla.policy.episode import Episode
 from mme_vla.probing.arms import UNPROBED, Arm, options_of
 from mme_vla.probing.channels import Channel, MemorySnapshot, Remembered, channel_of
 from mme_vla.probing.interventions import Moment
-from mme_vla.probing.recordings import SUBGOAL, Recording, others, stored_frames
 from mme_vla.processing.prompt import subgoal_kind
 from mme_vla.types import Noise, stack_noise
 
 
-class Prober(Host, Protocol):
-    """What such an episode asks of the policy that began it."""
+class ProbedEpisode(FedEpisode):
+    """A fed episode that a probe follows.
 
-    inner: Policy
-    arm: Arm
-    sessions: list[Recording]
-
-    @property
-    def before(self) -> int: ...
-
-
-class ProbedEpisode(Episode):
-    """Shows `inner`, the policy's own episode, what the arm makes of the frames.
-
-    recording: what is shown, where it is a recorded episode. exec_start: its first execution frame, once it is there.
-    boundaries: frames, as they are shown, at which sub-tasks began, where that is known.
-    said: the subgoals that were set at each chunk so far.
+    recording: the recorded episode, if it is one. subgoals: those that were set at each chunk so far.
     """
 
-    def __init__(self, prober: Prober, goal: str, seed: int = 0) -> None:
-        super().__init__(prober, goal, seed)
-        self._prober, self.seed = prober, seed
-        self.inner = prober.inner.start_episode(goal, seed)
-        self.recording: Recording | None = None
-        self.exec_start: int | None = None
-        self.boundaries: Sequence[int] = ()
+    recording: Recording | None = None
+
+    def __init__(self, policy: "ProbedPolicy", goal: str, seed: int = 0) -> None:
+        super().__init__(policy, goal, seed)
         self.subgoals: list[str | None] = []
 
-    def observe(
-        self,
-        frames: Mapping[str, np.ndarray],
-        states: np.ndarray,
-        is_demo: bool | np.ndarray = False,
-        actions: np.ndarray | None = None,
-        rendered: Mapping[str, np.ndarray] | None = None,
-    ) -> None:
-        """Take frames as `Episode.observe` does."""
-        self.inner.goal = self.goal
-        feed, count = self._prober.arm.feed, len(states)
-        demo = np.broadcast_to(np.asarray(is_demo, bool), (count,))
-        video = int(demo.sum())
-        if not self.n_observed_frames:
-            self._show_sessions()
-        if self.exec_start is None and video < count:
-            self.exec_start = self.n_observed_frames + video
-        chunk = _Frames(frames, np.asarray(states), demo, actions, rendered, self._robot.action.frames is None)
-        if feed.video:
-            chunk.show(self.inner, 0, video)
-        pause = -1 if self.exec_start is None else self.exec_start + feed.at - self.n_observed_frames
-        if feed.stills and video <= pause < count:
-            chunk.show(self.inner, video, pause + 1)
-            chunk.hold(self.inner, pause, feed.stills)
-            video = pause + 1
-        chunk.show(self.inner, video, count)
-        self.n_observed_frames += count
 
-    def _show_sessions(self) -> None:
-        stored, before = stored_frames(self._prober.inner, self._prober.before), 0
-        for recording in self._prober.sessions:
-            here = None if stored is None else stored[stored >= before] - before
-            recording.show(self.inner, 0, recording.length, here, video=True)
-            before += recording.length
-
-    def set_subgoal(self, subgoal: str | None) -> None:
-        """Tell the policy's own episode what the arm made of the subgoal."""
-        self.inner.subgoal = subgoal
-
-    def begun(self, frames: Sequence[int], exec_start: int) -> None:
-        """Note where sub-tasks began, the execution among them, as the frames are shown."""
-        starts = np.array(sorted({0, exec_start, *frames}), np.int64)
-        displayed = self._prober.arm.feed.displayed(starts, exec_start, self._prober.before)
-        self.boundaries = [int(frame) for frame in displayed if frame >= 0]
-
-    @property
-    def state(self) -> Tensor:
-        return self.inner.state
-
-    def acted(self, chunk: np.ndarray) -> None:
-        self.inner.acted(chunk)
-
-    def add_frames(
-        self,
-        frames: np.ndarray,
-        is_demo: bool | np.ndarray = False,
-        actions: np.ndarray | None = None,
-        states: np.ndarray | None = None,
-    ) -> None:
-        """Not offered: an arm decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
-
-    def set_view(self, images: Mapping[str, np.ndarray], state: np.ndarray) -> None:
-        """Not offered: an arm decides on whole observations."""
-        raise UserError("A probed episode takes whole observations: observe(), not add_frames() and set_view().")
-
-
-class _Frames:
-    """What one `observe` was given, shown part by part."""
-
-    def __init__(
-        self,
-        frames: Mapping[str, np.ndarray],
-        states: np.ndarray,
-        demo: np.ndarray,
-        actions: np.ndarray | None,
-        rendered: Mapping[str, np.ndarray] | None,
-        motions: bool,
-    ) -> None:
-        self._frames, self._states, self._demo = frames, states, demo
-        self._actions, self._rendered, self._motions = actions, rendered, motions
-        self._video, self._has_motions = int(demo.sum()), False
-
-    def show(self, episode: Episode, start: int, stop: int) -> None:
-        """Let an episode observe frames start … stop − 1."""
-        if stop <= start:
-            return
-        views, rendered = self._views(start, stop)
-        led = self._actions
-        if led is not None and start >= self._video:
-            led = led[:0] if self._motions and self._has_motions else led
-            led = led if self._motions else led[start - self._video : stop - self._video]
-            self._has_motions = True
-        elif start < self._video:
-            led = None
-        episode.observe(views, self._states[start:stop], self._demo[start:stop], led, **rendered)
-
-    def hold(self, episode: Episode, at: int, count: int) -> None:
-        """Let an episode observe one frame `count` times more, holding the action that led to it."""
-        views, rendered = self._views(at, at + 1)
-        views = {name: np.repeat(view, count, 0) for name, view in views.items()}
-        if rendered:
-            rendered = {
-                "rendered": {
-                    n: np.arange(count) if len(views[n]) else places for n, places in rendered["rendered"].items()
-                }
-            }
-        led = self._actions
-        if led is not None:
-            led = led[:0] if self._motions else np.repeat(led[at - self._video : at - self._video + 1], count, 0)
-        episode.observe(views, np.repeat(self._states[at : at + 1], count, 0), False, led, **rendered)
-
-    def _views(self, start: int, stop: int) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        if self._rendered is None:
-            return {name: view[start:stop] for name, view in self._frames.items()}, {}
-        places = {name: np.asarray(at, np.int64) for name, at in self._rendered.items()}
-        inside = {name: (at >= start) & (at < stop) for name, at in places.items()}
-        views = {
-            name: view[inside[name]] if name in inside else view[start:stop] for name, view in self._frames.items()
-        }
-        return views, {"rendered": {name: places[name][inside[name]] - start for name in places}}
-
-
-ALIKE = 3  # of the other episodes, so many with the most similar goals lend
+ALIKE = 3  # episodes with the most similar goals among which a donor is chosen
 
 
 class DonorEpisode:
-    """A recorded episode that a policy has seen."""
+    """A recorded episode that a policy has observed, from which contents are taken."""
 
     def __init__(self, policy: Policy, channel: Channel, recording: Recording) -> None:
         self._channel, self.recording = channel, recording
@@ -196,7 +56,7 @@ class DonorEpisode:
         return store
 
     def subgoal_of(self, episode: ProbedEpisode) -> str | None:
-        """What was said there, as many execution frames in."""
+        """The subgoal there, as many execution frames in."""
         if self._said not in self.recording.source.subgoal_names:
             return None
         return self.recording.subgoal(self._step(episode), self._said)
@@ -209,7 +69,7 @@ class DonorEpisode:
         if self._episode is None:
             recording, policy = self.recording, self._policy
             running, seen = policy.start_episode(recording.goal), 0
-            # A bank is written where chunks are chosen; of stored frames any moment can be asked for afterwards.
+            # A bank is written where chunks are chosen; stored frames can be read at any step afterwards.
             stops = [] if self._channel.chooses else recording.decisions(policy.embodiment.action.execute, None)
             for stop in stops:
                 recording.show(running, seen, stop + 1)
@@ -222,14 +82,14 @@ class DonorEpisode:
 
 
 class DonorEpisodes:
-    """Who lends to whom: for each episode always the same, one of those whose goals are most alike."""
+    """The donor of each episode: always the same, one of those whose goals are most alike."""
 
     def __init__(self, policy: Policy, channel: Channel, recordings: Sequence[Recording]) -> None:
         self._policy, self._channel, self._recordings = policy, channel, list(recordings)
         self._donors: dict[str, DonorEpisode] = {}
 
     def of(self, episode: ProbedEpisode) -> DonorEpisode:
-        """Who lends to this episode."""
+        """The donor of this episode."""
         alike = others(self._recordings, episode.recording, episode.goal)[:ALIKE]
         donor = alike[int(np.random.default_rng(episode.seed).integers(len(alike)))]
         if donor.name not in self._donors:
@@ -237,8 +97,19 @@ class DonorEpisodes:
         return self._donors[donor.name]
 
 
-class ProbedPolicy(Policy):
-    """`inner` under an arm. It evaluates and rolls out as any policy does; its noise is that of the unprobed one."""
+def others(recordings: Sequence[Recording], exclude: Recording | None, goal: str) -> list[Recording]:
+    """The other episodes, those whose goals have the most words in common first."""
+    words = set(goal.split())
+
+    def unlike(recording: Recording) -> float:
+        their = set(recording.goal.split())
+        return 1 - len(words & their) / max(len(words | their), 1)
+
+    return sorted((recording for recording in recordings if recording != exclude), key=unlike)
+
+
+class ProbedPolicy(FedPolicy):
+    """`inner` under an arm."""
 
     def __init__(
         self,
@@ -246,81 +117,43 @@ class ProbedPolicy(Policy):
         arm: Arm = UNPROBED,
         sessions: Sequence[Recording] = (),
         donors: DonorEpisodes | None = None,
-        of_split: bool = False,
     ) -> None:
-        """Stand before a policy.
+        """Wrap a policy.
 
         Args:
-            sessions: what is shown before each episode, as far as the arm asks for it.
-            donors: other episodes to take from. of_split: the sessions are those of a stress split.
+            sessions: recorded episodes to observe before each, as many as the arm needs. donors: to take contents from.
         """
-        super().__init__()
-        self.inner, self.arm, self.channel = inner, arm, channel_of(inner)
-        self.memory, self.processor = inner.memory, inner.processor
-        self.config = {**inner.config, **({"probe": [arm.name, options_of(arm)]} if arm.parts else {})}
-        self.horizon, self.action_dim = inner.horizon, inner.action_dim
-        self.sample_steps = inner.sample_steps if isinstance(inner, SamplesInSteps) else 1
-        self.max_actions = inner.max_actions if isinstance(inner, LimitsActions) else None
-        self.sessions, self.donors = list(sessions)[: arm.feed.sessions], donors
-        self.n_distractor_episodes = len(self.sessions) if of_split else 0  # those of an arm are the probe's own
-
-    @property
-    def before(self) -> int:
-        """Frames of the sessions."""
-        return sum(recording.length for recording in self.sessions)
+        super().__init__(inner, arm.feed, sessions)
+        self.arm, self.channel, self.donors = arm, channel_of(inner), donors
+        if arm.parts:
+            self.config["probe"] = [arm.name, options_of(arm)]
 
     def start_episode(self, goal: str, seed: int = 0) -> ProbedEpisode:
-        """Begin an episode, with the sessions that come before it."""
         return ProbedEpisode(self, goal, seed)
 
-    def sampling_noise(self, generator: torch.Generator) -> Noise:
-        return self.inner.sampling_noise(generator)
-
-    def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
-        return self.inner.sample_actions(batch, draws, steps)
-
-    @property
-    def history_dtype(self) -> torch.dtype:
-        return with_vision_memory(self.inner).history_dtype
-
-    def require_memory(self) -> Memory:
-        return with_vision_memory(self.inner).require_memory()
-
-    def vision_fingerprint(self) -> str:
-        return with_vision_memory(self.inner).vision_fingerprint()
-
-    def encode_frames(self, frames: np.ndarray) -> Tensor:
-        return with_vision_memory(self.inner).encode_frames(frames)
-
     def frames_read(self, steps: np.ndarray, exec_start: int) -> np.ndarray | None:
-        """The episode's own frames that are looked at, through what the arm makes of them."""
-        feed, before = self.arm.feed, self.before
-        displayed = feed.displayed(steps, exec_start, before)
-        reads = frames_read(self.inner, displayed, feed.first_executed(exec_start, before))
-        if reads is None:
-            return None
-        if "choice" in self.arm.needs and len(displayed):  # which frames are left to choose from, only then is known
-            stored = stored_frames(self.inner, int(displayed.max()) + 1)
-            reads = reads if stored is None else np.union1d(reads, stored)
-        paused = [exec_start + feed.at] if feed.stills else []
-        return np.union1d(feed.source_frames(reads, exec_start, before), np.array(paused, np.int64))
+        reads = super().frames_read(steps, exec_start)
+        if reads is None or not len(steps) or "choice" not in self.arm.needs:
+            return reads
+        # Which frames are left to choose from is known only then.
+        displayed = self.feed.displayed(steps, exec_start, self.before)
+        stored = stored_frames(self.inner, int(displayed.max()) + 1)
+        return reads if stored is None else np.union1d(reads, self.feed.source_frames(stored, exec_start, self.before))
 
     def observation(self, episodes: Sequence[Episode]) -> Any:
         for episode in map(_probed, episodes):
             episode.subgoals.append(episode.subgoal)
-            episode.set_subgoal(self.arm.say(episode.subgoal, self.moment(episode)))
+            episode.inner.subgoal = self.arm.say(episode.subgoal, self.moment(episode))
         return self.inner.observation([_probed(episode).inner for episode in episodes])
 
     def answer(
         self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        mine = [_probed(episode) for episode in episodes]
         if not self.arm.edits:
-            return self.inner.answer(batch, [episode.inner for episode in mine], draws, steps)
-        remembering = []
+            return super().answer(batch, episodes, draws, steps)
+        mine, remembering = [_probed(episode) for episode in episodes], []
         for i, episode in enumerate(mine):
-            sampled = {name: value[i] for name, value in draws.items()}
-            snapshot, stores = self.snapshot(episode, sampled)
+            snapshot, stores = self.snapshot(episode, {name: value[i] for name, value in draws.items()})
             remembering.append(self.channel.counterfactual(episode.inner, snapshot, stores))
         chunk = self.channel.answer(batch, remembering, draws, steps)
         for episode, its in zip(mine, remembering, strict=True):

@@ -3,21 +3,21 @@
 import base64
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.evaluation.results.compare import Comparison
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, INK, figure, legend, svg
-from mme_vla.evaluation.results.report import document, html_table, pair, section
+from mme_vla.evaluation.results.report import Section, html_page
 from mme_vla.evaluation.results.tables import Table, comparison_table, to_markdown
 from mme_vla.probing.lines import EntryLine, Line, MomentLine
-from mme_vla.probing.recordings import Recording
 from mme_vla.utils import write_atomically
 from mme_vla.utils.media import Tile, contact_sheet
+from mme_vla.utils.pages import render
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -37,9 +37,9 @@ AGES = (0, 16, 32, 64, 128, 256, 512)
 
 @dataclass(frozen=True)
 class Effect:
-    """What an arm, or an entry, did over some moments.
+    """The effect of an arm, or an entry, over some steps.
 
-    change, spread, distance: means, as in `Change`. beyond: share of moments at which the change exceeds the spread.
+    change, spread, distance: means, as in `Change`. beyond: share of steps at which the change exceeds the spread.
     """
 
     moments: int
@@ -110,7 +110,7 @@ class Findings:
         return sum(entry.change for entry in self.entries if entry.video) / total if total > 0 else None
 
     def matters_most(self) -> dict[str, list[EntryLine]]:
-        """For each task the moment at which a single entry mattered most: all entries of that moment."""
+        """For each task the step at which a single entry mattered most: all entries of that step."""
         strongest: dict[str, list[EntryLine]] = {}
         moments = _grouped(self.entries, lambda e: (e.task, e.recording, e.step))
         for (task, *_), lines in moments.items():
@@ -134,7 +134,7 @@ def show(effect_of: Effect | None) -> str:
 
 
 def arms_table(findings: Findings) -> Table:
-    """Every arm over all moments."""
+    """Every arm over all steps."""
     rows = []
     for name, effect_of in findings.arms().items():
         lines = [line for line in findings.moments if line.arm == name]
@@ -232,10 +232,10 @@ UNITS = (
 
 
 def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image":
-    """The frames remembered at a moment, each with its age and how the chunk changes without it; the current one last.
+    """The frames remembered at a step, each with its age and how the chunk changes without it; the current one last.
 
     Args:
-        lines: of one moment. recording: of which they are.
+        lines: of one step. recording: theirs.
     """
     step, tiles = lines[0].step, []
     for line in sorted(lines, key=lambda line: line.time):
@@ -247,7 +247,7 @@ def remembered_image(lines: Sequence[EntryLine], recording: Recording) -> "Image
 
 
 def write_images(findings: Findings, recordings: Sequence[Recording], folder: Path) -> list[Path]:
-    """Draw the moment of each task at which an entry mattered most; entries that are frames alone."""
+    """Render the step of each task at which an entry mattered most; entries that are frames alone."""
     by_name = {recording.name: recording for recording in recordings}
     paths = []
     for task, lines in findings.matters_most().items():
@@ -268,34 +268,29 @@ def write_page(
     folder: Path, name: str, findings: Findings, comparisons: Sequence[Comparison] = (), notes: Sequence[str] = ()
 ) -> Path:
     """Write `page.html` and `table.md` into the probe's folder."""
-    parts = [f"<h1>What {escape(name)} takes from its memory</h1>"]
-    texts = [f"# What {name} takes from its memory", ""]
-    if notes:
-        parts.append("<div class=note>" + "".join(f"<p>{escape(note)}</p>" for note in notes) + "</div>")
+    sections, tables = [], []
     if findings.moments:
         tables = [checkpoints_table({name: findings}), arms_table(findings), phases_table(findings)]
-        parts.append(section("In short", html_table(tables[0]), UNITS))
-        parts.append(section("Interventions", effects(findings)))
-        curves = [(f"Over the dial: {dial}", figure, "Dashed: the policy's own spread.")
-                  for dial, figure in dials(findings).items()]  # fmt: skip
+        curves = [(f"Over the dial: {dial}", curve, "Dashed: the policy's own spread.")
+                  for dial, curve in dials(findings).items()]  # fmt: skip
         if findings.entries:
             curves.insert(0, ("Decay with distance", decay(findings), "Each entry left out by itself."))
-        parts += [pair(*curves[i : i + 2]) if i + 1 < len(curves) else section(*curves[i])
-                  for i in range(0, len(curves), 2)]  # fmt: skip
-        parts += [section(table.title, html_table(table)) for table in tables[1:]]
-        texts += [to_markdown(table) for table in tables]
-    figure = sorted((folder / IMAGES).glob("*.png"))
-    if figure:
-        parts.append(section("What was remembered", "".join(map(_embedded, figure)),
-                             "The moment of each task at which a single entry mattered most."))  # fmt: skip
+        sections += [Section("In short", tables=tables[:1], caption=UNITS), Section("Interventions", effects(findings))]
+        sections += [Section(title, curve, caption=caption, half=i < len(curves) - len(curves) % 2)
+                     for i, (title, curve, caption) in enumerate(curves)]  # fmt: skip
+        sections += [Section(table.title, tables=[table]) for table in tables[1:]]
+    if images := [(path.stem, _encoded(path)) for path in sorted((folder / IMAGES).glob("*.png"))]:
+        caption = "The step of each task at which a single entry mattered most."
+        sections.append(Section("What was remembered", images=images, caption=caption))
+    verdicts = [comparison.verdict for comparison in comparisons]
     if comparisons:
-        table = comparison_table(comparisons)
-        parts.append(section("In closed loop", html_table(table), "; ".join(c.verdict for c in comparisons) + "."))
-        texts += [to_markdown(table), *(f"- {comparison.verdict}" for comparison in comparisons)]
-    texts += [f"- {note}" for note in notes]
-    for file, text in ((PAGE, document(f"Probe of {name}", parts)), (TABLE, "\n".join(texts) + "\n")):
+        tables.append(comparison_table(comparisons))
+        sections.append(Section("In closed loop", tables=tables[-1:], caption="; ".join(verdicts) + "."))
+    page = html_page(f"What {name} takes from its memory", sections, notes=notes)
+    text = render("probe.md", name=name, tables=map(to_markdown, tables), verdicts=verdicts, notes=notes)
+    for file, content in ((PAGE, page), (TABLE, text)):
         with write_atomically(folder / file) as draft:
-            draft.write_text(text, encoding="utf-8")
+            draft.write_text(content, encoding="utf-8")
     return folder / PAGE
 
 
@@ -304,11 +299,11 @@ def table_of(findings: Mapping[str, Findings]) -> str:
     return to_markdown(checkpoints_table(dict(findings)))
 
 
-def _embedded(path: Path) -> str:
+def _encoded(path: Path) -> str:
+    """An image as WEBP in base64."""
     from PIL import Image
 
     out = BytesIO()
     with Image.open(path) as image:
         image.save(out, format="WEBP", quality=80)
-    data = base64.b64encode(out.getvalue()).decode()
-    return f'<img style="max-width:100%" alt="{escape(path.stem)}" src="data:image/webp;base64,{data}">'
+    return base64.b64encode(out.getvalue()).decode()

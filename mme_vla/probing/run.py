@@ -1,8 +1,8 @@
-"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it continues where it was."""
+"""A whole probe: on recorded episodes, in closed loop, and the page about both. Repeated, it resumes."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +12,26 @@ from mme_vla.envs.make import make_env, require_simulator
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError, did_you_mean
 from mme_vla.evaluation.api import load
-from mme_vla.evaluation.results.compare import Comparison
-from mme_vla.evaluation.rollout.evaluation import Shard, checkpoint_label, choose_episodes, memory_budget
+from mme_vla.evaluation.recordings import Recording, all_recordings
+from mme_vla.evaluation.records import EpisodeRecord
+from mme_vla.evaluation.results.aggregate import aggregate
+from mme_vla.evaluation.results.compare import Comparison, common_episodes, compare_all
+from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.evaluation import Shard, checkpoint_label, choose_episodes, evaluate, memory_budget
 from mme_vla.evaluation.rollout.runner import RunFacts
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.evaluation.store import claim_run, fingerprint
+from mme_vla.evaluation.store import claim_run, find_records, fingerprint, read_folders
 from mme_vla.policy.base import Policy
 from mme_vla.probing import lines
-from mme_vla.probing.arms import Arm, choose_arms, options_of
+from mme_vla.probing.arms import UNPROBED, Arm, choose_arms, options_of, slug
 from mme_vla.probing.channels import channel_of
 from mme_vla.probing.offline import OfflineSettings, probe_offline
-from mme_vla.probing.online import online_records, paired, probe_online
-from mme_vla.probing.recordings import Recording, all_recordings
+from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.probing.report import Findings, write_images, write_page
 from mme_vla.subgoal import SubgoalPredictor, build_predictor
 
-OFFLINE = "offline"
+OFFLINE, ONLINE = "offline", "online"
+"""Folders of the lines and of the closed loop."""
 NO_DATA = (
     "A probe on recorded episodes needs some: recordings=<dataset>. Those of the benchmark are made by "
     "`mme-vla record tasks=… episodes=0-9 split=val output=<new folder>`; offline=false online=true "
@@ -39,7 +43,7 @@ NO_DATA = (
 class ProbePlan:
     """What is probed.
 
-    arms: as `with` says them; None for the usual ones. recordings: episodes to probe; lend: to take from.
+    arms: as in `with`; None for `DEFAULT_ARMS`. recordings: episodes to probe; lend: to take from.
     jobs: episodes of the closed loop, none for none. source: where the weights are from.
     """
 
@@ -54,7 +58,7 @@ class ProbePlan:
 
 @dataclass(frozen=True)
 class Probe:
-    """What a probe found. notes: what a reader has to know, such as arms that were left out."""
+    """The results of a probe. notes: what a reader has to know, such as arms that were left out."""
 
     findings: Findings
     comparisons: list[Comparison]
@@ -73,45 +77,43 @@ def run_probe(
     base: Callable[..., Any] = make_env,
     show_progress: bool = True,
 ) -> Probe:
-    """Do what is asked for and is not there, and write the page."""
-    notes: list[str] = []
+    """Run the parts of the plan that the folder lacks, and write the page."""
+    channel, notes = channel_of(policy), list[str]()
     if plan.recordings:
-        notes += _on_recordings(policy, plan, folder / OFFLINE, facts, show_progress)
+        has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
+        names = {recording.name for recording in plan.lend}
+        n_donors = len(names) - any(recording.name in names for recording in plan.recordings)  # never the probed one
+        arms, notes = choose_arms(plan.arms, policy, channel, n_donors, boundaries=has_boundaries)
+        _on_recordings(policy, arms, plan, folder / OFFLINE, facts, show_progress)
     if plan.jobs:
         has_boundaries = base is make_env and settings.env == "mme_vla"
-        arms, left_out = choose_arms(plan.arms, policy, channel_of(policy), len(plan.lend), boundaries=has_boundaries)
+        arms, left_out = choose_arms(plan.arms, policy, channel, len(plan.lend), boundaries=has_boundaries)
         notes += [f"In closed loop {note}" for note in left_out if note not in notes]
-        probe_online(
-            policy, arms, plan.jobs, folder, facts, settings, lend=plan.lend, subgoals=subgoals,
-            shard=plan.shard, source=plan.source, base=base, show_progress=show_progress,
-        )  # fmt: skip
+        donors = DonorEpisodes(policy, channel, plan.lend) if plan.lend else None
+        for arm in [UNPROBED, *arms]:
+            probed = policy if arm is UNPROBED else ProbedPolicy(policy, arm, plan.lend, donors).eval()
+            evaluate(
+                probed, plan.jobs, folder / ONLINE / slug(arm.name), replace(facts, model=named(facts.model, arm)),
+                settings, subgoals=subgoals, shard=plan.shard, source=plan.source, base=base,
+                notes={"arm": arm.name}, show_progress=show_progress,
+            )  # fmt: skip
     findings = Findings.of(lines.read_all(folder / OFFLINE))
-    comparisons = paired(online_records(folder), facts.split, facts.model)
+    records = read_folders(find_records([folder / ONLINE])) if (folder / ONLINE).is_dir() else []
+    comparisons = _paired(records, facts.split, facts.model)
     write_images(findings, plan.recordings, folder)
     return Probe(findings, comparisons, notes, write_page(folder, facts.model, findings, comparisons, notes))
 
 
-def _on_recordings(policy: Policy, plan: ProbePlan, folder: Path, facts: RunFacts, show_progress: bool) -> list[str]:
+def _on_recordings(
+    policy: Policy, arms: Sequence[Arm], plan: ProbePlan, folder: Path, facts: RunFacts, show_progress: bool
+) -> None:
     policy.require_processor().require_stats()
-    has_boundaries = all(recording.tells_subtasks for recording in plan.recordings)
-    arms, notes = choose_arms(plan.arms, policy, channel_of(policy), _to_take_from(plan), boundaries=has_boundaries)
     claim_run(folder, _settings(policy, plan, facts, arms))
     shard = plan.shard
-    mine = list(plan.recordings)[shard.index :: shard.count]
-    name = "offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl"
-    with progress("probe", len(mine), unit="episodes") if show_progress else nullcontext(_silent) as advance:
-        probe_offline(policy, arms, mine, plan.lend, folder / name, plan.offline, advance)
-    return notes
-
-
-def _silent(steps: int) -> None:
-    """Nobody is told."""
-
-
-def _to_take_from(plan: ProbePlan) -> int:
-    """Recorded episodes that are there for every one that is probed: not itself."""
-    names = {recording.name for recording in plan.lend}
-    return len(names) - any(recording.name in names for recording in plan.recordings)
+    local = list(plan.recordings)[shard.index :: shard.count]
+    path = folder / ("offline.jsonl" if shard.count == 1 else f"offline-{shard.index}of{shard.count}.jsonl")
+    with progress("probe", len(local), unit="episodes") if show_progress else nullcontext(lambda _: None) as advance:
+        probe_offline(policy, arms, local, plan.lend, path, plan.offline, advance)
 
 
 def _settings(policy: Policy, plan: ProbePlan, facts: RunFacts, arms: Sequence[Arm]) -> dict[str, Any]:
@@ -153,7 +155,7 @@ def probe(
     show_progress: bool = True,
     **settings: Any,
 ) -> Probe:
-    """Ask what a policy takes from its memory; what `output` holds already is not asked again.
+    """Measure what a policy takes from its memory; what `output` holds already is not run again.
 
     Args:
         policy: one with statistics; or a folder or hub repository to load one from.
@@ -161,8 +163,8 @@ def probe(
         arms: interventions, such as `["shuffle", "drop:2", "nodemo+delay:64"]`; by default all that are possible.
         output: the probe's folder, for its lines and its page.
         tasks, episodes: of the closed loop, as for `evaluate`; None leaves it out.
-        seed: of noise and of what is drawn at random.
-        draws: chunks sampled at each moment. moments: most of an episode.
+        seed: of noise and of random choices.
+        draws: chunks sampled at each step. moments: most steps of an episode.
         subgoal: a predictor, or the name of one, for policies that read subgoals in closed loop.
         name: what lines and records call the policy. base: makes an environment with the benchmark's interface.
         show_progress: whether a progress bar is shown. settings: of `RolloutSettings`, such as `workers=2`.
@@ -196,3 +198,25 @@ def probe(
     return run_probe(
         loaded.eval(), plan, folder, facts, run_settings, subgoals=predictor, base=base, show_progress=show_progress
     )
+
+
+def named(model: str, arm: Arm) -> str:
+    """What records call a model under an arm; unprobed it keeps its name."""
+    return model if arm is UNPROBED else f"{model} · {arm.name}"
+
+
+def _paired(records: Sequence[EpisodeRecord], split: str, model: str) -> list[Comparison]:
+    """Each arm against the unprobed run, over the episodes that both have, corrected for their number.
+
+    Args:
+        model: the unprobed one's name.
+    """
+    tasks = tuple(dict.fromkeys(record.task for record in records))
+    if not tasks:
+        return []
+    protocol = Protocol(tasks, episodes=1 + max(record.episode for record in records))
+    methods = aggregate(records, protocol, split).methods
+    baseline = next((method for method in methods if method.model == model), None)
+    if baseline is None:
+        return []
+    return compare_all([(m, baseline) for m in methods if m is not baseline and common_episodes(m, baseline)], protocol)

@@ -428,7 +428,7 @@ def remove_drafts(folder: Path) -> None:
     """Remove the drafts in a folder whose writers, processes of this machine, were killed."""
     for path in folder.glob(".*.partial"):
         draft = _DRAFT.fullmatch(path.name)
-        if draft is not None and draft["host"] == _host() and not _lives(int(draft["process"])):
+        if draft is not None and draft["host"] == _host() and not is_alive(int(draft["process"])):
             path.unlink(missing_ok=True)
 
 
@@ -436,7 +436,8 @@ def _host() -> str:
     return socket.gethostname().partition(".")[0]
 
 
-def _lives(process: int) -> bool:
+def is_alive(process: int) -> bool:
+    """Whether a process of this machine runs."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

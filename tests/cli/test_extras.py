@@ -4,7 +4,6 @@ Which packages those are follows from pyproject.toml and from what is installed.
 and the words that install it.
 """
 
-import json
 import os
 import re
 import subprocess

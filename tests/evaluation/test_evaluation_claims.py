@@ -1,6 +1,6 @@
-"""Episodes that processes share: taken one by one, longest first, and again when whoever had them is gone."""
+"""Episodes that processes share: each taken once, the longest first, and again after a process was killed."""
 
-import json
+import errno
 import subprocess
 import sys
 from pathlib import Path
@@ -9,13 +9,15 @@ import pytest
 
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
-from mme_vla.evaluation.forecast import Durations, earlier_records
+from mme_vla.evaluation import store
 from mme_vla.evaluation.records import EpisodeRecord, Seconds
 from mme_vla.evaluation.results.aggregate import aggregate
 from mme_vla.evaluation.results.compare import compare
 from mme_vla.evaluation.results.scopes import Protocol
+from mme_vla.evaluation.rollout.progress import Durations, earlier_records
 from mme_vla.evaluation.rollout.runner import Waiting
-from mme_vla.evaluation.store import CLAIMS, Claims, RecordLog
+from mme_vla.evaluation.store import Claims, RecordLog
+from mme_vla.utils import write_json
 
 JOBS = [Job("BinFill", "test", i) for i in range(4)]
 
@@ -55,7 +57,7 @@ def test_each_episode_is_taken_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_killed_process_had_not_finished_is_taken_again(tmp_path: Path) -> None:
+def test_unfinished_episodes_of_a_killed_process_are_taken_again(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", TAKE_TWO, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -64,23 +66,80 @@ def test_what_a_killed_process_had_not_finished_is_taken_again(tmp_path: Path) -
     other = "episodes-1of2.jsonl"
     with RecordLog(tmp_path / other):
         claims = Claims(tmp_path, other)
-        assert taken(claims.take(JOBS)) == 2  # the process is alive: 0 and 1 are its own
+        assert taken(claims.take(JOBS)) == 2  # the process is alive and holds 0 and 1
         process.kill()
         process.communicate()
-        with (tmp_path / CLAIMS).open("a") as file:
-            file.write('{"by": "half')  # as if it had been writing
-        assert [taken(claims.take(JOBS)) for _ in range(3)] == [1, 3, None]  # 0 it had finished
-        with RecordLog(tmp_path / "episodes-0of2.jsonl"):  # begun again, under its old name
+        assert [taken(claims.take(JOBS)) for _ in range(3)] == [1, 3, None]  # it had finished 0
+        with RecordLog(tmp_path / "episodes-0of2.jsonl"):  # restarted under its old name
             again = Claims(tmp_path, "episodes-0of2.jsonl")
             assert again.take(JOBS) is None
 
 
-def test_a_damaged_file_of_claims_is_named(tmp_path: Path) -> None:
-    Claims(tmp_path, "episodes-0of2.jsonl")
-    with (tmp_path / CLAIMS).open("a") as file:
-        file.write(json.dumps({"by": "nobody", "task": "BinFill", "episode": 0}) + "\n")
-    with pytest.raises(UserError, match=r"claims\.jsonl is damaged"):
-        Claims(tmp_path, "episodes-1of2.jsonl")
+def test_a_restarted_process_gives_back_its_unfinished_episodes(tmp_path: Path) -> None:
+    names = [f"episodes-{i}of2.jsonl" for i in range(2)]
+    with RecordLog(tmp_path / names[0]) as log:
+        before = Claims(tmp_path, names[0])
+        assert [taken(before.take(JOBS)) for _ in range(2)] == [0, 1]
+        log.append(record(0))
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        Claims(tmp_path, names[0])
+        other = Claims(tmp_path, names[1])
+        assert [taken(other.take(JOBS)) for _ in range(2)] == [1, 2]
+
+
+def test_one_of_two_processes_takes_over_a_stale_claim(tmp_path: Path) -> None:
+    with RecordLog(tmp_path / "episodes-0of3.jsonl"):
+        Claims(tmp_path, "episodes-0of3.jsonl").take(JOBS[:1])
+    names = [f"episodes-{i}of3.jsonl" for i in (1, 2)]
+    with RecordLog(tmp_path / names[0]), RecordLog(tmp_path / names[1]):
+        first, second = (Claims(tmp_path, name) for name in names)  # both have read the stale claim
+        assert [taken(claims.take(JOBS[:1])) for claims in (first, second)] == [0, None]
+
+
+@pytest.mark.parametrize(("process", "holds"), [(1, True), (2**22 + 1, False)])
+def test_without_locks_the_process_number_decides(
+    process: int, holds: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_locks(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(store.fcntl, "flock", no_locks)
+    (tmp_path / "episodes-0of2.jsonl").touch()
+    write_json(tmp_path / "claims" / "BinFill-0.0.json", vars(store.Claim("episodes-0of2.jsonl", process=process)))
+    assert (Claims(tmp_path, "episodes-1of2.jsonl").take(JOBS[:1]) is None) == holds
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "", "{", "[]", "{}", '{"records": 7, "host": "a", "process": 1}', "\x00",
+        '{"records": "../episodes.jsonl", "host": "a", "process": 1}',
+        '{"records": "/etc/passwd", "host": "a", "process": 1}',
+        '{"records": null, "host": "a", "process": 0}', '{"records": null, "host": "a", "process": true}',
+        '{"records": null, "host": "a", "process": 1, "more": 1}',
+    ],
+)  # fmt: skip
+def test_a_damaged_claim_is_named(content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "_await_content", lambda path: None)
+    joined = Claims(tmp_path, "episodes-0of2.jsonl")
+    path = tmp_path / "claims" / "BinFill-0.0.json"
+    path.parent.mkdir()
+    path.write_text(content)
+    for read in (lambda: Claims(tmp_path, "episodes-1of2.jsonl"), lambda: joined.take(JOBS)):
+        with pytest.raises(UserError, match=r"claims/BinFill-0\.0\.json is damaged.*Remove the folder"):
+            read()
+
+
+def test_a_folder_in_place_of_a_claim_is_named(tmp_path: Path) -> None:
+    (tmp_path / "claims" / "BinFill-0.0.json").mkdir(parents=True)
+    with pytest.raises(UserError, match=r"BinFill-0\.0\.json is damaged"):
+        Claims(tmp_path, "episodes-0of2.jsonl")
+
+
+def test_claims_of_earlier_versions_are_ignored(tmp_path: Path) -> None:
+    (tmp_path / "claims.jsonl").write_text("anything")
+    with RecordLog(tmp_path / "episodes-0of2.jsonl"):
+        assert taken(Claims(tmp_path, "episodes-0of2.jsonl").take(JOBS)) == 0
 
 
 def test_episodes_that_took_longest_begin_first() -> None:

@@ -26,10 +26,9 @@ from mme_vla.evaluation.results.aggregate import (
     wilson,
 )
 from mme_vla.evaluation.results.compare import compare, compare_all
-from mme_vla.evaluation.results.demo import demo_records
-from mme_vla.evaluation.results.paper import chunk_flops
+from mme_vla.evaluation.results.paper import chunk_flops, demo_records
+from mme_vla.evaluation.results.report import policy_facts, training_details
 from mme_vla.evaluation.results.scopes import GROUPS, PAPER_ORDER, SUITES, TASK_FACTS, TASK_NAMES, Protocol, tasks_of
-from mme_vla.evaluation.results.submission import policy_facts, training_details
 from mme_vla.evaluation.results.tables import Table, leaderboard, overview, to_csv, to_latex, to_markdown
 from mme_vla.evaluation.store import RecordLog, claim_run
 from mme_vla.testing.small import ALL_BEYOND, ALL_MODELS

@@ -9,13 +9,11 @@ from torch import Tensor
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import make_far_env
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
-from mme_vla.envs.vector.pool import Job
+from mme_vla.evaluation.recordings import Recording
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing.arms import Arm, read_arm, read_arms
 from mme_vla.probing.lines import Line
 from mme_vla.probing.offline import OfflineSettings, probe_offline
-from mme_vla.probing.probed import ProbedPolicy
-from mme_vla.probing.recordings import Recording
 
 SIDE = 64
 
@@ -42,7 +40,7 @@ class MadeUpSource:
     def decisions(self, episode: int) -> range:
         return range(int(self.exec_starts[episode]), int(self.lengths[episode]))
 
-    def drawn(self, episode: int) -> np.ndarray:
+    def rendered(self, episode: int) -> np.ndarray:
         return np.ones(self.lengths[episode], bool)
 
     def subgoals(self, episode: int, step: int) -> dict[str, str]:

@@ -23,13 +23,13 @@ from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
+from mme_vla.evaluation.recordings import all_recordings
 from mme_vla.evaluation.results.paper import average, counted, paper_method
 from mme_vla.policy.base import Policy
 from mme_vla.probing import lines
 from mme_vla.probing.arms import read_arms
 from mme_vla.probing.lines import MomentLine
 from mme_vla.probing.offline import OfflineSettings, probe_offline
-from mme_vla.probing.recordings import all_recordings
 
 SIDE, POSE = 64, np.array([[0, -1, 0, 0.0], [-1, 0, 0, 0.0], [0, 0, -1, 1.0]], np.float32)
 LLAMA = [*TOWERS, "backbone.vlm.depth=1", "backbone.vlm.width=32", "backbone.vlm.mlp_dim=32"]

@@ -1,5 +1,7 @@
 """A probe finds what a policy reads in its memory, and nothing where it reads nothing."""
 
+import json
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from helpers.rollout_fakes import quick_policy
 from mme_vla.errors import UserError
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.probing.channels import channel_of
-from mme_vla.probing.lines import EntryLine, MomentLine
+from mme_vla.probing.lines import EntryLine, MomentLine, append, read
 from mme_vla.probing.offline import compare_chunks
 from mme_vla.probing.probed import ProbedPolicy
 from mme_vla.probing.report import Findings
@@ -124,10 +126,36 @@ def test_what_is_done_is_not_done_again_and_a_torn_line_is_done_anew(tmp_path: P
     path = tmp_path / "offline.jsonl"
     whole = path.read_bytes()
     assert probed(reader(2), ["shuffle"], tmp_path, count=2) == lines and path.read_bytes() == whole
-    path.write_bytes(whole[:-60])
-    with pytest.warns(UserWarning, match="half-written"):
-        again = probed(reader(2), ["shuffle"], tmp_path, count=2)
-    assert again == lines
+    for cut in (100, 1):  # within the last line, and its end alone
+        path.write_bytes(whole[:-cut])
+        with pytest.warns(UserWarning, match="half-written") if cut > 1 else nullcontext():
+            assert probed(reader(2), ["shuffle"], tmp_path, count=2) == lines
+    append(path, [], "another")
+    assert read(path) == (lines, {"made-up/0", "made-up/1", "another"})
+
+
+def test_a_damaged_line_of_a_probe_is_named(tmp_path: Path) -> None:
+    probed(reader(2), ["shuffle"], tmp_path)
+    path = tmp_path / "offline.jsonl"
+    first, *others = path.read_text().splitlines(keepends=True)
+    row = json.loads(first)
+    for changed in ({"change": row["change"] + 1}, {"step": row["step"] + 1}):
+        path.write_text(json.dumps(row | changed) + "\n" + "".join(others))
+        with pytest.raises(
+            UserError, match=r"offline\.jsonl, line 1, is not a line of a probe: .*not what was written"
+        ):
+            read(path)
+    del row["crc32"]
+    path.write_text(json.dumps(row) + "\n" + "".join(others))  # as earlier versions wrote it
+    assert len(read(path)[0]) == len(others)
+    for changed in ({"change": {"a": 1}}, {"step": "x"}, {"step": True}, {"kind": "other"}, {"more": 1}):
+        path.write_text(json.dumps(row | changed) + "\n" + "".join(others))
+        with pytest.raises(UserError, match="line 1, is not a line of a probe"):
+            read(path)
+    for line in ('{"kind": "done"}', '{"kind": "done", "recording": 7}', "[]"):
+        path.write_text(line + "\n")
+        with pytest.raises(UserError, match="line 1, is not a line of a probe"):
+            read(path)
 
 
 def test_a_change_is_measured_against_the_noise_of_the_same_policy() -> None:

@@ -10,11 +10,11 @@ from helpers.probe_fakes import made_up
 from helpers.rollout_fakes import quick_policy
 from mme_vla import build_policy
 from mme_vla.errors import UserError
+from mme_vla.evaluation.feed import Feed
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.methods.sam2act.sam2 import BankState
 from mme_vla.probing.arms import UNPROBED, choose_arms, read_arm
 from mme_vla.probing.channels import channel_of
-from mme_vla.probing.interventions import Feed
 from mme_vla.probing.probed import DonorEpisodes, ProbedPolicy
 from mme_vla.testing.small import unit_stats
 

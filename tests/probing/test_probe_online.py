@@ -13,9 +13,8 @@ from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.probing.arms import read_arm
 from mme_vla.probing.lines import LINES
 from mme_vla.probing.offline import OfflineSettings
-from mme_vla.probing.online import named
 from mme_vla.probing.report import Findings, table_of
-from mme_vla.probing.run import Probe, ProbePlan, probed_folder, run_probe
+from mme_vla.probing.run import Probe, ProbePlan, named, probed_folder, run_probe
 
 
 @pytest.mark.parametrize("name", ["framesamp_modul", "tokendrop_expert", "ttt_context"])

@@ -8,12 +8,11 @@ arrive as stored tokens, as they do in training; what the vision tower spends on
 own.
 """
 
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor, nn
-from torch.utils._python_dispatch import TorchDispatchMode
+from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from mme_vla.config.composition import compose, config_dir
@@ -23,45 +22,6 @@ from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_policy
 from mme_vla.policy.capabilities import CountsCost
-
-
-class RememberedShapes(TorchDispatchMode):
-    """While entered, an operation on meta tensors that was asked before with such tensors gives its result at once.
-
-    Only results that are new tensors, one each; views and changes in place are made as ever.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._known: dict[Hashable, tuple[Any, ...]] = {}
-
-    def __torch_dispatch__(
-        self, func: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
-        kwargs = kwargs or {}
-        if any(result.alias_info is not None for result in func._schema.returns):
-            return func(*args, **kwargs)
-        signature = (func, _about(args), tuple((name, _about(value)) for name, value in kwargs.items()))
-        try:
-            known = self._known.get(signature)
-        except TypeError:  # something that has no hash
-            return func(*args, **kwargs)
-        if known is not None:
-            size, stride, dtype = known
-            return torch.empty_strided(size, stride, dtype=dtype, device="meta")
-        result = func(*args, **kwargs)
-        if isinstance(result, Tensor) and type(result) is Tensor and result.device.type == "meta":
-            self._known[signature] = (result.shape, result.stride(), result.dtype)
-        return result
-
-
-def _about(value: Any) -> Hashable:
-    """All of an argument that shapes depend on; numbers with their kind, as 1, 1.0 and True are equal."""
-    if isinstance(value, Tensor):
-        return value.shape, value.stride(), value.dtype, value.device
-    if isinstance(value, tuple | list):
-        return tuple(map(_about, value))
-    return type(value), value
 
 
 def count_model(model: str, budget: int | None = None, backbone: str | None = None) -> ModelCost:
@@ -88,7 +48,7 @@ def count_model(model: str, budget: int | None = None, backbone: str | None = No
 
 def flops(work: Callable[[], object]) -> int:
     """FLOPs of a call, forward only."""
-    with torch.no_grad(), RememberedShapes(), FlopCounterMode(display=False) as counter:
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
         work()
     return counter.get_total_flops()
 

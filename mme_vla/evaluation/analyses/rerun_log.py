@@ -1,4 +1,4 @@
-"""Episodes for the Rerun viewer: images, numbers and words over the steps, in one `.rrd` file."""
+"""Episodes for the Rerun viewer: images, numbers and texts over the steps, in one `.rrd` file."""
 
 from pathlib import Path
 from types import TracebackType
@@ -52,7 +52,7 @@ class RerunLog:
         self._log(name, self._rerun.TextDocument(text))
 
     def views(self, source: EpisodeSource, episode: int, step: int) -> None:
-        """Go to a step of a recorded episode, and log its images and words."""
+        """Go to a step of a recorded episode, and log its images and texts."""
         self.at(episode, step)
         for view in source.robot.camera_names:
             self.log_image(f"views/{view}", source.frames(episode, np.array([step]), view)[0])

@@ -82,7 +82,7 @@ def bootstrap(
     """Percentile interval of a mean over tasks, drawing episodes anew within each task.
 
     Args:
-        tasks: for each task a number per episode [episodes], already averaged over the runs: an episode is drawn with
+        tasks: for each task a number per episode [episodes], already averaged over the runs: an episode is sampled with
             all of them.
     """
     rng = np.random.default_rng(seed)

@@ -107,7 +107,7 @@ CAPTION = (
 
 
 def process_of(record: EpisodeRecord) -> ProcessScore | None:
-    """What a record says of it; None for episodes whose environment did not tell."""
+    """The score in a record; None for episodes whose environment reports none."""
     value = record.extra.get(EXTRA)
     return None if value is None else ProcessScore.from_dict(value)
 

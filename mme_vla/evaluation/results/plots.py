@@ -197,7 +197,7 @@ def svg(canvas: "Canvas") -> str:
 
 
 def legend(canvas: "Canvas", axes: "Axes", columns: int) -> None:
-    """A legend above the panel, clear of what is drawn in it, in so many columns at most."""
+    """A legend above the panel, clear of its content, in so many columns at most."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         order = sorted(range(len(labels)), key=lambda i: labels[i].endswith("paper"))  # last, in the bars

@@ -28,7 +28,7 @@ PAPER_SEEDS = (7, 42, 0)
 
 
 class Task(NamedTuple):
-    """What the paper says of a task.
+    """The paper's facts of a task.
 
     memory: what has to be remembered: T(ime), S(pace), O(bject), P(rocedure).
     video: whether a conditioning video comes first. steps: mean length of a demonstration.

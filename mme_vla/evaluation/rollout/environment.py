@@ -32,7 +32,7 @@ REPORTED = (
 _BLIND = np.zeros((SIDE, SIDE, 3), np.uint8)
 
 Observation = dict[str, Any]
-"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not asked for; `state`: float32 [t, s].
+"""Every camera by its name: lists of uint8 [H, W, 3], or None where a frame was not requested; `state`: float32 [t, s].
 
 The robot's `readings`, if it has any, are lists of all frames.
 """
@@ -45,7 +45,7 @@ class RenderClock:
         self.seconds = 0.0
 
     def watch(self, env: Any) -> None:
-        """Time the images of this environment; those of the official package cannot be told from its simulation."""
+        """Time the images of this environment; those of the official package are part of its simulation."""
         scene = getattr(getattr(env, "task", None), "scene", None)
         if scene is None:
             return
@@ -72,8 +72,8 @@ class ChunkEnv:
         stick: its robot holds a stick, and takes no command of the gripper, which is an action's last number.
         max_steps: actions after which the outcome is `timeout`, should the environment itself not say so: one more
             than this is executed, as in the benchmark.
-        video: draws the episode as it goes.
-        robot: says which cameras are read and how wide an action is.
+        video: records the episode.
+        robot: the cameras that are read and the width of an action.
         most_actions: actions that are executed at most, whatever frames they took; then the outcome is `timeout`.
     """
 
@@ -101,7 +101,7 @@ class ChunkEnv:
         """All frames of the conditioning video, the current one last, and the report.
 
         Args:
-            draw: the images that are asked for; by default all.
+            draw: the requested images; by default all.
         """
         self._ask(draw)
         with self._simulation():
@@ -118,7 +118,7 @@ class ChunkEnv:
 
         Args:
             command: `actions` [n, w]; `subgoal`, the text that is in the video meanwhile; `draw`, the images that
-                are asked for, where it is not all: frames are counted from the reset on, and the newest is the last.
+                are requested, where it is not all: frames are counted from the reset on, and the newest is the last.
 
         Returns:
             The frames of the executed actions, 0, terminated, truncated, and the report with `executed`, the number of
@@ -215,7 +215,7 @@ class ChunkEnv:
 
 
 def _is_unreachable(observation: Any, info: dict[str, Any]) -> bool:
-    """Whether an action asked for a pose that no joints or no motion reach: the policy's failure, not the machine's."""
+    """Whether no joints or no motion reach an action's pose: the policy's failure, not the machine's."""
     return observation == {} or info.get("exception_type") == "PlanningError"
 
 
@@ -232,7 +232,7 @@ class _Frames:
         """Take the benchmark's lists; how many frames they hold."""
         joints, fingers = observation["joint_state_list"], observation["gripper_state_list"]
         self._states += [benchmark_state(q, f) for q, f in zip(joints, fingers, strict=True)]
-        blind = not any(key.endswith("_rgb_list") for key in observation)  # it was asked not to render
+        blind = not any(key.endswith("_rgb_list") for key in observation)  # it does not render
         for name, images in self._images.items():
             if not blind and name in self._cameras and f"{name}_rgb_list" not in observation:
                 raise UserError(f"The environment has no camera {name!r}; it shows {', '.join(sorted(observation))}.")
@@ -247,7 +247,7 @@ class _Frames:
         return len(joints)
 
     def leave(self, draw: RenderRequest | None, first: int) -> int:
-        """Leave out the images that were not asked for; from the first frame's number to the one that follows."""
+        """Leave out the images that were not requested; from the first frame's number to the one that follows."""
         stop = first + len(self._states)
         if draw is not None:
             for frame in range(first, stop):

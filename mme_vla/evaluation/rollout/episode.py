@@ -31,7 +31,7 @@ class RunningEpisode:
     video do not keep other episodes waiting.
 
     Args:
-        subgoals: who says the subgoal. piece: frames to a piece. trace: where the subgoals are noted.
+        subgoals: predicts the subgoal. piece: frames to a piece. trace: logs the subgoals.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class RunningEpisode:
         self.video_frames = 0
         self.video = ""
         self.process: dict[str, Any] = {}
-        """Where the chain of sub-tasks broke, once the episode is over; empty where the environment does not tell."""
+        """Where the chain of sub-tasks broke, once the episode is over; empty where it is not reported."""
         self.redrawn: int | None = None
         """Frames of the conditioning video, once it is being simulated again for its images."""
         self._actions = hashlib.sha256()
@@ -110,7 +110,7 @@ class RunningEpisode:
         views, rendered = self._views(part)
         views |= {name: np.stack(self._frames[name][part]) for name in self._robot.readings}
         led = self._led
-        if led is not None:  # one action a frame; or some motions, all told with the first of their frames
+        if led is not None:  # one action a frame; or some motions, all given with the first of their frames
             led = led[part] if self._robot.action.frames is not None else led[: len(led) if not self._at else 0]
         some = (
             {} if all(len(places) == len(self._demo[part]) for places in rendered.values()) else {"rendered": rendered}

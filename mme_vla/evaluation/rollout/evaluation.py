@@ -12,10 +12,9 @@ from mme_vla.envs.episodes import choose_episodes as choose_specs
 from mme_vla.envs.make import ACTION_SPACES, check_sessions, make_env
 from mme_vla.envs.vector.pool import Job, VecEnv
 from mme_vla.errors import UserError
-from mme_vla.evaluation.forecast import Durations, earlier_records
 from mme_vla.evaluation.records import EpisodeRecord, RunKey, finished, merge
 from mme_vla.evaluation.rollout.environment import make_rollout_env
-from mme_vla.evaluation.rollout.progress import RolloutProgress
+from mme_vla.evaluation.rollout.progress import Durations, RolloutProgress, earlier_records
 from mme_vla.evaluation.rollout.runner import Rollout, RunFacts, Waiting, Workload
 from mme_vla.evaluation.rollout.settings import RolloutSettings
 from mme_vla.evaluation.rollout.subgoals import SUBGOALS
@@ -47,7 +46,7 @@ def choose_episodes(tasks: str | Sequence[str] = "all", episodes: Any = None, sp
 
 
 def choose_shard(text: str | None, environment: Mapping[str, str] | None = None) -> Shard:
-    """Read `0/4` (the first of four), or what torchrun says of this process.
+    """Read `0/4` (the first of four), or the rank of this process under torchrun.
 
     Args:
         text: wins over the environment. environment: by default the process's own.
@@ -104,10 +103,10 @@ def evaluate(
     Args:
         policy: in eval mode, on its device, with statistics.
         jobs: the episodes of the run. shard: which of how many processes this is; each takes the next episode that is
-            free when it has room (`claims.py`).
+            free when it has room (`store.Claims`).
         output: the run's folder; one that holds a part of the same run is gone on with.
         facts: what the records say of the policy.
-        subgoals: who says the subgoal, where the policy reads one.
+        subgoals: predicts the subgoal, where the policy reads one.
         source: where the weights are from; part of what makes a run the same.
         base: makes an environment with the benchmark's interface; importable by name.
         notes: kept in `run.json` and never compared.
@@ -222,7 +221,7 @@ def _end_of(place: str | None) -> str | None:
 
 
 def check_subgoals(policy: Policy, subgoals: SubgoalPredictor | None) -> None:
-    """Refuse a predictor that says what this policy was not trained to read."""
+    """Refuse a predictor whose subgoals this policy was not trained to read."""
     if subgoals is None:
         return
     if not policy.require_processor().prompt_spec.reads_subgoal:

@@ -1,8 +1,8 @@
-"""Which images a rollout asks its environments for: those that the policy and its predictor look at, no others.
+"""The images that a rollout requests of its environments: those that the policy and its predictor read, no others.
 
 When a policy acts is known beforehand, so what its memory reads is too, but for one thing: how long the conditioning
 video is. An episode therefore begins without those of its images that depend on it. Where some turn out to be
-needed, it begins once more, and the same simulation then draws them.
+needed, it begins once more, and the same simulation then renders them.
 """
 
 from collections.abc import Container
@@ -24,10 +24,10 @@ LONGEST_VIDEO = 10_000  # frames
 
 
 class RenderPlan:
-    """Says for each command to an environment what is to be drawn; None asks for everything.
+    """The images to render for each command to an environment; None requests everything.
 
     Args:
-        policy, subgoals: who looks. settings: how often the policy acts, and whether all is drawn anyway (`draw`).
+        policy, subgoals: the readers. settings: how often the policy acts, and whether all is rendered (`draw`).
     """
 
     def __init__(self, policy: Policy, subgoals: SubgoalPredictor | None, settings: RolloutSettings) -> None:
@@ -49,7 +49,7 @@ class RenderPlan:
         memory = self._policy.memory
         if self._sees_video:
             return self._render_request(EVERY)
-        # Of memories that keep few frames all are drawn at once, of others none.
+        # Of memories that keep few frames all are rendered at once, of others none.
         few = memory is not None and memory.storage.keep_every > 1
         return self._render_request(
             frozenset(memory.storage.stored_frames(LONGEST_VIDEO).tolist()) if memory and few else ()

@@ -1,7 +1,7 @@
-"""Many episodes at once: environments in worker processes, one policy that answers whoever waits in one batch.
+"""Many episodes at once: environments in worker processes, one policy that acts for the waiting ones in one batch.
 
-Each worker executes its chunk at its own pace. Whoever has finished one is in the policy's next batch; nobody waits
-for a slow episode, and a long conditioning video is read in pieces between batches.
+Each worker executes its chunk at its own pace. One that has finished is in the policy's next batch. No episode waits
+for a slow one, and a long conditioning video is read in pieces between batches.
 """
 
 import time
@@ -102,14 +102,14 @@ class Workload:
 
 @dataclass
 class Rollout:
-    """Runs episodes and records each the moment it ends.
+    """Runs episodes and records each when it ends.
 
     Args:
         policy: in eval mode, on its device.
         envs: environments that take chunks (`make_rollout_env`).
         facts: what the records say of the policy.
         record: called with every record, as soon as there is one.
-        subgoals: who says the subgoal; None leaves it out of the prompt.
+        subgoals: predicts the subgoal; None leaves it out of the prompt.
         subgoal_folder: where every subgoal is written down with its image; None keeps the scores alone.
     """
 

@@ -1,4 +1,4 @@
-"""What a rollout can be told, checked before anything is loaded."""
+"""The settings of a rollout, checked before anything is loaded."""
 
 import os
 from collections.abc import Mapping
@@ -20,14 +20,14 @@ class RolloutSettings:
     """The protocol, and how it is run. The defaults are the paper's.
 
     seed: of the policy's noise; it does not reach the environments.
-    execute: actions of a chunk that are executed before the policy is asked again; None: as the robot says.
+    execute: actions of a chunk that are executed before the policy acts again; None: the embodiment's number.
     workers: environments at a time; None: one a core, at most 16.
     max_batch: most episodes that act together; 1 makes results independent of timing to the last bit.
     encode_chunk: frames encoded before other episodes may act.
     retries: how often an episode whose environment failed is tried again before the run continues without it.
-    timeout_s: seconds after which an environment that does not answer is replaced.
-    draw: `needed`: images of what the policy and its subgoals look at; `all`: of every frame. Outcomes are the same.
-    subgoal_log: whether every subgoal is written down with its image, where a predictor says them.
+    timeout_s: seconds after which an environment that does not respond is replaced.
+    draw: `needed`: images that the policy and its subgoals read; `all`: of every frame. Outcomes are the same.
+    subgoal_log: whether every predicted subgoal is logged with its image.
     """
 
     seed: int = 42

@@ -1,4 +1,4 @@
-"""Predicted subgoals against the environment's own: whether the words are right, and how far the points are off."""
+"""Predicted subgoals against the environment's own: whether the text is right, and how far the points are off."""
 
 import json
 import shutil
@@ -28,10 +28,10 @@ EXTRA = "subgoals"
 class SubgoalScore:
     """Counts over the subgoals of an episode, one whenever the policy acted.
 
-    A subgoal counts as right when its words are, points aside; points are compared where the words are right.
+    A subgoal is right when its text without points is; points are compared where the text is right.
 
     chunks: times the policy acted. judged: of these, how often the environment had a subgoal to compare with.
-    right: how often the words were the environment's. points, distance: points compared, and the sum of their distances
+    right: how often the text was the environment's. points, distance: points compared, and the sum of their distances
     in pixels of the front image. asked: questions to a model. problems: unusable answers by kind.
     """
 
@@ -95,7 +95,7 @@ class SubgoalScore:
 
 
 def score_of(record: EpisodeRecord) -> SubgoalScore | None:
-    """What a record says of its subgoals; None for an episode without a predictor."""
+    """The score of a record's subgoals; None for an episode without a predictor."""
     values = record.extra.get(EXTRA)
     return None if values is None else SubgoalScore.from_dict(values)
 

@@ -21,7 +21,7 @@ class EpisodeVideo:
     """Draws and compresses frame by frame, so that no episode is held in memory.
 
     A thread compresses beside the simulation, which waits only when it is `BEHIND` frames ahead.
-    The file gets its name, which tells the outcome, when the episode is over; until then it is a hidden file beside it.
+    The file gets its name, with the outcome, when the episode is over; until then it is a hidden file beside it.
 
     Args:
         path: of the video, from outcome and goal.
@@ -36,7 +36,7 @@ class EpisodeVideo:
         self._waiting: deque[Future[None]] = deque()
 
     def add(self, views: Sequence[np.ndarray], caption: str | None = None, demo: bool = False) -> None:
-        """Append the images [H, W, 3] uint8 that all cameras took at one moment."""
+        """Append the images [H, W, 3] uint8 that all cameras took at one step."""
         if self._video is None:
             self._video, self._thread = self._open(), ThreadPoolExecutor(1, "film")
         assert self._thread is not None
@@ -57,7 +57,7 @@ class EpisodeVideo:
         return target
 
     def discard(self) -> None:
-        """Drop what was drawn."""
+        """Drop the frames."""
         if self._video is not None:
             for frame in self._waiting:
                 frame.cancel()

@@ -21,7 +21,8 @@ from mme_vla.cli.inspect import show_checkpoint
 from mme_vla.config.composition import compose
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.vector.pool import Job
-from mme_vla.memory.base import full_history, stack_history
+from mme_vla.evaluation.recordings import all_recordings
+from mme_vla.memory.base import stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, RecallingCore
 from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.base import Policy
@@ -31,7 +32,6 @@ from mme_vla.policy.tensor_files import load_tensors
 from mme_vla.probing.arms import read_arms
 from mme_vla.probing.lines import MomentLine
 from mme_vla.probing.offline import OfflineSettings, probe_offline
-from mme_vla.probing.recordings import all_recordings
 from mme_vla.testing.small import BEYOND_MEMORIES, moving_frames
 from mme_vla.training.data import check_frozen, prepare_data
 from mme_vla.types import HistoryTokens

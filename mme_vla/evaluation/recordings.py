@@ -1,4 +1,4 @@
-"""Recorded episodes as a probe uses them: shown as they were, or lent to others as sessions and contents."""
+"""Recorded episodes that a policy observes: in a probe, or before each episode of a stress split."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from mme_vla.policy.base import Policy
 from mme_vla.policy.capabilities import frames_read
 
 SUBGOAL = "simple_subgoal"
-"""The column that tells sub-tasks apart."""
+"""The column whose changes separate sub-tasks."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Recording:
         return SUBGOAL in self.source.subgoal_names
 
     def subgoal(self, step: int, column: str = SUBGOAL) -> str | None:
-        """What is said at a step, or None where the dataset has no such column."""
+        """The subgoal at a step; None where the dataset has no such column."""
         return self.source.subgoals(self.episode, step).get(column)
 
     def frame(self, number: int) -> np.ndarray:
@@ -65,7 +65,7 @@ class Recording:
         return sorted({0, self.exec_start, *changes})
 
     def decisions(self, stride: int, most: int | None) -> list[int]:
-        """Steps at which chunks are chosen: every `stride`-th of those the robot decides at, spread, `most` at most."""
+        """Steps at which chunks are chosen: every `stride`-th at which the robot decides, `most` of them at most."""
         every = 1 if self.source.robot.action.frames is None else stride
         steps = np.asarray(self.source.decisions(self.episode))[::every]
         if most is not None and len(steps) > most:
@@ -79,7 +79,7 @@ class Recording:
 
         Args:
             required: frames that the memory camera shows beside the last, which all cameras do; None for every frame. A
-                robot that reads depth is shown the frames that the dataset keeps depth of.
+                robot that reads depth observes the frames that the dataset keeps depth of.
         """
         robot = self.source.robot
         if robot.readings:
@@ -98,7 +98,7 @@ class Recording:
     def show(
         self, running: Any, start: int, stop: int, required: np.ndarray | None = None, video: bool = False
     ) -> None:
-        """Let an episode observe frames start … stop − 1.
+        """Observe frames start … stop − 1 in a running episode.
 
         Args:
             required: as for `views`. video: all of it as if it were a conditioning video.
@@ -122,17 +122,6 @@ class Recording:
 def all_recordings(sources: Sequence[EpisodeSource]) -> list[Recording]:
     """Every episode of some datasets."""
     return [Recording(source, episode) for source in sources for episode in range(len(source))]
-
-
-def others(recordings: Sequence[Recording], exclude: Recording | None, goal: str) -> list[Recording]:
-    """The other episodes, those with the most words of the goal in common first."""
-    words = set(goal.split())
-
-    def unlike(recording: Recording) -> float:
-        their = set(recording.goal.split())
-        return 1 - len(words & their) / max(len(words | their), 1)
-
-    return sorted((recording for recording in recordings if recording != exclude), key=unlike)
 
 
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
