@@ -115,5 +115,5 @@ class _Random(Pi05Backbone):
 
 def test_a_backbone_whose_loss_does_not_repeat_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BACKBONES._entries, "broken", _Random)
-    with pytest.raises(AssertionError, match="same draws must give the same loss"):
+    with pytest.raises(AssertionError, match="same noise must give the same loss"):
         check_backbone("broken", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})
