@@ -28,8 +28,8 @@ class Policy(Saved):
     A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
     `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
     says: whoever trains only moves it to a device. Random numbers come from outside (`training_noise`,
-    `sampling_noise`), so that training resumes bit for bit, and the noise of an episode does not depend on its batch; only the policy knows
-    what they mean.
+    `sampling_noise`), so that training resumes bit for bit, and the noise of an episode does not depend on its
+    batch; only the policy knows what they mean.
     """
 
     memory: Memory | None
