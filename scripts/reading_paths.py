@@ -21,7 +21,8 @@ NOT_READ = {"mme_vla", "mme_vla.errors", "mme_vla.registry"}
 SELECTION = ["memory/tokendrop.py", "memory/history.py"]
 HEAD = ["backbone/flow.py"]
 SAMPLING = [
-    ("policy/base.py", "act"), ("policy/mme.py", "sample_actions"), ("model.py", "sample"), ("backbone/pi05.py", "sample"),
+    ("policy/base.py", "act"), ("policy/mme.py", "sample_actions"), ("model.py", "sample"),
+    ("backbone/pi05.py", "sample"),
 ]  # fmt: skip
 ALONE = "README.md"
 
