@@ -323,7 +323,8 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
 
 def test_settings_and_policies_that_cannot_work_are_refused(policy):
     for bad, message in (({"port": 70000}, "port=70000 must be a whole number from 0 to 65535"),
-                         ({"action_space": "joints"}, "action_space='joints'. Known: ee_delta, ee_pose, joint_angle"), ({"api_key": " x"}, "without blanks"),
+                         ({"action_space": "joints"}, "action_space='joints'. Known: ee_delta"),
+                         ({"api_key": " x"}, "without blanks"),
                          ({"execute": 0}, "a whole number, 1 or more or null"), ({"max_batch": 1.5}, "a whole number"),
                          ({"limits": {"send_s": -1}}, "limits.send_s=-1 must be a number above 0")):  # fmt: skip
         with pytest.raises(UserError, match=message):
