@@ -69,7 +69,7 @@ class MMEPolicy(Policy):
             compute_dtype: `bfloat16` runs matmuls under autocast over the float32 master weights.
             history_dtype: dtype of stored vision tokens; bfloat16 as released.
             augment: augment the current views while training (memory features never are).
-            attention: what computes it: `auto`, `sdpa`, `flex` or `varlen` (docs/hardware.md).
+            attention: what computes it: `auto`, `sdpa`, `flex` or `varlen` (docs/evidence/hardware.md).
             float32_products: how a GPU multiplies in recurrent memories, which compute in float32: `ieee` or `tf32`.
         """
         super().__init__()
