@@ -251,7 +251,7 @@ class Saved(nn.Module):
         if "backbone" not in config:
             raise UserError(
                 f"{folder / CONFIG} is not this library's: it lacks the section 'backbone'. Weights of other formats "
-                "are read by mme_vla.weights.load_weights() and converted by python -m mme_vla.weights.convert."
+                "are read by mme_vla.weights.load_weights() and converted by mme-vla weights."
             )
         import_trusted(config, str(source), trust_plugins)
         policy_type = policy_class_for(cls, config, str(source))

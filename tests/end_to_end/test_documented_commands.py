@@ -116,11 +116,11 @@ def test_the_words_of_other_documented_commands_are_valid(page: str, command: st
     program, arguments = words[start], words[start + 1 :]
     if program in ("mme-vla", "mme_vla"):
         assert arguments[0] in cli.COMMANDS
-        command, arguments = f"mme-vla {arguments[0]}", arguments[1:]
+        entry, arguments = f"mme-vla {arguments[0]}", arguments[1:]
     else:
         assert find_spec(program) is not None
-        command = f"python -m {program}"
-    name = {documented: name for name, documented in COMMANDS.items()}.get(command)
+        entry = f"python -m {program}"
+    name = {documented: name for name, documented in COMMANDS.items()}.get(entry)
     if name is None:  # it takes options instead of a configuration
         return
     arguments = trust_as_override(arguments)
