@@ -101,7 +101,7 @@ def _updates(policy: MMEPolicy, samples: int, reshard: Callable[[], None]) -> di
     optimizer = make_optimizer(learning.values(), TrainSettings(steps=10, batch_size=samples, lr=1e-4))
     ema = EMA(learning, 0.999, reshard=reshard)
     batch = batch_of(policy, samples)
-    draws = {name: value.to(DEVICE) for name, value in policy.loss_draws(samples, torch.Generator()).items()}
+    draws = {name: value.to(DEVICE) for name, value in policy.training_noise(samples, torch.Generator()).items()}
     allocated = torch.cuda.memory_allocated()
     for _ in range(3):  # moments come with the first
         torch.cuda.reset_peak_memory_stats()

@@ -110,7 +110,7 @@ def built(model: str, backbone: str, device: torch.device, attention: str = "aut
         options["policy.compute_dtype"] = "bfloat16"
     policy = build_policy(model, backbone=backbone, device=device, **options)
     assert isinstance(policy, MMEPolicy)
-    policy.backbone.choose_attention(attention)
+    policy.backbone.set_attention_backend(attention)
     policy.backbone.vision.requires_grad_(False)
     return policy.train()
 
@@ -126,5 +126,5 @@ def batch_of(policy: MMEPolicy, size: int, device: torch.device) -> Batch:
 
 def draws_of(policy: MMEPolicy, size: int, device: torch.device) -> dict[str, Tensor]:
     """Random numbers of its loss."""
-    sampled = policy.loss_draws(size, torch.Generator().manual_seed(0))
+    sampled = policy.training_noise(size, torch.Generator().manual_seed(0))
     return {name: value.to(device) for name, value in sampled.items()}

@@ -33,7 +33,7 @@ import torch
 
 from mme_vla import build_policy
 from mme_vla.config.composition import compose, print_user_errors
-from mme_vla.memory.base import stack_history
+from mme_vla.memory.base import past_view_spec, stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.images import past_views, stack_past
@@ -120,7 +120,9 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
     history = None
     if policy.memory is not None:
         memory = policy.memory
-        recalled = [memory.recall(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history]
+        recalled = [
+            memory.gather_selection(s.history, int(t)) for s, t in zip(selected, steps, strict=True) if s.history
+        ]
         history = stack_history(recalled)
     return Batch(
         images=processor.images([views, views])[:, :1],  # one camera says it all
@@ -135,7 +137,7 @@ def make_batch(policy: MMEPolicy, streams: list[Stream], rng: np.random.Generato
 
 def past_of(policy: MMEPolicy, selected: Sequence[Stream], steps: np.ndarray) -> PastViews | None:
     """Past views of the one camera, where the memory gives the vision tower any."""
-    past_spec = None if policy.memory is None else policy.memory.past_view_spec
+    past_spec = past_view_spec(policy.memory)
     if past_spec is None:
         return None
     prepare = policy.require_processor().images

@@ -1,4 +1,4 @@
-"""Name → class tables. A decorator registers; a Hydra config names the key."""
+"""Name → class tables. A decorator registers; a configuration names the key."""
 
 import importlib
 import inspect
@@ -106,6 +106,7 @@ BACKBONES: Registry[Any] = Registry(
         "openvla": "mme_vla.methods.openvla_oft.model",
     },
 )
+HEADS: Registry[Any] = Registry("flow head", dict.fromkeys(("flow", "clean_flow"), "mme_vla.backbone.flow"))
 POLICIES: Registry[Any] = Registry(
     "policy",
     {
@@ -137,7 +138,7 @@ PLAYERS: Registry[Any] = Registry(
 )
 INTERVENTIONS: Registry[Any] = Registry("intervention")
 REGISTRIES = {
-    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "policy": POLICIES,
+    "memory": MEMORIES, "integration": INTEGRATIONS, "backbone": BACKBONES, "head": HEADS, "policy": POLICIES,
     "processor": PROCESSORS, "subgoal": SUBGOALS, "task": TASKS, "player": PLAYERS,
     "intervention": INTERVENTIONS,
 }  # fmt: skip
@@ -147,8 +148,8 @@ def register(kind: str, name: str) -> Callable[[Any], Any]:
     """Return a decorator that files a part of one's own under `name`, for YAML files and command lines to call it by.
 
     Args:
-        kind: `memory`, `integration`, `backbone`, `policy`, `processor`, `subgoal` (a predictor), `task`,
-            `player` or `intervention` (of a probe).
+        kind: `memory`, `integration`, `backbone`, `head` (of a flow backbone), `policy`, `processor`,
+            `subgoal` (a predictor), `task`, `player` or `intervention` (of a probe).
 
     Raises:
         UserError: an unknown kind, or the name is taken.

@@ -5,7 +5,7 @@ One legend for shapes, used in the whole library:
 b batch · n tokens · d width · t frames · v views (cameras) · h action horizon · a action width · l prompt length
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Self
 
@@ -16,6 +16,26 @@ from torch import Tensor
 def send(x: Tensor, device: torch.device) -> Tensor:
     """A tensor on a device; from the CPU to a GPU through page-locked memory, so that nobody waits for the copy."""
     return x.pin_memory().to(device, non_blocking=True) if device.type == "cuda" and not x.is_cuda else x.to(device)
+
+
+Noise = dict[str, Tensor]
+"""Random numbers by name, one row a sample. The caller makes them, so that batching and sharding cannot change them."""
+
+
+def named_noise(noise: Mapping[str, Tensor] | Tensor | None, **more: Tensor | None) -> Noise:
+    """Noise by name; a bare tensor is a flow's `noise`."""
+    named = {"noise": noise} if isinstance(noise, Tensor) else dict(noise or {})
+    return named | {name: value for name, value in more.items() if value is not None}
+
+
+def stack_noise(rows: Sequence[Mapping[str, Tensor]], device: torch.device | None = None) -> Noise:
+    """Noise of single samples (`sampling_noise`) as that of a batch."""
+    return {name: torch.stack([row[name] for row in rows]).to(device) for name in (rows[0] if rows else {})}
+
+
+def map_noise(noise: Mapping[str, Tensor], change: Callable[[Tensor], Tensor]) -> Noise:
+    """Every value through `change`: rows of a batch, another device."""
+    return {name: change(value) for name, value in noise.items()}
 
 
 class TensorStruct:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import MemoryModule, ScoringMemory
 from mme_vla.memory.history import FrameScorer, History, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -30,7 +30,7 @@ class MeanBrightness:
         return cells.reshape(-1).astype(np.float32) if frame_index % 3 == 0 else None
 
 
-class LastFrames(Memory):
+class LastFrames(MemoryModule, ScoringMemory):
     """Remembers the newest kept frames, the brighter of them first in line where there are scores."""
 
     def __init__(self, frames: int = 3, keep_every: int = 1, scored: bool = False) -> None:

@@ -134,8 +134,8 @@ def compare(name: str, dtype: str) -> dict[str, Any]:
     shared = copy.deepcopy(alone)
     shard(shared, ParallelSettings("fsdp").mesh("cpu"), shared.compute_dtype)
     batch = alone.full_batch()
-    draws = alone.loss_draws(1, torch.Generator().manual_seed(1))
-    start = alone.sample_draws(torch.Generator().manual_seed(2))
+    draws = alone.training_noise(1, torch.Generator().manual_seed(1))
+    start = alone.sampling_noise(torch.Generator().manual_seed(2))
     asked = {key: value[None] for key, value in start.items()}
     results: dict[str, Any] = {}
     for which, model in (("alone", alone), ("shared", shared)):

@@ -126,7 +126,7 @@ ALIKE = {
     "openvla": "OpenVLA in this room: policy, processor, checkpoints, names",
     "memoryvla": "MemoryVLA in this room: checkpoints, names",
 }
-WRITING, READING = {"remember", "look", "observe"}, {"select", "recall", "encode", "gather"}
+WRITING, READING = {"remember", "look", "observe"}, {"select", "gather_selection", "encode", "gather"}
 
 
 def test_no_two_modules_of_one_name_mean_different_things() -> None:
@@ -149,4 +149,4 @@ def test_episodes_write_and_memories_read_under_names_of_their_own() -> None:
                     methods.setdefault(room if room == "memory" else node.name, set()).update(defined)
     assert not methods["memory"] & WRITING, "a memory selects and encodes; Episode is what is written to"
     assert methods["memory"] >= READING and methods["Episode"] >= WRITING
-    assert not methods["Episode"] & (READING - {"recall"})
+    assert not methods["Episode"] & (READING - {"gather_selection"})

@@ -11,16 +11,15 @@ from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from mme_vla.backbone.base import Backbone
-from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief
 from mme_vla.registry import BACKBONES
 
 LARGEST, DEEPEST = 2**24, 2**10
-"""Bounds of every size and of layers: far above any network here, and a damaged file's number ends in words."""
+"""Bounds of every size and of layers, far above any network here: a number of a damaged file exceeds them."""
 
 
 def check_positive(config: Any, prefix: str) -> None:
-    """Make sure that every number of a dataclass is one a network can have."""
+    """Raise an error if a number of a dataclass is not a possible size."""
     for name, value in vars(config).items():
         if isinstance(value, float) and not 0 < value < 1:
             raise UserError(f"{prefix}{name}={brief(value)} must lie between 0 and 1.")
@@ -73,6 +72,7 @@ class BackboneConfig:
     action_dim: int = 32
     horizon: int = 20
     time_distribution: str = "beta"  # `beta`: 0.001 + 0.999·Beta(1.5, 1), as released; `uniform`: the paper's text
+    head: Mapping[str, Any] = field(default_factory=lambda: {"name": "flow"}, hash=False)  # a key of HEADS, its options
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
@@ -86,17 +86,17 @@ class BackboneConfig:
             raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
 
 
-_DRAWS = {Tensor.normal_, Tensor.uniform_}
+_INITIALISERS = {Tensor.normal_, Tensor.uniform_}
 
 
 @contextmanager
 def shapes_only() -> Iterator[None]:
     """Build on `meta`, and leave out initialisation, a third of the time that building takes there."""
-    with torch.device("meta"), _Undrawn():
+    with torch.device("meta"), _WithoutInit():
         yield
 
 
-class _Undrawn(TorchFunctionMode):
+class _WithoutInit(TorchFunctionMode):
     def __torch_function__(
         self,
         func: Callable[..., Any],
@@ -105,7 +105,7 @@ class _Undrawn(TorchFunctionMode):
         kwargs: Mapping[str, Any] | None = None,
     ) -> Any:
         kwargs = kwargs or {}
-        if func in _DRAWS or getattr(func, "__module__", None) == nn.init.__name__:
+        if func in _INITIALISERS or getattr(func, "__module__", None) == nn.init.__name__:
             tensor = args[0] if args else kwargs["tensor"]
             if tensor.is_meta:
                 return tensor
@@ -114,18 +114,20 @@ class _Undrawn(TorchFunctionMode):
 
 def read_backbone(section: Mapping[str, Any]) -> tuple[type[Backbone], Any]:
     """The class that the section `backbone` names, and its sizes."""
+    from mme_vla.config.sections import read_section
+
     kind: type[Backbone] = BACKBONES[str(section.get("name"))]
     return kind, read_section(kind.Config, {key: value for key, value in section.items() if key != "name"}, "backbone")
 
 
 def shape_of(section: Mapping[str, Any]) -> Backbone:
-    """The backbone of a section without weights (on the device `meta`), to be asked for its sizes."""
+    """The backbone of a section without weights (on the device `meta`), for its sizes."""
     shape: tuple[Any, Any] = read_backbone(section)
     try:
         hash(shape)
-    except TypeError:  # somebody's dataclass that can be changed
+    except TypeError:  # a dataclass that is not frozen
         return _shape(*shape)
-    return _remembered(*shape)
+    return _cached_shape(*shape)
 
 
 def _shape(kind: type[Backbone], sizes: Any) -> Backbone:
@@ -133,4 +135,4 @@ def _shape(kind: type[Backbone], sizes: Any) -> Backbone:
         return kind(sizes)
 
 
-_remembered = lru_cache(maxsize=32)(_shape)
+_cached_shape = lru_cache(maxsize=32)(_shape)

@@ -10,9 +10,19 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import AttentionMask, attend, build_mask, select_rows
+from mme_vla.backbone.attention import (
+    AttentionMask,
+    Block,
+    MaskLayout,
+    Span,
+    Visibility,
+    apply_custom_positions,
+    attend,
+    build_mask,
+    select_rows,
+    token_positions,
+)
 from mme_vla.backbone.base import Hook, bind_hook
-from mme_vla.backbone.blocks import Block, MaskLayout, Span, Visibility, placed, token_positions
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.layers import AdaRMSNorm, Modulation, RMSNorm, Rotation, compute_dtype, rotate, rotation
 from mme_vla.speed.recompute import Recompute, run_layer
@@ -269,7 +279,7 @@ class JointTransformer(nn.Module):
         """Mask and rotary angles of `blocks` in sequence order, after those of `past`, under a visibility table."""
         spans = [Span(block.name, len(block)) for block in blocks]
         asking = torch.cat([block.mask for block in blocks], 1)
-        positions = placed(token_positions(asking, past.mask if past else None), blocks)
+        positions = apply_custom_positions(token_positions(asking, past.mask if past else None), blocks)
         all_spans, valid = (past.spans + spans, torch.cat([past.mask, asking], 1)) if past else (spans, asking)
         mask_layout, dtype = MaskLayout.of(spans, all_spans, valid, table), compute_dtype(blocks[0].tokens)
         mask = build_mask(mask_layout, dtype, self.attention, self._compiled)

@@ -1,31 +1,29 @@
-"""nano: a backbone of under five million parameters. Action tokens read images, words and memory; nothing else moves.
+"""nano: a backbone of under five million parameters, whose action tokens read images, words and memory.
 
 The prefix is not processed in layers: each layer of the action column attends to the context as it is. That makes a
-training step on stored tokens cheap enough for a laptop, and leaves memory as many doors as it needs.
+training step on stored tokens cheap enough for a laptop.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone import flow
-from mme_vla.backbone.attention import additive_mask, attend
-from mme_vla.backbone.base import Backbone, Draws, Hook, Inject, Injection
-from mme_vla.backbone.blocks import Block
+from mme_vla.backbone.attention import Block, additive_mask, attend
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Hook, Injection, bind_hook
 from mme_vla.backbone.config import ExpertConfig, check_positive
+from mme_vla.backbone.flow import HasFlowHead, time_embedding
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm
 from mme_vla.backbone.nano_vision import CLASSES, ConvTower, load_shipped
 from mme_vla.backbone.pi05 import initialise
-from mme_vla.backbone.siglip import pool_grid
 from mme_vla.errors import UserError
 from mme_vla.registry import BACKBONES
+from mme_vla.speed import Recomputes
 from mme_vla.speed.recompute import Recompute
-from mme_vla.speed.rtc import agreeing
-from mme_vla.types import Batch
+from mme_vla.types import Batch, Noise, map_noise
 
 
 @dataclass(frozen=True)
@@ -69,6 +67,7 @@ class NanoConfig:
     horizon: int = 4
     draws: int = 4
     time_distribution: str = "beta"
+    head: Mapping[str, Any] = field(default_factory=lambda: {"name": "clean_flow"}, hash=False)
 
     def __post_init__(self) -> None:
         check_positive(self, "backbone.")
@@ -78,10 +77,9 @@ class NanoConfig:
             raise UserError(f"time_distribution={self.time_distribution!r}: choose 'beta' or 'uniform'.")
 
 
-EULER_STEPS = 10
 MAX_VIEWS, MAX_WORDS = 4, 256
 FIRST = CLASSES.index("red cube") - 1
-"""Where, among the classes of a token, what the goal names stands."""
+"""Index, among the classes of a token, of the class that the goal names."""
 STATE_FREQUENCIES = (1.0, 4.0, 16.0, 64.0)
 """Per radian or metre: a finger's four centimetres count as well as a joint's turn."""
 
@@ -105,27 +103,34 @@ class Reader(nn.Module):
         self.down = nn.Linear(config.action.mlp_dim, width)
 
     def forward(
-        self, x: Tensor, condition: Tensor, k: Tensor, v: Tensor, mask: Tensor, draws: int, hook: Hook | None, at: int
+        self,
+        x: Tensor,
+        condition: Tensor,
+        k: Tensor,
+        v: Tensor,
+        mask: Tensor,
+        versions: int,
+        hook: Callable[[Tensor], Tensor] | None,
     ) -> Tensor:
         """The action tokens [b·r, h, d] after this layer.
 
         Args:
-            condition: [b·r, d]. k, v: of the context, [b, n, N, h]; mask: additive [b, 1, 1, n]. draws: r.
-            hook: what changes the MLP's input. at: the layer's number.
+            condition: [b·r, d]. k, v: of the context, [b, n, N, h]; mask: additive [b, 1, 1, n]. versions: r.
+            hook: changes the MLP's input.
         """
         normed, gate = self.norm(x, condition)
         q, new_k, new_v = self.qkv(normed).unflatten(-1, (-1, self.head_dim)).chunk(3, dim=-2)
         x = x + (1 + gate) * self.out(attend(q, new_k, new_v, None))
         normed, gate = self.read_norm(x, condition)
         q = self.read_q(normed).unflatten(-1, (-1, self.head_dim))
-        # The draws of a sample read the same context: they stand side by side as its queries.
-        together = q.unflatten(0, (-1, draws)).flatten(1, 2)
-        read = attend(together, k, v, mask).unflatten(1, (draws, -1)).flatten(0, 1)
-        # What the goal asks for decides what of it counts: products are learned sooner here than behind the MLP.
+        # The versions of a sample read the same context: they are side by side as its queries.
+        together = q.unflatten(0, (-1, versions)).flatten(1, 2)
+        read = attend(together, k, v, mask).unflatten(1, (versions, -1)).flatten(0, 1)
+        # The goal gates what is read: products are learned sooner here than behind the MLP.
         x = x + (1 + gate) * self.read_out(read * self.read_gate(condition)[:, None])
         if hook is not None:
-            rows = x.unflatten(0, (-1, draws)).unbind(1)
-            x = torch.stack([hook(at, row) for row in rows], 1).flatten(0, 1)
+            rows = x.unflatten(0, (-1, versions)).unbind(1)
+            x = torch.stack([hook(row) for row in rows], 1).flatten(0, 1)
         normed, gate = self.mlp_norm(x, condition)
         inner, opening = self.up(normed).chunk(2, dim=-1)
         return x + (1 + gate) * self.down(nn.functional.gelu(inner) * opening)
@@ -145,8 +150,17 @@ class Column(nn.Module):
         return self.kv(self.norm(tokens)[0]).unflatten(-1, self.shape).movedim((2, 3), (0, 1))
 
 
+class Context(NamedTuple):
+    """What a chunk reads in every step: keys and values [layers, 2, b, n, N, h], their mask, the condition [b, d]."""
+
+    keys_values: Tensor
+    mask: Tensor
+    condition: Tensor
+    hook: Hook | None
+
+
 @BACKBONES.register("nano")
-class NanoBackbone(Backbone):
+class NanoBackbone(Backbone, HasFlowHead, HasExtraExperts, HasLoraTargets, Recomputes):
     """A pretrained convolutional tower, and layers of action tokens that read the context; chunks by flow matching.
 
     The network predicts the chunk without its noise, and the velocity follows. The loss takes several noisy versions of
@@ -156,7 +170,6 @@ class NanoBackbone(Backbone):
     vision: ConvTower
     Config = NanoConfig
     supports = frozenset({"blocks", "expert", "hook"})
-    supports_rtc = True
     lora_targets = ("qkv", "read_q", "out", "read_out", "up", "down")
     heads = ("action_in", "action_out", "state_in", "prompt_in")
     lora_exclude = r"\.\w*norm\.dense$"
@@ -171,9 +184,6 @@ class NanoBackbone(Backbone):
         super().__init__(config, extra_experts)
         self.config = config
         tower, width, action_width = config.vision, config.vlm.width, config.action.width
-        self.token_width = width
-        self.output_width = action_width
-        self.depth, self.head_dim = config.depth, config.head_dim
         self.image_size, self.grid = tower.image_size, tower.image_size // 16
         self.horizon, self.action_dim = config.horizon, config.action_dim
         # The tower comes first: with one seed it is the same in every variant, and so is a cache made by it.
@@ -182,7 +192,7 @@ class NanoBackbone(Backbone):
         )
         self.vision_width = self.vision.token_width
         initialise(self.vision)
-        if tower.pretrained and self.device.type != "meta":
+        if tower.pretrained and self.vision.out.weight.device.type != "meta":
             load_shipped(self.vision)
         self.places = nn.Embedding(self.grid**2, width)
         self.views = nn.Embedding(MAX_VIEWS, width)
@@ -205,8 +215,9 @@ class NanoBackbone(Backbone):
         for name, module in self.named_children():
             if name != "vision":
                 initialise(module)
+        self.make_head(config)
 
-    def draw_experts(self, names: Sequence[str]) -> None:
+    def init_experts(self, names: Sequence[str]) -> None:
         """Give the columns of these experts fresh weights."""
         for name in names:
             initialise(self.columns[name])
@@ -223,14 +234,10 @@ class NanoBackbone(Backbone):
             tokens: Tensor = self.vision(images)
             return tokens
 
-    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        """Tokens [n, grid², d] as memories store them."""
-        return pool_grid(self.encode_images(images), grid, pooling)
+    def condition_on_prompt(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
+        """Swap the class that the prompt names first with the first cube, so that one index holds the requested class.
 
-    def mark(self, tokens: Tensor, prompt: Tensor, prompt_mask: Tensor) -> Tensor:
-        """The class that the prompt names first changes places with the first cube: one place holds what is asked.
-
-        Which word names which class is part of the tower's weights (`ConvTower.words`).
+        `ConvTower.words`, part of the tower's weights, says which word names which class.
         """
         named = self.vision.words[prompt].bool() & prompt_mask[..., None]  # b l classes
         places = torch.where(named.any(1), named.int().argmax(1), prompt.shape[1])
@@ -243,16 +250,16 @@ class NanoBackbone(Backbone):
         permutation = torch.cat([groups, remaining], 1)
         return tokens.gather(-1, permutation.view(len(prompt), *[1] * (tokens.ndim - 2), -1).expand_as(tokens))
 
-    def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
-        """`images`, the tokens of all views (`batch.view_tokens` where they were made beforehand), and `prompt`."""
-        views = images.shape[1]
+    def embed(self, batch: Batch) -> list[Block]:
+        """Blocks `images`, of all views (`batch.view_tokens` where they were encoded before), and `prompt`."""
+        views = batch.images.shape[1]
         if batch.view_tokens is None:
-            tokens = self.encode_images(images.flatten(0, 1)).unflatten(0, (-1, views))
+            tokens = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, (-1, views))
         else:
             tokens = batch.view_tokens.to(self.places.weight.dtype)
-        tokens = self.mark(tokens, batch.prompt, batch.prompt_mask)
-        placed = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
-        encoded = placed + self.see(placed)
+        tokens = self.condition_on_prompt(tokens, batch.prompt, batch.prompt_mask)
+        located = self.see_in(tokens) + self.places.weight + self.views.weight[:views, None]  # b v n d
+        encoded = located + self.see(located)
         image_mask = batch.image_mask[:, :, None].expand(tokens.shape[:3]).flatten(1)
         words = self.embedding(batch.prompt) + self.positions.weight[: batch.prompt.shape[1]]
         return [
@@ -260,79 +267,67 @@ class NanoBackbone(Backbone):
             Block("prompt", words, batch.prompt_mask, "vlm"),
         ]
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """`noise` [n, r, h, a] and flow times `time` [n, r], r versions a sample."""
-        r = self.config.draws
-        noise = torch.randn(count, r, self.horizon, self.action_dim, generator=generator)
-        time = flow.sample_time(count * r, self.config.time_distribution, noise.device, generator)
-        return {"noise": noise, "time": time.view(count, r)}
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
+        """`noise` [n, r, h, a] and flow times `time` [n, r], for r noisy versions a sample."""
+        versions = self.config.draws
+        noise = self.head.training_noise(count * versions, generator)
+        return map_noise(noise, lambda value: value.unflatten(0, (count, versions)))
 
-    def loss(self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor]) -> Tensor:
+    def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
         """Squared error [b, h] of the chunk without its noise, the mean over its noisy versions."""
         assert batch.actions is not None
-        versions = draws["noise"].shape[1]
-        actions = batch.actions.float().repeat_interleave(versions, 0)
-        noise, time = draws["noise"].flatten(0, 1), draws["time"].flatten()
-        noisy, _ = flow.interpolate(actions, noise, time)
-        clean = self._clean(batch, *self._prepare(batch, images, inject), noisy, time, versions)
-        return flow.step_loss(clean, actions).unflatten(0, (-1, versions)).mean(1)
+        versions = noise["noise"].shape[1]
+        context = self.read_context(batch, injection)
+        actions = batch.actions.repeat_interleave(versions, 0)
+        flat = map_noise(noise, lambda value: value.flatten(0, 1))
+        losses = self.head.loss(lambda x_t, time: self.denoise(context, x_t, time, versions), actions, flat)
+        return losses.unflatten(0, (-1, versions)).mean(1)
 
-    def recompute(self, mode: Recompute) -> None:
-        """There is nothing worth recomputing: a layer's activations are a chunk's few tokens."""
-
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
-        return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
+        return self.head.sampling_noise(generator)
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A normalised chunk [b, h, a] in so many Euler steps, 10 by default."""
-        steps = steps or EULER_STEPS
-        prepared = self._prepare(batch, images, inject)
-        times = flow.euler_times(steps, self.device)
+        steps = steps or self.head.steps
+        context, start = self.read_context(batch, injection), noise["noise"]
+        times = self.head.times(steps, start.device)
 
-        def velocity(x: Tensor, index: int) -> Tensor:
-            time = times[index].expand(len(x))
-            return (x - self._clean(batch, *prepared, x, time, 1)) / time[:, None, None].clamp(min=1 / steps)
+        def clean(x: Tensor, index: int) -> Tensor:
+            return self.denoise(context, x, times[index].expand(len(x)), 1)
 
-        return flow.euler(draws["noise"], steps, agreeing(velocity, batch.overlap, times))
+        return self.head.sample(clean, start, steps, batch.overlap)
 
-    def _prepare(self, batch: Batch, images: Tensor, inject: Inject) -> tuple[Tensor, Tensor, Tensor, Injection]:
-        """What does not depend on the noise: each layer's keys and values, their mask, what the goal says."""
-        observation = self.observation_blocks(batch, images)
-        injection = inject(observation)
+    def read_context(self, batch: Batch, injection: Injection) -> Context:
+        """All that does not depend on the noise."""
         visible = [block for block in injection.blocks if block.name in injection.visibility["action"]]
-        cached = torch.cat([self.columns[block.expert](block.tokens) for block in visible], 3)
-        mask = additive_mask(torch.cat([block.mask for block in visible], 1)[:, None], cached.dtype)
-        words = self.prompt_in(observation[1].tokens) * batch.prompt_mask[..., None]
-        prompt_mean = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
-        return cached, mask, prompt_mean, injection
+        keys_values = torch.cat([self.columns[block.expert](block.tokens) for block in visible], 3)
+        mask = additive_mask(torch.cat([block.mask for block in visible], 1)[:, None], keys_values.dtype)
+        (prompt,) = (block for block in injection.blocks if block.name == "prompt")
+        words = self.prompt_in(prompt.tokens) * batch.prompt_mask[..., None]
+        condition = words.sum(1) / batch.prompt_mask.sum(1, keepdim=True).clamp(min=1)
+        if batch.state is not None:
+            condition = condition + self.state_in(_waves(batch.state.float()))
+        return Context(keys_values, mask, condition, injection.hook)
 
-    def _clean(
-        self,
-        batch: Batch,
-        cached: Tensor,
-        mask: Tensor,
-        prompt_mean: Tensor,
-        injection: Injection,
-        noisy: Tensor,
-        time: Tensor,
-        versions: int,
-    ) -> Tensor:
+    def denoise(self, context: Context, x_t: Tensor, time: Tensor, versions: int) -> Tensor:
         """The chunks [b·r, h, a] without their noise, from noisy ones at times [b·r]."""
-        condition = self.time_in(flow.time_embedding(time, self.config.action.width))
-        known = prompt_mean if batch.state is None else prompt_mean + self.state_in(_waves(batch.state.float()))
-        condition = condition + known.repeat_interleave(versions, 0)
-        x = self.action_in(noisy) + self.steps.weight + condition[:, None]
-        for at, layer in enumerate(self.layers):
-            x = layer(x, condition, *cached[at], mask, versions, injection.hook, at)
+        condition = self.time_in(time_embedding(time, self.config.action.width))
+        condition = condition + context.condition.repeat_interleave(versions, 0)
+        x = self.action_in(x_t) + self.steps.weight + condition[:, None]
+        for i, layer in enumerate(self.layers):
+            x = layer(x, condition, *context.keys_values[i], context.mask, versions, bind_hook(context.hook, i))
         output: Tensor = self.action_out(self.final(x)[0]).float()
         return output
 
+    def recompute(self, mode: Recompute) -> None:
+        """No effect: a layer's activations are a chunk's few tokens."""
+
     def parts(self) -> Mapping[str, str]:
-        """Tower; words and images; columns that an integration asked for; all else acts."""
+        """Tower; words and images; columns of an integration's extra experts; the rest is `action`."""
         return self.PARTS
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mme_vla.backbone.attention import our_kernels
+from mme_vla.backbone.attention import fused_kernels
 from mme_vla.backbone.config import VisionConfig
 from mme_vla.backbone.layers import compute_dtype
 from mme_vla.errors import UserError
@@ -113,7 +113,7 @@ class VisionTower(nn.Module):
             x = patches.flatten(2).transpose(1, 2) + vit.pos_embed.float()
         dtype = compute_dtype(vit.head.weight)
         x = x.to(dtype)
-        with our_kernels(x):
+        with fused_kernels(x):
             if frame_mask is None:
                 for block in vit.blocks:
                     x = block(x)

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import cli
 from mme_vla.errors import UserError, printable
+from mme_vla.memory.base import make_scorer
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -157,7 +158,7 @@ def build_memory(cfg: DictConfig) -> "Memory":
 
     config: Any = OmegaConf.to_container(cfg, resolve=True)
     backbone = shape_of(config["backbone"])
-    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.token_width)
+    return mme.build_memory(config["memory"], backbone.vision_width, backbone.grid, backbone.vision_width)
 
 
 def draw_memory(
@@ -174,7 +175,7 @@ def draw_memory(
     from mme_vla.memory.history import OnlineHistory
 
     frames = source.frames(episode, np.arange(step + 1))
-    history = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
+    history = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
     stored, patches = history.to_encode(len(frames)), memory.storage.grid**2
     history.append(frames, _no_tokens(len(stored), patches))
     selected = memory.select(history, step)

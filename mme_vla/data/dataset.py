@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from mme_vla.data.cache import VisionCache
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, past_view_spec, uses_proprio
 from mme_vla.processing.base import PolicyProcessor, Sample
 from mme_vla.processing.base import collate as collate
 from mme_vla.processing.images import past_views
@@ -198,13 +198,13 @@ class TrainingDataset(Dataset[dict[str, Any]]):
             item["action_mask"] = torch.from_numpy(step.recorded)
         if self.memory is not None:
             history = self.caches[step.source].history(step.episode)
-            if self.memory.reads_motion:
+            if uses_proprio(self.memory):
                 history.motion = partial(self._motion, step.source, step.episode)
                 history.state_width = self.processor.embodiment.state.width
-            item["history"] = self.memory.recall(history, step.index, rng if self.jitter else None)
-            if self.memory.past_view_spec is not None:
+            item["history"] = self.memory.gather_selection(history, step.index, rng if self.jitter else None)
+            if (spec := past_view_spec(self.memory)) is not None:
                 read = partial(self._images, step.source, step.episode)
-                item["past"] = past_views(self.memory.past_view_spec, step.index, read, self.processor.images)
+                item["past"] = past_views(spec, step.index, read, self.processor.images)
         return item
 
     def _images(self, source: int, episode: int, frames: np.ndarray) -> list[np.ndarray]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.blocks import Block, Visibility
+from mme_vla.backbone.attention import Block, Visibility
 from mme_vla.backbone.config import BackboneConfig
 from mme_vla.errors import UserError
 from mme_vla.integration.base import (

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from mme_vla.backbone.blocks import Block
+from mme_vla.backbone.attention import Block
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.integration.base import Integration, checked_position, explicit_positions, memory_visibility, required
 from mme_vla.registry import INTEGRATIONS

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import MemoryModule
 from mme_vla.memory.history import StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
 
@@ -66,7 +66,7 @@ class FeatureEncoder(nn.Module):
         return self.encode(features, position_features(positions, self.position_dim) * mask[..., None])
 
 
-class PerceptualMemory(Memory):
+class PerceptualMemory(MemoryModule):
     """Selected tokens, right-padded to the budget and encoded one by one; subclasses choose."""
 
     timed = True

@@ -4,9 +4,13 @@ Both forms answer the same three questions: which frames are there (`len`), what
 (`scores`), and what are the tokens at these (frame, patch) pairs (`gather`). A memory cannot tell them apart.
 """
 
+import ast
+import hashlib
+import inspect
+import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,10 +24,10 @@ class StorageSpec:
     """What a memory wants kept of every frame. It is data, so that a cache can be named after it.
 
     grid: side of the pooled token grid (a view's tokens are pooled to grid×grid before they are stored); it divides the
-        backbone's (`Memory.check_grid`).
+        backbone's (`check_grid`).
     pooling: `mean` (as released) or `max` (paper, section 4.2).
     keep_every: frame 0 and frames k·keep_every − 1 are kept; 1 keeps all. Others are never encoded.
-    scorer: name of the frame scorer whose rows are stored beside the tokens; empty for none.
+    scorer: key of the frame scorer whose rows are stored beside the tokens (`FrameScorer.key`); empty for none.
     """
 
     grid: int
@@ -52,12 +56,40 @@ class StorageSpec:
         return asdict(self)
 
 
-class FrameScorer(Protocol):
-    """Scores raw frames as they pass, for memories that choose by content. One instance per episode."""
+FORMER_KEYS: dict[str, str] = {}
+"""Digest of a scorer's code → the format of its key in caches that were built before keys had a digest."""
+
+
+class FrameScorer:
+    """Scores raw frames as they pass, for memories that choose by content. One instance per episode.
+
+    Subclasses are dataclasses: their fields are the options.
+    """
+
+    @classmethod
+    def digest(cls) -> str:
+        """A hash of the code of the class and its bases, without comments, docstrings and helper functions."""
+        code = []
+        for part in cls.__mro__[: cls.__mro__.index(FrameScorer)]:
+            tree = ast.parse(textwrap.dedent(inspect.getsource(part)))
+            for node in ast.walk(tree):
+                if isinstance(node, ast.FunctionDef | ast.ClassDef) and ast.get_docstring(node) is not None:
+                    node.body = node.body[1:] or [ast.Pass()]
+            code.append(ast.unparse(tree))
+        return hashlib.sha256("\n".join(code).encode()).hexdigest()[:8]
+
+    @property
+    def key(self) -> str:
+        """The name of these scores in a cache: it follows from the class, its code and its options."""
+        options = {f.name: getattr(self, f.name) for f in fields(self) if f.init}  # type: ignore[arg-type]
+        digest = self.digest()
+        if digest in FORMER_KEYS:
+            return FORMER_KEYS[digest].format(**options)
+        return "-".join([type(self).__name__.lower(), *(f"{k}{v}" for k, v in options.items()), digest])
 
     def __call__(self, frame_index: int, frame: np.ndarray) -> np.ndarray | None:
         """Take one RGB frame [H, W, 3] uint8 of the memory view; return a score per patch [grid²] or None."""
-        ...
+        raise NotImplementedError
 
 
 @dataclass
@@ -81,7 +113,7 @@ class History:
     """One episode's stored tokens. `exec_start` is the index of the first execution frame (0 without a video).
 
     `motion` gives what the robot felt and did at frames [n], [n, w] float32, normalised, the first `state_width` of
-    them its state; both are there for memories that say `reads_motion`.
+    them its state; both are there for a `ProprioMemory`.
     """
 
     motion: Callable[[np.ndarray], Tensor] | None = None
@@ -270,11 +302,11 @@ class OnlineHistory(History):
 
 
 class PromptConditionedHistory(History):
-    """A history whose tokens go through `mark` [n, d_vision] → [n, d_vision] as they are gathered."""
+    """A history whose tokens are changed by `condition` [n, d_vision] → [n, d_vision] as they are gathered."""
 
-    def __init__(self, source: History, mark: Callable[[Tensor], Tensor]) -> None:
+    def __init__(self, source: History, condition: Callable[[Tensor], Tensor]) -> None:
         super().__init__(source.spec, source.exec_start)
-        self._source, self._mark = source, mark
+        self._source, self._condition = source, condition
         self.motion, self.state_width = source.motion, source.state_width
 
     def __len__(self) -> int:
@@ -285,7 +317,7 @@ class PromptConditionedHistory(History):
         return self._source.scores
 
     def gather(self, indices: np.ndarray) -> Tensor:
-        return self._mark(self._source.gather(indices))
+        return self._condition(self._source.gather(indices))
 
     def stored(self, indices: np.ndarray) -> Tensor:
         return self._source.stored(indices)

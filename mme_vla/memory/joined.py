@@ -10,7 +10,22 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import Memory, PastViewSpec, union_frames
+from mme_vla.memory.base import (
+    CompilableMemory,
+    MemoryModule,
+    PastViewMemory,
+    PastViewSpec,
+    ProprioMemory,
+    ScoringMemory,
+    StreamingMemory,
+    encode_histories,
+    frames_scored,
+    make_scorer,
+    past_view_spec,
+    start_stream,
+    union_frames,
+    uses_proprio,
+)
 from mme_vla.memory.history import FrameScorer, FrameScores, History, StorageSpec
 from mme_vla.registry import MEMORIES
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -19,7 +34,7 @@ SHARE_UNIT = 16  # shares are multiples of it, so that they hold whole frames of
 
 
 @MEMORIES.register("joined")
-class JoinedMemory(Memory):
+class JoinedMemory(MemoryModule, StreamingMemory, ScoringMemory, ProprioMemory, PastViewMemory, CompilableMemory):
     """Each member selects and encodes as if it were alone, within its share of the budget.
 
     The history keeps what serves all of them: a grid of which all of theirs are pooled when they are read
@@ -39,7 +54,7 @@ class JoinedMemory(Memory):
         """
         super().__init__()
         sections = shares(members, budget)
-        built: list[Memory] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
+        built: list[MemoryModule] = [MEMORIES.build(section, d_vision=d_vision, width=width) for section in sections]
         self.members = nn.ModuleList(built)
         self.names = _distinct([section["name"] for section in sections])
         self.storage = common_storage(dict(zip(self.names, [member.storage for member in built], strict=True)))
@@ -47,17 +62,18 @@ class JoinedMemory(Memory):
         self.capacity = sum(m.capacity * (self.storage.grid // m.storage.grid) ** 2 for m in built)
         self.pad_left = any(member.pad_left for member in built)
         self.timed = all(member.timed for member in built)
-        self.reads_motion = any(member.reads_motion for member in built)
+        self.uses_proprio = any(uses_proprio(member) for member in built)
         self.lazy = all(member.lazy for member in built)
         self.past_view_spec = single_past_view_spec(
-            {n: m.past_view_spec for n, m in zip(self.names, built, strict=True)}
+            {n: past_view_spec(m) for n, m in zip(self.names, built, strict=True)}
         )
         # Indices of the members in the order in which their selections lie.
         self._order = sorted(range(len(built)), key=lambda i: not built[i].pad_left)
 
     def compile(self, **options: Any) -> None:
         for member in self.memories:
-            member.compile(**options)
+            if isinstance(member, CompilableMemory):
+                member.compile(**options)
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
         """What any member remembers, as the stored tokens it is made of."""
@@ -71,11 +87,11 @@ class JoinedMemory(Memory):
         return union_frames([member.frames_read(steps, exec_start) for member in self.memories])
 
     def frames_scored(self, length: int) -> np.ndarray:
-        return union_frames([member.frames_scored(length) for member in self.memories])
+        return union_frames([frames_scored(member, length) for member in self.memories])
 
     def make_scorer(self) -> FrameScorer | None:
         for member in self.memories:
-            scorer = member.make_scorer()
+            scorer = make_scorer(member)
             if scorer is not None:
                 return _Upsampled(scorer, member.storage.grid, self.storage.grid)
         return None
@@ -84,17 +100,17 @@ class JoinedMemory(Memory):
         first, *others = (self.memories[i] for i in self._order)
         return first.padded_length(min(count, first.capacity)) + sum(member.capacity for member in others)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
         memories, views = self.memories, self._views(history)
         parts = []
         for place, i in enumerate(self._order):
-            part = memories[i].recall(views[i], step, rng)
+            part = memories[i].gather_selection(views[i], step, rng)
             parts.append(_padded(part, memories[i]) if place else part)
         features, positions, mask = (torch.cat([getattr(part, name) for part in parts]) for name in _FIELDS)
         return HistoryTokens(features, positions, mask, parts[0].step)
 
-    def condition_on_prompt(self, history: HistoryTokens, mark: Callable[[Tensor], Tensor]) -> HistoryTokens:
-        parts = [self.memories[i].condition_on_prompt(piece, mark) for i, piece in self._pieces(history)]
+    def condition_on_prompt(self, history: HistoryTokens, condition: Callable[[Tensor], Tensor]) -> HistoryTokens:
+        parts = [self.memories[i].condition_on_prompt(piece, condition) for i, piece in self._pieces(history)]
         return replace(history, features=torch.cat([part.features for part in parts], 1))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
@@ -113,23 +129,24 @@ class JoinedMemory(Memory):
         return [(i, HistoryTokens(f, p, m, history.step)) for i, (f, p, m) in zip(self._order, pieces, strict=True)]
 
     def start_stream(self) -> tuple[Any, ...]:
-        return tuple(member.start_stream() for member in self.memories)
+        return tuple(start_stream(member) for member in self.memories)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         views = [self._views(history) for history in histories]
         return self._joined([
-            member.encode([view[i] for view in views], [stream[i] for stream in streams])
+            encode_histories(member, [view[i] for view in views], [stream[i] for stream in streams])
             for i, member in enumerate(self.memories)
         ])  # fmt: skip
 
     def prepare(self, history: History, stream: Any) -> bool:
         members = zip(self.memories, self._views(history), stream, strict=True)
-        return sum(member.prepare(view, piece) for member, view, piece in members) > 0  # a piece of each
+        left = [m.prepare(view, piece) for m, view, piece in members if isinstance(m, StreamingMemory)]
+        return any(left)
 
     @property
-    def memories(self) -> list[Memory]:
+    def memories(self) -> list[MemoryModule]:
         """The members, in their order."""
-        return [member for member in self.members if isinstance(member, Memory)]
+        return [member for member in self.members if isinstance(member, MemoryModule)]
 
     def _views(self, history: History) -> list[History]:
         return [CoarserHistory(history, member.storage) for member in self.memories]
@@ -180,7 +197,7 @@ class CoarserHistory(History):
         return (cells.mean(1) if self.spec.pooling == "mean" else cells.amax(1)).to(pooled.dtype)
 
 
-class _Upsampled:
+class _Upsampled(FrameScorer):
     """A member's scorer, its rows spread over the finer grid that is stored."""
 
     def __init__(self, scorer: FrameScorer, grid: int, fine: int) -> None:
@@ -251,7 +268,7 @@ def single_past_view_spec(specs: Mapping[str, PastViewSpec | None]) -> PastViewS
     return next(iter(defined.values()), None)
 
 
-def _padded(part: HistoryTokens, member: Memory) -> HistoryTokens:
+def _padded(part: HistoryTokens, member: MemoryModule) -> HistoryTokens:
     """A selection at its member's capacity."""
     missing = member.capacity - len(part.mask)
     ends = (missing, 0) if member.pad_left else (0, missing)

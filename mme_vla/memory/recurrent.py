@@ -1,7 +1,7 @@
-"""What the two recurrent memories share: frame after frame enters a small state, and the state is what is read.
+"""Base of the recurrent memories: frames update a small state, and the state is read as memory tokens.
 
-Two forms of the same computation: `forward` runs a whole window, for training and for ready batches; `init_state`,
-`update` and `read` take it frame by frame. `remember` uses the second while an episode's frame list grows.
+Two forms of the same computation: `forward` runs a full window, for training; `init_state`, `update` and `read` take it
+frame by frame, which `encode` uses while an episode's frame list grows.
 """
 
 from collections import defaultdict
@@ -17,7 +17,17 @@ from torch.utils.checkpoint import checkpoint
 
 from mme_vla.config.devices import float32_products
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, all_patches, jittered, recurrent_frames, token_positions, union_frames
+from mme_vla.memory.base import (
+    CompilableMemory,
+    MatmulPrecision,
+    MemoryModule,
+    StreamingMemory,
+    all_patches,
+    jittered,
+    recurrent_frames,
+    token_positions,
+    union_frames,
+)
 from mme_vla.memory.encoder import FeatureEncoder
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.types import HistoryTokens, MemoryTokens
@@ -114,7 +124,7 @@ class RecurrentLayer(nn.Module):
         return {}
 
 
-class RecurrentMemory(Memory):
+class RecurrentMemory(MemoryModule, StreamingMemory, CompilableMemory, MatmulPrecision):
     """Encoder → recurrent layer → output projection. Subclasses supply the layer."""
 
     pad_left = True

@@ -11,15 +11,14 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from mme_vla.backbone.base import stack_draws
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.base import Memory, make_scorer, stack_history, uses_proprio
 from mme_vla.memory.history import FrameScores, History, StorageSpec
 from mme_vla.nano.demonstrations import Demonstration
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.normalise import NormStats, QuantileStats, RunningStats
 from mme_vla.processing.prompt import perturb_point, subgoal_kind
-from mme_vla.types import Batch, HistoryTokens
+from mme_vla.types import Batch, HistoryTokens, stack_noise
 from mme_vla.utils import write_atomically
 
 NARROWEST = 0.1  # of an action's number, in metres or radians: less than that is jitter, and is not blown up
@@ -177,7 +176,7 @@ def position_error(policy: MMEPolicy, val_set: Decisions, seed: int = 0) -> Tens
     rows = val_set.distant.nonzero()[:, 0].tolist()
     batch, generator = val_set.collate(rows), torch.Generator().manual_seed(seed)
     assert batch.actions is not None and batch.state is not None
-    chunk = policy.sample_actions(batch, stack_draws([policy.sample_draws(generator) for _ in rows])).float()
+    chunk = policy.sample_actions(batch, stack_noise([policy.sampling_noise(generator) for _ in rows])).float()
     processor = policy.require_processor()
     predicted = processor.absolute_actions(chunk, batch.state)
     return (predicted - processor.absolute_actions(batch.actions, batch.state))[:, 0, :2].norm(dim=1)
@@ -220,7 +219,7 @@ def _items(policy: MMEPolicy, demonstration: Demonstration) -> list[dict[str, An
             "action_mask": torch.from_numpy(recorded),
         }  # fmt: skip
         if history is not None:
-            item["history"] = policy.require_memory().recall(history, frame)
+            item["history"] = policy.require_memory().gather_selection(history, frame)
         items.append(item)
     return items
 
@@ -237,7 +236,7 @@ def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
         policy.memory.storage, demonstration.length, dict(zip(taken, tokens, strict=True)), demonstration.exec_start,
         _scores(policy.memory, taken),
     )  # fmt: skip
-    if policy.memory.reads_motion:  # an action is a motion of many frames here, so the states alone tell what was done
+    if uses_proprio(policy.memory):  # an action is a motion of many frames here, so the states alone tell what was done
         nothing = np.zeros((demonstration.length, policy.embodiment.action.width), np.float32)
         motion = policy.require_processor().motion(
             demonstration.states[: demonstration.length], nothing, np.zeros(demonstration.length, bool)
@@ -248,7 +247,7 @@ def _history(policy: MMEPolicy, demonstration: Demonstration) -> History | None:
 
 def _scores(memory: Memory, images: Mapping[int, np.ndarray]) -> FrameScores:
     """What the memory's scorer says of these frames, as it says it while an episode runs."""
-    scorer = memory.make_scorer()
+    scorer = make_scorer(memory)
     scores = {} if scorer is None else {frame: scorer(frame, images[frame]) for frame in sorted(images)}
     rows = {frame: values for frame, values in scores.items() if values is not None}
     if not rows:

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, stack_draws
 from mme_vla.embodiment import Embodiment
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
@@ -17,6 +16,7 @@ from mme_vla.policy.episode import Episode
 from mme_vla.policy.saving import Saved
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
+from mme_vla.types import Noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -27,8 +27,8 @@ class Policy(Saved):
 
     A subclass registers in `POLICIES` (`policy.name` of a configuration), sets `memory` (or None), `processor`,
     `config`, `horizon` and `action_dim`, and implements what raises NotImplementedError. What a batch is, its processor
-    says: whoever trains only moves it to a device. Random numbers come from outside (`loss_draws`, `sample_draws`), so
-    that training resumes bit for bit, and the noise of an episode does not depend on its batch; only the policy knows
+    says: whoever trains only moves it to a device. Random numbers come from outside (`training_noise`,
+    `sampling_noise`), so that training resumes bit for bit, and the noise of an episode does not depend on its batch; only the policy knows
     what they mean.
     """
 
@@ -65,19 +65,19 @@ class Policy(Saved):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """The random numbers that the losses of `count` samples take, on the CPU: each value [count, …]."""
         return {}
 
-    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
-        """The random numbers that change the images of `count` training samples, if any; beside `loss_draws`'s."""
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
+        """The random numbers that change the images of `count` training samples, if any; beside `training_noise`'s."""
         return {}
 
     def forward(self, batch: Any, draws: Mapping[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss of a batch, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` makes them, on the policy's device; fresh ones by default.
+            batch: with `actions`. draws: as `training_noise` makes them, on the policy's device; fresh ones by default.
         """
         raise NotImplementedError
 
@@ -91,7 +91,7 @@ class Policy(Saved):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The random numbers that one sampled chunk takes, on the CPU, without a batch axis."""
         return {}
 
@@ -99,7 +99,7 @@ class Policy(Saved):
         """A normalised chunk [b, h, a].
 
         Args:
-            draws: as `sample_draws` makes them, with a batch axis, on the policy's device; fresh ones by default.
+            draws: as `sampling_noise` makes them, with a batch axis, on the policy's device; fresh ones by default.
             steps: of an iterative head; its own number by default.
         """
         raise NotImplementedError
@@ -144,7 +144,7 @@ class Policy(Saved):
             )
         processor.require_stats()  # before any episode's noise or memory moves on
         batch = self.observation(episodes)
-        draws = stack_draws([e.draw() for e in episodes])
+        draws = stack_noise([e.draw() for e in episodes])
         was_training = self.training
         self.eval()
         try:

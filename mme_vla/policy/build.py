@@ -12,7 +12,7 @@ from mme_vla.config.composition import compose, import_plugins
 from mme_vla.config.naming import words
 from mme_vla.errors import UserError
 from mme_vla.integration.base import Integration, extension_points
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, check_grid, past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.policy.saving import policy_class
 from mme_vla.processing.base import DEFAULT as DEFAULT_PROCESSOR
@@ -28,7 +28,7 @@ def build_memory(section: Mapping[str, Any], d_vision: int, grid: int, width: in
         d_vision: width of a vision token. grid: side of a view's token grid. width: of the memory's own tokens.
     """
     memory: Memory = MEMORIES.build(section, d_vision=d_vision, width=width)
-    memory.check_grid(grid)
+    check_grid(memory, grid)
     return memory
 
 
@@ -53,7 +53,7 @@ def check_integrated(
 
 def check_past(config: Mapping[str, Any], memory: Memory, supports: Set[str]) -> None:
     """Make sure that a memory that gives past views has a backbone whose vision tower looks at them."""
-    if memory.past_view_spec is not None and "past" not in supports:
+    if past_view_spec(memory) is not None and "past" not in supports:
         raise UserError(
             f"The memory {config['memory']['name']!r} gives the vision tower past views along with the current ones, "
             f"and the tower of the backbone {config['backbone']['name']!r} sees one image at a time. Take another "

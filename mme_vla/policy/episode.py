@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mme_vla.embodiment import Embodiment, Option
 from mme_vla.errors import UserError
+from mme_vla.memory.base import past_view_spec, start_history, start_stream, uses_proprio
 from mme_vla.memory.history import History, OnlineHistory
 from mme_vla.policy.promises import ActionPrefix, checked_prefix
 from mme_vla.processing.images import PastImages
@@ -71,7 +72,7 @@ class Host(Protocol):
 
     def encode_frames(self, frames: np.ndarray) -> Tensor: ...
 
-    def sample_draws(self, generator: torch.Generator) -> dict[str, Tensor]: ...
+    def sampling_noise(self, generator: torch.Generator) -> dict[str, Tensor]: ...
 
 
 class Episode:
@@ -89,15 +90,15 @@ class Episode:
         self.options: tuple[Option, ...] = ()
         """What can be chosen, for policies that choose; set it before `act`."""
         memory = policy.memory
-        self.history = None if memory is None else memory.start_history(policy.encode_frames)
-        if self.history is not None and memory is not None and memory.reads_motion:
+        self.history = None if memory is None else start_history(memory, policy.encode_frames)
+        if self.history is not None and uses_proprio(memory):
             self.history.motion = lambda frames: torch.stack([self._motion_of_frames[int(frame)] for frame in frames])
             self.history.state_width = policy.embodiment.state.width
-        self.stream = None if memory is None else memory.start_stream()
+        self.stream = start_stream(memory)
         """What the memory carries from one `act` to the next, where it has something to carry."""
         self.read: History | None = None
         """The history as the last `act` read it, where a backbone marks what is stored."""
-        spec = None if memory is None else memory.past_view_spec
+        spec = past_view_spec(memory)
         self._past = None if spec is None else PastImages(spec)
         self.n_observed_frames = 0
         self._motion_of_frames: list[Tensor] = []  # rows [w] of motion, one a frame, where the memory reads them
@@ -259,7 +260,7 @@ class Episode:
         Raises:
             UserError: it does, and there are no states, or no statistics.
         """
-        if not self._policy.require_memory().reads_motion:
+        if not uses_proprio(self._policy.require_memory()):
             return []
         if states is None:
             raise UserError(
@@ -272,10 +273,10 @@ class Episode:
             actions[places], known[places] = executed[: len(places)], True
         return list(self._policy.require_processor().motion(states, actions, known))
 
-    def recall(self) -> HistoryTokens:
+    def gather_selection(self) -> HistoryTokens:
         """The memory's selection at the current frame, unbatched."""
         history = self.required_history()
-        return self._policy.require_memory().recall(history, len(history) - 1)
+        return self._policy.require_memory().gather_selection(history, len(history) - 1)
 
     def required_history(self) -> OnlineHistory:
         """The history, once there is something in it.
@@ -389,7 +390,7 @@ class Episode:
 
     def draw(self) -> dict[str, Tensor]:
         """The next chunk's random numbers, from this episode's own generator: batching cannot change them."""
-        return self._policy.sample_draws(self._generator)
+        return self._policy.sampling_noise(self._generator)
 
     def _prepared_images(
         self, views: Mapping[str, np.ndarray], rendered: Mapping[str, np.ndarray] | None, frame: int

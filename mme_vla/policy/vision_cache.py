@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from mme_vla.memory.base import StreamingMemory
+
 if TYPE_CHECKING:
     from mme_vla.memory.base import Memory
     from mme_vla.policy.episode import Episode
@@ -50,7 +52,7 @@ def encode_frames(
 
 def prepare(policy: VisionEncoder, episode: "Episode") -> bool:
     """`Policy.prepare` where the memory reads the episode's own history."""
-    if policy.memory is None or not episode.n_observed_frames:
+    if not isinstance(policy.memory, StreamingMemory) or not episode.n_observed_frames:
         return False
     with policy.autocast():
         return policy.memory.prepare(episode.required_history(), episode.stream)

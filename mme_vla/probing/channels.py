@@ -204,7 +204,7 @@ class SelectionChannel(Channel):
         view, at, frames = snapshot.source
         slots = dict(zip(frames, stores[0].entries, strict=True))
         places = {frame: entry.content for frame, entry in slots.items() if entry is not None}
-        tokens = self._memory.recall(Exchanged(view, places), at)
+        tokens = self._memory.gather_selection(Exchanged(view, places), at)
         positions, mask = tokens.positions.clone(), tokens.mask.clone()
         for frame, entry in slots.items():
             its = tokens.mask & (tokens.positions[:, 0] == frame)

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws
 from mme_vla.config.sections import read_section
 from mme_vla.evaluation.rollout.episode import episode_seed
 from mme_vla.policy.base import Policy
@@ -22,6 +21,7 @@ from mme_vla.probing.lines import EntryLine, Line, MomentLine
 from mme_vla.probing.probed import DonorEpisodes, ProbedEpisode, ProbedPolicy
 from mme_vla.probing.recordings import Recording, others
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.types import Noise
 
 
 @dataclass(frozen=True)
@@ -134,10 +134,10 @@ class _Moments:
         """Everything that is found."""
         return [line for probed in self._by_feed.values() for line in self._watch(probed)]
 
-    def _shared_noise(self) -> dict[int, list[Draws]]:
+    def _shared_noise(self) -> dict[int, list[Noise]]:
         generator = torch.Generator().manual_seed(self._seed)
         count = self._settings.draws
-        return {step: [self._policy.sample_draws(generator) for _ in range(count)] for step in self._steps}
+        return {step: [self._policy.sampling_noise(generator) for _ in range(count)] for step in self._steps}
 
     def _watch(self, arms: list[ProbedPolicy]) -> list[Line]:
         """Show the episode once to arms that are shown the same."""

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, stack_draws
 from mme_vla.errors import UserError
 from mme_vla.policy.base import Policy
 from mme_vla.policy.episode import Episode, Host
@@ -18,6 +17,7 @@ from mme_vla.probing.channels import Channel, MemorySnapshot, Remembered, channe
 from mme_vla.probing.interventions import Moment
 from mme_vla.probing.recordings import SUBGOAL, Recording, others, stored_frames
 from mme_vla.processing.prompt import subgoal_kind
+from mme_vla.types import Noise, stack_noise
 
 
 class Prober(Host, Protocol):
@@ -269,8 +269,8 @@ class ProbedPolicy(Policy):
         """Begin an episode, with the sessions that come before it."""
         return ProbedEpisode(self, goal, seed)
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
-        return self.inner.sample_draws(generator)
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
+        return self.inner.sampling_noise(generator)
 
     def sample_actions(self, batch: Any, draws: Mapping[str, Tensor] | None = None, steps: int | None = None) -> Tensor:
         return self.inner.sample_actions(batch, draws, steps)
@@ -316,7 +316,7 @@ class ProbedPolicy(Policy):
             self.channel.commit(episode.inner, its)
         return chunk
 
-    def snapshot(self, episode: ProbedEpisode, sampled: Draws | None = None) -> tuple[MemorySnapshot, list[Remembered]]:
+    def snapshot(self, episode: ProbedEpisode, sampled: Noise | None = None) -> tuple[MemorySnapshot, list[Remembered]]:
         """What is remembered among the frames that may be, and what the arm makes of it."""
         moment = self.moment(episode)
         snapshot = self.channel.read(episode.inner, only=self.arm.only(moment))
@@ -338,7 +338,7 @@ class ProbedPolicy(Policy):
         return Moment(rng, now, stored, episode.boundaries, episode.subgoals, weigh=weigh, **known)
 
     def _weigh(
-        self, episode: ProbedEpisode, snapshot: MemorySnapshot, place: int, sampled: Draws, store: Remembered
+        self, episode: ProbedEpisode, snapshot: MemorySnapshot, place: int, sampled: Noise, store: Remembered
     ) -> np.ndarray:
         """By how much a chunk changes without each slot of a store."""
         slots = store.occupied
@@ -355,7 +355,7 @@ class ProbedPolicy(Policy):
         episode: ProbedEpisode,
         snapshot: MemorySnapshot,
         variants: Sequence[Sequence[Remembered]],
-        draws: Sequence[Draws],
+        draws: Sequence[Noise],
         steps: int | None = None,
         batch: int = 64,
     ) -> Tensor:
@@ -371,7 +371,7 @@ class ProbedPolicy(Policy):
         for start in range(0, len(pairs), batch):
             part = pairs[start : start + batch]
             observation = self.inner.observation([episode.inner] * len(part))
-            stacked = stack_draws([sampled for _, sampled in part])
+            stacked = stack_noise([sampled for _, sampled in part])
             chunks.append(
                 self.channel.answer(observation, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu()
             )

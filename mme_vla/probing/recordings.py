@@ -8,6 +8,7 @@ import numpy as np
 
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.keyframes import EpisodeKeyframes, file_of
+from mme_vla.memory.base import frames_scored, past_view_spec
 from mme_vla.policy.base import Policy
 
 SUBGOAL = "simple_subgoal"
@@ -136,6 +137,6 @@ def others(recordings: Sequence[Recording], exclude: Recording | None, goal: str
 def stored_frames(policy: Policy, length: int) -> np.ndarray | None:
     """Frames of an episode that a memory may have stored or scored, whatever it chooses; None for all."""
     memory = policy.memory
-    if memory is None or memory.past_view_spec is not None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
+    if memory is None or past_view_spec(memory) is not None or policy.frames_read(np.zeros(1, np.int64), 0) is None:
         return None
-    return np.union1d(memory.storage.stored_frames(length), memory.frames_scored(length))
+    return np.union1d(memory.storage.stored_frames(length), frames_scored(memory, length))

@@ -125,7 +125,7 @@ class PastImages:
     def take(self, views: Mapping[str, np.ndarray], count: int, rendered: Mapping[str, np.ndarray] | None) -> None:
         """Add the next `count` frames of every camera; `rendered` as in `Episode.observe`."""
         first, self._count = self._count, self._count + count
-        oldest = self._count - 1 - self.spec.reach
+        oldest = self._count - 1 - self.spec.span
         for frame in range(max(oldest, first), self._count):
             places = [_place(frame - first, None if rendered is None else rendered[name]) for name in views]
             if all(place is not None for place in places):

@@ -156,7 +156,7 @@ class Processor(PolicyProcessor):
         sizes = {"image_size": backbone.image_size, "action_dim": backbone.action_dim}
         settings = {key: value for key, value in sections["processor"].items() if key != "name"}
         processor = cls.from_config({**settings, **sizes, "embodiment": embodiment_of(sections).to_dict()})
-        vocab_size = backbone.vocab_size
+        vocab_size = sections["backbone"].get("vocab_size")
         if vocab_size is not None and processor.tokenizer.vocab_size > vocab_size:
             raise UserError(
                 f"The tokenizer {processor.tokenizer.spec!r} has {processor.tokenizer.vocab_size} entries but "

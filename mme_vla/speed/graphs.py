@@ -1,4 +1,4 @@
-"""A chunk as one CUDA graph: thousands of launches become one, for each size of batch that occurs."""
+"""A chunk as one CUDA graph: thousands of kernel launches become one, for each batch size that occurs."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,8 +26,8 @@ class _Captured:
 class GraphSampler:
     """Captures `run` once for every size, and replays it from then on.
 
-    Batches are filled up to a power of two by rows that nobody reads, so that few sizes occur. All graphs share one
-    pool of memory: a chunk is copied out before the next one is computed.
+    Batches are padded to a power of two with rows whose output is ignored, so that few sizes occur. All graphs share
+    one pool of memory: a chunk is copied out before the next one is computed.
 
     Args:
         run: what is captured; it must give the same for a row whatever stands beside it.
@@ -95,7 +95,7 @@ class CapturedSampling:
     """A policy's sampler behind graphs: one `GraphSampler` for each number of steps.
 
     Args:
-        sample: (batch, memory, draws, steps) → chunks. stamp: what graphs depend on beside their inputs and the places
+        sample: (batch, memory, noise, steps) → chunks. stamp: what graphs depend on beside their inputs and the places
             of weights; where it changes they are captured again.
     """
 
@@ -104,19 +104,19 @@ class CapturedSampling:
         self._graphs: dict[int, GraphSampler] = {}
         self._captured_at: object = None
 
-    def __call__(self, batch: Batch, memory: MemoryTokens | None, draws: Mapping[str, Tensor], steps: int) -> Tensor:
+    def __call__(self, batch: Batch, memory: MemoryTokens | None, noise: Mapping[str, Tensor], steps: int) -> Tensor:
         """Chunks [b, h, a]."""
         if (stamp := self._stamp()) != self._captured_at:
             self._graphs, self._captured_at = {}, stamp
         if steps not in self._graphs:
             self._graphs[steps] = GraphSampler(lambda inputs: self._run(inputs, steps))
         inputs: dict[str, Tensor | TensorStruct] = {
-            "batch": replace(batch, history=None, actions=None, action_mask=None), **draws,
+            "batch": replace(batch, history=None, actions=None, action_mask=None), **noise,
         }  # fmt: skip
         if memory is not None:
             inputs["memory"] = replace(memory, metrics={})
         return self._graphs[steps](inputs)
 
     def _run(self, inputs: Inputs, steps: int) -> Tensor:
-        draws = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
-        return self._sample(inputs["batch"], inputs.get("memory"), draws, steps)
+        noise = {name: value for name, value in inputs.items() if isinstance(value, Tensor)}
+        return self._sample(inputs["batch"], inputs.get("memory"), noise, steps)

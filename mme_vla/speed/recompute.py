@@ -1,4 +1,4 @@
-"""Layers that keep no activations for the backward pass, or only those that are dear to compute again."""
+"""Activation checkpointing: layers that keep no activations for the backward pass, or only the expensive ones."""
 
 from collections.abc import Callable
 from functools import partial

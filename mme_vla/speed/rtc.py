@@ -36,7 +36,7 @@ def strength(time: Tensor) -> Tensor:
     return ((remaining.square() + time.square()) / (remaining * time)).nan_to_num(posinf=STRONGEST).clamp(max=STRONGEST)
 
 
-def agreeing(velocity: Velocity, overlap: Overlap | None, times: Tensor) -> Velocity:
+def rtc_guidance(velocity: Velocity, overlap: Overlap | None, times: Tensor) -> Velocity:
     """A velocity whose path ends in agreement with `overlap`; without one, the same velocity.
 
     Each call then also runs the network backwards.

@@ -1,18 +1,17 @@
-"""Which weights processes that share a policy gather together, and in what precision."""
+"""Sharding groups: which weights processes gather together, and in what precision."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from torch import nn
 
 
 class ShardGroup(NamedTuple):
-    """A module whose weights are gathered right before it runs, and let go of after.
+    """A module whose weights are gathered before its forward and freed after it.
 
-    module: it runs by being called, nobody reads its weights but then, and it answers with tensors, or with tuples,
-        lists and dictionaries of tensors.
-    full: gathered in float32 where all else is gathered in bfloat16: what computes in float32, and towers that hold
-        such layers without calling them.
+    module: its weights are read in its forward alone, and it returns tensors or collections of them.
+    full: gather in float32 instead of bfloat16: modules that compute in float32, and towers that hold such layers
+        without calling them.
     """
 
     module: nn.Module
@@ -20,9 +19,9 @@ class ShardGroup(NamedTuple):
 
 
 def stacked_layers(module: nn.Module) -> Iterator[nn.Module]:
-    """The layers of a network: those that stand in a list of at least two of one class; of nested ones the outermost.
+    """The layers of a network: members of a `ModuleList` of at least two of one class, of nested ones the outermost.
 
-    They run one after the other, so that of all their weights one layer's are needed at a time.
+    They run one after the other, so that one layer's weights are needed at a time.
     """
     for child in module.children():
         inside = list(child.children())
@@ -33,8 +32,16 @@ def stacked_layers(module: nn.Module) -> Iterator[nn.Module]:
             yield from stacked_layers(child)
 
 
+def backbone_groups(backbone: nn.Module) -> list[ShardGroup]:
+    """The vision tower `backbone.vision` as one group, and each layer of the rest."""
+    tower: Any = backbone.vision
+    in_tower = set(tower.modules())
+    layers = [ShardGroup(layer) for layer in stacked_layers(backbone) if layer not in in_tower]
+    return [ShardGroup(tower, full=True), *layers]
+
+
 def float32_modules(group: nn.Module) -> list[nn.Module]:
-    """The modules inside a group that compute in float32: norms, and those that say so (`keeps_float32`)."""
+    """The modules inside a group that compute in float32: norms, and those with `keeps_float32`."""
     if getattr(group, "keeps_float32", False):
         return [group]
     children = list(group.children())

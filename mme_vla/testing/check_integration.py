@@ -32,7 +32,7 @@ def check_integration(name: str, memory: str = "framesamp", backbone: str = "tin
     if policy.integration.memory_width < 1:
         raise UserError(f"The integration {name!r} takes no memory: its memory_width is 0.")
     batch = random_batch(policy, batch=2, valid=64)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     assert batch.history is not None
     with torch.no_grad():
         memory_tokens = policy.encode_memory(batch.history)
@@ -93,7 +93,7 @@ def check_rows(policy: MMEPolicy, batch: Batch, draws: dict[str, Tensor], memory
 
 def check_sampling(policy: MMEPolicy, batch: Batch, memory: MemoryTokens) -> None:
     """What runs once a chunk and what runs in every step add up to the pass that training makes."""
-    draws = {k: torch.stack([v, v]) for k, v in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    draws = {k: torch.stack([v, v]) for k, v in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
     for steps in (1, 2):  # as many as samples, too: a step must not be taken for a sample
         chunk = policy.sample_actions(batch, draws, steps=steps, memory=memory)
         assert torch.isfinite(chunk).all(), "a sampled chunk is not finite."

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 import mme_vla.memory  # noqa: F401  (registers what ships)
-from mme_vla.memory.base import Memory, stack_history
+from mme_vla.memory.base import Memory, encode_histories, make_scorer, stack_history, start_stream, uses_proprio
 from mme_vla.memory.history import CachedHistory, FrameScores, History, OnlineHistory
 from mme_vla.registry import MEMORIES
 from mme_vla.testing.small import moving_frames
@@ -59,7 +59,7 @@ class Episode:
     def cached(self, length: int | None = None) -> CachedHistory:
         """The whole episode, or its first `length` frames, as read from a cache."""
         length = self.length if length is None else length
-        spec, scorer = self.memory.storage, self.memory.make_scorer()
+        spec, scorer = self.memory.storage, make_scorer(self.memory)
         stored = spec.stored_frames(length)
         rows = [] if scorer is None else [(t, scorer(t, self.images[t])) for t in range(length)]
         scored = [(t, values) for t, values in rows if values is not None]
@@ -69,18 +69,18 @@ class Episode:
 
     def _moving(self, history: _Kind) -> _Kind:
         """The history with what the robot felt and did, where its memory reads that."""
-        history.motion, history.state_width = self.motion.__getitem__ if self.memory.reads_motion else None, STATE
+        history.motion, history.state_width = self.motion.__getitem__ if uses_proprio(self.memory) else None, STATE
         return history
 
     def online(self, piece: int, until: int | None = None) -> OnlineHistory:
         """The first `until` frames as an environment delivers them, `piece` at a time."""
-        history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
+        history = self._moving(OnlineHistory(self.memory.storage, make_scorer(self.memory), self.exec_start))
         self.extend(history, piece, self.length if until is None else until)
         return history
 
     def sparse(self, rendered: np.ndarray, until: int) -> OnlineHistory:
         """The first `until` frames, of which only some have an image."""
-        history = self._moving(OnlineHistory(self.memory.storage, self.memory.make_scorer(), self.exec_start))
+        history = self._moving(OnlineHistory(self.memory.storage, make_scorer(self.memory), self.exec_start))
         tokens = self.tokens[history.to_encode(until, rendered)]
         history.append(self.images[rendered], tokens, rendered, until)
         return history
@@ -113,7 +113,7 @@ def check_selection(memory: Memory, frames: int) -> None:
         assert selection.min() >= 0 and selection[:, 1].max() < patches, f"patches must lie in 0 to {patches - 1}."
         assert (np.diff(selection[:, 0]) >= 0).all(), f"at step {step} the selection is not in time order."
         stored = set(memory.storage.stored_frames(step + 1).tolist())
-        selected_frames = set() if memory.reads_motion else set(selection[:, 0].tolist())
+        selected_frames = set() if uses_proprio(memory) else set(selection[:, 0].tolist())
         assert selected_frames <= stored, "select chose frames that the StorageSpec does not keep."
         again = memory.select(full, step)
         assert np.array_equal(selection, again), "without rng, select must make the same choice every time."
@@ -139,7 +139,7 @@ def _encoded(memory: Memory, history: HistoryTokens) -> MemoryTokens:
 
 
 def _recalled(memory: Memory, history: History, *steps: int) -> HistoryTokens:
-    return stack_history([memory.recall(history, step) for step in steps])
+    return stack_history([memory.gather_selection(history, step) for step in steps])
 
 
 def _valid(tokens: MemoryTokens) -> Tensor:
@@ -185,12 +185,14 @@ def check_streaming(memory: Memory, frames: int) -> None:
     """`remember`: an episode that grows gives the tokens that a fresh look at the whole of it gives."""
     first, second = Episode(memory, frames, seed=1), Episode(memory, frames, seed=2)
     histories = [first.online(16, 16), second.online(16, 16)]
-    streams = [memory.start_stream() for _ in histories]
+    streams = [start_stream(memory) for _ in histories]
     for until in (16, 32, 37, frames):
         for episode, history in zip((first, second), histories, strict=True):
             episode.extend(history, 16, until)
-        streamed = memory.encode(histories, streams)
-        fresh = _encoded(memory, stack_history([memory.recall(history, len(history) - 1) for history in histories]))
+        streamed = encode_histories(memory, histories, streams)
+        fresh = _encoded(
+            memory, stack_history([memory.gather_selection(history, len(history) - 1) for history in histories])
+        )
         error = float((_valid(streamed) - _valid(fresh)).abs().max())
         assert error <= TOLERANCE, f"after {until} frames the stream's tokens differ from a fresh look by {error:.2g}."
 

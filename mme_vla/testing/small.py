@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from mme_vla.config.composition import compose
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.memory.base import make_scorer, past_view_spec
 from mme_vla.memory.history import CachedHistory, FrameScores, OnlineHistory
 from mme_vla.policy.build import build_from_config, policy_words
 from mme_vla.policy.mme import MMEPolicy, mme_of
@@ -114,7 +115,7 @@ def random_past(policy: MMEPolicy, batch: int, seed: int = 0) -> PastViews | Non
     if policy.memory is None:
         return None
     views = len(policy.embodiment.cameras)
-    past = full_past(policy.memory.past_view_spec, views, policy.backbone.image_size, "cpu")
+    past = full_past(past_view_spec(policy.memory), views, policy.backbone.image_size, "cpu")
     if past is None:
         return None
     generator = torch.Generator().manual_seed(seed + 1)
@@ -138,7 +139,7 @@ def moving_frames(count: int, size: int = 64, seed: int = 0) -> np.ndarray:
 def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -> CachedHistory:
     """What a cache of this whole episode would hold, encoded in one go."""
     memory = policy.require_memory()
-    spec, scorer = memory.storage, memory.make_scorer()
+    spec, scorer = memory.storage, make_scorer(memory)
     stored_frames = spec.stored_frames(len(frames))
     tokens = policy.encode_frames(frames[stored_frames])
     rows = [] if scorer is None else [(t, scorer(t, frame)) for t, frame in enumerate(frames)]
@@ -155,7 +156,7 @@ def cached_history(policy: MMEPolicy, frames: np.ndarray, exec_start: int = 0) -
 def online_history(policy: MMEPolicy, frames: np.ndarray, chunk: int, exec_start: int = 0) -> OnlineHistory:
     """The same episode as an environment would deliver it, `chunk` frames at a time."""
     memory = policy.require_memory()
-    history = OnlineHistory(memory.storage, memory.make_scorer(), exec_start)
+    history = OnlineHistory(memory.storage, make_scorer(memory), exec_start)
     for start in range(0, len(frames), chunk):
         part = frames[start : start + chunk]
         history.append(part, policy.encode_frames(part[history.to_encode(len(part))]))

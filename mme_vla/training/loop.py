@@ -164,10 +164,10 @@ class Trainer:
         rate = scheduled_rate(step, settings)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        draws = self.policy.loss_draws(settings.batch_size, generator_for(settings.seed, "train", step))
+        draws = self.policy.training_noise(settings.batch_size, generator_for(settings.seed, "train", step))
         # Of the whole update: the images of a sample depend neither on the number of processes nor of pieces.
         generator = generator_for(settings.seed, "model", step, 0, 0)
-        draws = {**draws, **self.policy.image_draws(settings.batch_size, generator)}
+        draws = {**draws, **self.policy.augmentation_params(settings.batch_size, generator)}
         sums: dict[str, Tensor] = {}
         for piece in range(settings.accumulate):
             with window.waiting():

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from mme_vla.backbone.base import stack_draws
 from mme_vla.data.dataset import TrainingDataset
 from mme_vla.embodiment import ActionSpace, Embodiment
 from mme_vla.policy.base import Policy
 from mme_vla.training.order import generator_for
+from mme_vla.types import stack_noise
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def open_loop(policy: Policy, samples: TrainingDataset, chunks: int, seed: int, 
     for place in (starts[i : i + 8] for i in range(0, len(starts), 8)):
         batch = processor.collate([samples.observation(i) for i in place])
         states = torch.from_numpy(np.stack([samples.step(i).state for i in place]))
-        draws = stack_draws([policy.sample_draws(generator) for _ in place], policy.device)
+        draws = stack_noise([policy.sampling_noise(generator) for _ in place], policy.device)
         chunk = policy.sample_actions(batch.to(policy.device), draws).float().cpu()
         predicted.append(processor.absolute_actions(chunk, states))
     recorded = [samples.step(i) for i in starts]

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from mme_vla.errors import UserError, brief
 from mme_vla.policy.base import Policy
 from mme_vla.policy.run_folders import CHECKPOINTS, checkpoints_in, newest_checkpoint, resolve_checkpoint, step_of
 from mme_vla.policy.saving import policy_name
-from mme_vla.registry import INTEGRATIONS, MEMORIES, Registry
+from mme_vla.registry import BACKBONES, INTEGRATIONS, MEMORIES, Registry
 from mme_vla.training.checkpoint import read_state
 from mme_vla.training.settings import TrainSettings
 from mme_vla.utils import FolderLock, to_json
@@ -152,7 +152,15 @@ def _completed(config: Mapping[str, Any]) -> dict[str, Any]:
         "train": {**train, **config["train"]},
         "policy": {"name": policy_name(config), **(config.get("policy") or {})},
         **{key: _with_defaults(table, config[key]) for key, table in PARTS.items() if config.get(key)},
+        **({"backbone": _with_head(config["backbone"])} if config.get("backbone") else {}),
     }
+
+
+def _with_head(section: Mapping[str, Any]) -> dict[str, Any]:
+    """The section `backbone` with the default flow head, where earlier versions had no other."""
+    sizes: Any = BACKBONES[section["name"]].Config if section["name"] in BACKBONES else None
+    heads = [f.default_factory for f in (fields(sizes) if is_dataclass(sizes) else ()) if f.name == "head"]
+    return ({"head": heads[0]()} if heads and heads[0] is not MISSING else {}) | dict(section)
 
 
 def _with_defaults(table: Registry[Any], section: Mapping[str, Any]) -> dict[str, Any]:

@@ -54,7 +54,7 @@ class Validation:
             place = mine[number] if number < len(mine) else places[process % len(places)]
             if number == len(self._batches):
                 self._batches.append(self._collate([self._samples[i] for i in place]))
-            rows = [policy.loss_draws(1, generator_for(self._seed, "validation", i)) for i in place]
+            rows = [policy.training_noise(1, generator_for(self._seed, "validation", i)) for i in place]
             draws = {name: torch.cat([row[name] for row in rows]).to(policy.device) for name in rows[0]}
             loss, _ = policy(self._batches[number].to(policy.device), draws)
             if number < len(mine):

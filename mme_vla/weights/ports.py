@@ -12,6 +12,7 @@ from typing import Any
 from torch import Tensor
 
 from mme_vla.errors import UserError, brief
+from mme_vla.memory.base import past_view_spec
 from mme_vla.memory.extensions.spacetime import SpaceTime
 from mme_vla.policy.base import Policy
 from mme_vla.policy.mme import MMEPolicy
@@ -47,7 +48,7 @@ def port_adapter(policy: MMEPolicy) -> Adapter:
     """
     table = prefixed("backbone", names.torch_names(pi05_of(policy)))
     memory = policy.memory
-    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == policy.backbone.token_width:
+    if isinstance(memory, SpaceTime) and memory.states is not None and memory.width == pi05_of(policy).config.vlm.width:
         table |= {f"memory.states.{part}": [Piece(f"{HISTORY}.{part}")] for part in ("weight", "bias")}
     return Adapter(table, names.torch_unread(pi05_of(policy)), names.TIED)
 
@@ -84,7 +85,7 @@ def window_of(policy: Policy) -> dict[str, bool | int]:
         return dict.fromkeys(WINDOW_MEMORY, False)
     settings = {"frames": memory.frames, "stride": memory.stride, "every": memory.every}
     memory_settings = {
-        "use_visual_memory": memory.past_view_spec is not None,
+        "use_visual_memory": past_view_spec(memory) is not None,
         "use_proprioceptive_memory": memory.states is not None,
     }
     return memory_settings | {source_name: settings[target_name] for source_name, (target_name, _) in WINDOW.items()}

@@ -6,8 +6,7 @@ from test_sight import TABLES, blocks_of, validity
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.attention import attend, build_mask, select_rows
-from mme_vla.backbone.blocks import MaskLayout, Visibility
+from mme_vla.backbone.attention import MaskLayout, Visibility, attend, build_mask, select_rows
 from mme_vla.testing.small import SMALL_VISION, random_batch, small_policy
 
 OTHERS = ["flex", "varlen"]
@@ -65,7 +64,7 @@ def test_a_policy_gives_the_same_loss_and_the_same_chunk(model: str, backend: st
     def results(attention: str) -> tuple[float, Tensor]:
         policy = small_policy(model, backbone=FEW_TOKENS, policy={"augment": False}, **{"+policy.attention": attention})
         batch = random_batch(policy, 2)
-        draws = policy.loss_draws(2, torch.Generator().manual_seed(1))
+        draws = policy.training_noise(2, torch.Generator().manual_seed(1))
         with torch.no_grad():
             loss, _ = policy(batch, draws)
         return float(loss), policy.eval().sample_actions(batch, draws["noise"], steps=2)

@@ -9,8 +9,16 @@ from torch import Tensor
 
 from mme_vla import UserError
 from mme_vla.backbone import attention, gemma
-from mme_vla.backbone.attention import ALIGNMENT, BIG_NEGATIVE, layout_mask
-from mme_vla.backbone.blocks import PI05_VISIBILITY, MaskLayout, Span, Visibility, attention_mask
+from mme_vla.backbone.attention import (
+    ALIGNMENT,
+    BIG_NEGATIVE,
+    PI05_VISIBILITY,
+    MaskLayout,
+    Span,
+    Visibility,
+    attention_mask,
+    layout_mask,
+)
 from mme_vla.integration.base import MEMORY_VISIBILITY, memory_visibility
 from mme_vla.testing.small import random_batch, small_policy
 
@@ -88,7 +96,7 @@ def test_what_padding_asks_changes_no_loss_no_gradient_and_no_chunk(
     policy = small_policy(model, policy={"augment": False})
     batch = random_batch(policy, 3)
     batch.image_mask[2, 1] = False
-    draws = policy.loss_draws(3, torch.Generator().manual_seed(1))
+    draws = policy.training_noise(3, torch.Generator().manual_seed(1))
 
     def results() -> tuple[Tensor, dict[str, Tensor], Tensor]:
         policy.zero_grad()

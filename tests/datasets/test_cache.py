@@ -26,6 +26,7 @@ from mme_vla.data.convert import ConvertOptions, convert
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.hdf5 import find_files, list_episodes
 from mme_vla.errors import UserError
+from mme_vla.memory.base import make_scorer
 from mme_vla.memory.history import OnlineHistory
 
 COMMAND = "mme-vla cache model=mine data=here"
@@ -54,13 +55,13 @@ def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, 
     assert cache.width == WIDTH
     for episode in range(3):
         history = cache.history(episode)
-        online = OnlineHistory(memory.storage, memory.make_scorer(), int(source.exec_starts[episode]))
+        online = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
         for t in range(int(source.lengths[episode])):
             frame = source.frames(episode, [t])
             wanted = frame[online.to_encode(1)]
             tokens = encode(wanted) if len(wanted) else torch.zeros(0, 4, WIDTH)
             online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
-            cached, streamed = memory.recall(history, t), memory.recall(online, t)
+            cached, streamed = memory.gather_selection(history, t), memory.gather_selection(online, t)
             for one, other in zip(cached.tensors(), streamed.tensors(), strict=True):
                 torch.testing.assert_close(one, other, rtol=0, atol=tolerance)
         assert (len(history), history.exec_start) == (len(online), online.exec_start)

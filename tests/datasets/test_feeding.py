@@ -109,7 +109,7 @@ def gradients(recompute: bool | str) -> dict[str, torch.Tensor]:
     built = policy("framesamp_modul", policy={"augment": False}).train()
     built.recompute(recompute)
     batch = built.full_batch()
-    built(batch, built.loss_draws(1, torch.Generator().manual_seed(0)))[0].backward()
+    built(batch, built.training_noise(1, torch.Generator().manual_seed(0)))[0].backward()
     return {name: p.grad for name, p in built.named_parameters() if p.grad is not None}
 
 
@@ -135,7 +135,7 @@ def _products(how: bool | str) -> int:
 
     built = policy(policy={"augment": False}).train()
     built.recompute(how)
-    draws = built.loss_draws(1, torch.Generator().manual_seed(0))
+    draws = built.training_noise(1, torch.Generator().manual_seed(0))
     with Count() as count:
         built(built.full_batch(), draws)[0].backward()
     return count.found

@@ -88,14 +88,14 @@ def test_the_current_view_and_state_are_those_after_the_last_action(plain, monke
 @pytest.mark.parametrize("encode_chunk", [3, 32])
 def test_memory_holds_at_every_inference_what_training_would_select(name, encode_chunk, monkeypatch):
     policy = quick_policy(name, 8, policy={"history_dtype": "float32"})
-    watched = Watched(policy, monkeypatch, lambda e: (e.n_observed_frames, e.history.exec_start, e.recall()))
+    watched = Watched(policy, monkeypatch, lambda e: (e.n_observed_frames, e.history.exec_start, e.gather_selection()))
     envs = InlineEnvs()
     roll(policy, [UNMASK], envs, encode_chunk=encode_chunk)
     frames, video = np.stack(envs.made[UNMASK].frames), VIDEO["VideoUnmask"]
     assert len(watched.seen) == 3
     for seen, exec_start, recalled in watched.seen:
         assert exec_start == video
-        offline = policy.memory.recall(cached_history(policy, frames, exec_start=video), seen - 1)
+        offline = policy.memory.gather_selection(cached_history(policy, frames, exec_start=video), seen - 1)
         assert torch.equal(recalled.mask, offline.mask)
         assert torch.equal(recalled.positions, offline.positions)
         assert torch.allclose(recalled.features, offline.features, atol=1e-5)

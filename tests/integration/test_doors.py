@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla import MMEPolicy, UserError
+from mme_vla.backbone.attention import PI05_VISIBILITY, Block
 from mme_vla.backbone.base import Hook
-from mme_vla.backbone.blocks import PI05_VISIBILITY, Block
 from mme_vla.backbone.config import ExpertConfig
 from mme_vla.config.composition import compose
 from mme_vla.integration.base import Integration, required
@@ -162,7 +162,7 @@ def test_a_door_leads_to_the_action_in_training_and_in_every_step_of_sampling(ow
 def test_a_policy_learns_and_acts_through_a_door(own: type[Integration]) -> None:
     policy = own_policy(own)
     batch = random_batch(policy, valid=64)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     before, _ = policy(batch, draws)
     before.backward()
     torch.optim.SGD(policy.parameters(), 1e-2).step()

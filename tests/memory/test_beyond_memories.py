@@ -48,7 +48,7 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
 def encoded(memory: Any, tokens: torch.Tensor, step: int | None = None, exec_start: int = 0) -> MemoryTokens:
     step = len(tokens) - 1 if step is None else step
     with torch.no_grad():
-        found: MemoryTokens = memory(stack_history([memory.recall(stored(memory, tokens, exec_start), step)]))
+        found: MemoryTokens = memory(stack_history([memory.gather_selection(stored(memory, tokens, exec_start), step)]))
     return found
 
 
@@ -81,7 +81,7 @@ def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_
 def test_retrieval_looks_at_tokens_as_they_are_stored() -> None:
     """What a prompt does to tokens (`mark`) is not known when a dataset is read, so it must not decide."""
     policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2}, backbone=FEW_TOKENS)
-    policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
+    policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
     frames, seen = moving_frames(40), []
     select = policy.require_memory().select
     policy.require_memory().select = lambda *given: seen.append(select(*given)) or seen[-1]  # type: ignore[method-assign]
@@ -175,7 +175,7 @@ def test_learned_topk_keeps_time_and_tells_the_age_of_what_it_keeps() -> None:
 
 def test_what_is_not_kept_still_reaches_the_loss() -> None:
     memory = LearnedTopK(D, 16, budget=5, pool=6, grid=2)
-    history = stack_history([memory.recall(stored(memory, noise(6, 4, D)), 5)])
+    history = stack_history([memory.gather_selection(stored(memory, noise(6, 4, D)), 5)])
     history = replace(history, features=history.features.requires_grad_())
     kept, _ = memory.keep(memory.scores(history), history.mask)
     memory(history).tokens[:, -1].sum().backward()
@@ -287,7 +287,7 @@ def test_memory_compiles_in_one_piece(policy: MMEPolicy) -> None:
 
 
 def test_in_bfloat16_it_computes_what_it_computes_in_float32(policy: MMEPolicy) -> None:
-    batch, draws = random_batch(policy, valid=64), policy.loss_draws(2, torch.Generator().manual_seed(0))
+    batch, draws = random_batch(policy, valid=64), policy.training_noise(2, torch.Generator().manual_seed(0))
     with torch.no_grad():
         exact = float(policy(batch, draws)[0])
         policy.compute_dtype = torch.bfloat16
@@ -339,9 +339,9 @@ def test_what_the_robot_did_is_no_vision_token_and_is_not_marked_beside_a_prompt
     members: list[Any] = [{"name": "framesamp", "budget": 64}, {"name": "actions", **SMALLER["actions"]}]
     for name, memory in (("actions_modul", SMALLER["actions"]), ("framesamp_ttt_modul", {"members": members})):
         policy = small_policy(name, memory=memory, backbone=FEW_TOKENS)
-        policy.backbone.mark = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
+        policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
         batch = random_batch(policy, valid=96)
-        found = policy._conditioned_history(batch)
+        found = policy.conditioned_history(batch)
         assert batch.history is not None and found is not None
         # The actions' rows come first, for they are padded on the left.
         given, own = batch.history.features, batch.history.mask.shape[1] - (64 if "members" in memory else 0)

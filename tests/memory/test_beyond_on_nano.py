@@ -31,7 +31,7 @@ def test_it_trains_for_twenty_steps_on_what_a_demonstration_shows(name: str) -> 
     shown = demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
     policy.require_processor().stats = statistics([shown], policy)
     batch, generator, losses = Decisions.of(policy, [shown]).batch, torch.Generator().manual_seed(0), []
-    draws = policy.loss_draws(len(batch.prompt), generator)
+    draws = policy.training_noise(len(batch.prompt), generator)
     optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=3e-3, fused=True)
     for _ in range(20):
         loss, _ = policy(batch, draws)

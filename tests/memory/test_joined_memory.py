@@ -56,11 +56,11 @@ def test_a_joined_memory_keeps_a_memorys_promises(members: list[Any]) -> None:
 def test_every_member_answers_as_if_it_were_alone(members: list[Any]) -> None:
     memory = joined(members).eval()
     episode, steps = Episode(memory, 48), (3, 20, 47)
-    found = memory(stack_history([memory.recall(episode.cached(), step) for step in steps]))
+    found = memory(stack_history([memory.gather_selection(episode.cached(), step) for step in steps]))
     start = 0
     for i, member in enumerate(memory.memories):
         history = alone(memory, i, episode).cached()
-        expected = member(stack_history([member.recall(history, step) for step in steps]))
+        expected = member(stack_history([member.gather_selection(history, step) for step in steps]))
         part = slice(start, start + member.budget)
         assert torch.equal(found.mask[:, part], expected.mask)
         error = (found.tokens[:, part] - expected.tokens)[expected.mask].abs().max()
@@ -96,10 +96,10 @@ def test_equal_names_are_told_apart_in_what_is_reported() -> None:
     memory = joined([TTT, {**TTT, "stride": 4}])
     memory.reporting = True
     episode = Episode(memory, 40)
-    metrics = memory(stack_history([memory.recall(episode.cached(), 39)])).metrics
+    metrics = memory(stack_history([memory.gather_selection(episode.cached(), 39)])).metrics
     assert {name.split("/")[0] for name in metrics} == {"ttt", "ttt_2"}
     memory.reporting = False
-    assert memory(stack_history([memory.recall(episode.cached(), 39)])).metrics == {}
+    assert memory(stack_history([memory.gather_selection(episode.cached(), 39)])).metrics == {}
 
 
 @pytest.mark.parametrize("integration", ["context", "modulator", "expert"])
@@ -108,7 +108,7 @@ def test_it_trains_through_every_integration(integration: str) -> None:
     batch = random_batch(policy, 1)
     assert batch.history is not None
     batch.history = HistoryTokens(batch.history.features, batch.history.positions, torch.ones_like(batch.history.mask))
-    before, _ = policy(batch, policy.loss_draws(1, torch.Generator().manual_seed(0)))
+    before, _ = policy(batch, policy.training_noise(1, torch.Generator().manual_seed(0)))
     before.backward()
     assert isinstance(policy.memory, JoinedMemory)
     for member in policy.memory.memories:
@@ -116,7 +116,7 @@ def test_it_trains_through_every_integration(integration: str) -> None:
         assert gradient is not None
         assert gradient.abs().sum() > 0
     torch.optim.SGD(policy.parameters(), 1e-3).step()
-    after, _ = policy(batch, policy.loss_draws(1, torch.Generator().manual_seed(0)))
+    after, _ = policy(batch, policy.training_noise(1, torch.Generator().manual_seed(0)))
     assert after < before
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from mme_vla import UserError
-from mme_vla.backbone.blocks import placed, token_positions
+from mme_vla.backbone.attention import apply_custom_positions, token_positions
 from mme_vla.memory.base import stack_history
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.testing import check_integration
@@ -40,7 +40,7 @@ def without(history: HistoryTokens, first: int, count: int) -> HistoryTokens:
 
 def remembered(policy: MMEPolicy) -> HistoryTokens:
     frames = moving_frames(FRAMES)
-    return stack_history([policy.require_memory().recall(cached_history(policy, frames), FRAMES - 1)] * 2)
+    return stack_history([policy.require_memory().gather_selection(cached_history(policy, frames), FRAMES - 1)] * 2)
 
 
 @pytest.mark.parametrize(("position", "shifts"), [("slot", True), ("time", False)])
@@ -55,9 +55,9 @@ def test_a_dropped_frame_shifts_how_far_the_older_ones_stand_from_the_view_only_
         """From the first memory token to the first token of the current view."""
         memory = policy.encode_memory(selection)
         assert memory is not None
-        observed = policy.backbone.observation_blocks(views, views.images.float())
+        observed = policy.backbone.embed(replace(views, images=views.images.float()))
         blocks = policy.integration.blocks(observed, memory)
-        positions = placed(token_positions(torch.cat([block.mask for block in blocks], 1)), blocks)
+        positions = apply_custom_positions(token_positions(torch.cat([block.mask for block in blocks], 1)), blocks)
         return float(positions[0, len(blocks[0])] - positions[0, 0])
 
     dropped = without(history, 2 * OLD, OLD)
@@ -107,7 +107,7 @@ def test_an_episode_and_a_cache_place_memory_alike() -> None:
     policy = small_policy("framesamp_modul", memory={"budget": 64}, integration={"memory_position": "time"})
     episode, frames = policy.start_episode("press the button"), moving_frames(9)
     episode.observe({"front": frames, "wrist": frames}, np.zeros((9, 8), np.float32))
-    recalled = [episode.recall(), policy.require_memory().recall(cached_history(policy, frames), 8)]
+    recalled = [episode.gather_selection(), policy.require_memory().gather_selection(cached_history(policy, frames), 8)]
     assert [item.step.item() for item in recalled if item.step is not None] == [8, 8]
     ages = [stack_history([item]).ages for item in recalled]
     assert ages[0] is not None and ages[0].max() == 8 and torch.equal(ages[0], ages[1])  # type: ignore[arg-type]

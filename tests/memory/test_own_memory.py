@@ -94,7 +94,7 @@ def test_own_memory_gets_a_loss_and_acts(policy):
     episode = policy.start_episode("press the button")
     frames = np.random.default_rng(0).integers(0, 256, (9, 64, 64, 3), dtype=np.uint8)
     episode.observe({"front": frames, "wrist": frames}, np.zeros((9, 8), np.float32))
-    recalled = episode.recall()
+    recalled = episode.gather_selection()
     assert sorted(set(recalled.positions[recalled.mask][:, 0].tolist())) == [0, 4, 8]
     assert torch.isfinite(torch.from_numpy(policy.act([episode]))).all()
 

@@ -68,7 +68,7 @@ class Counting:
 
 
 def window(memory: RecurrentMemory, length: int, exec_start: int = 0) -> HistoryTokens:
-    return stack_history([memory.recall(RandomHistory(length, exec_start), length - 1)])
+    return stack_history([memory.gather_selection(RandomHistory(length, exec_start), length - 1)])
 
 
 def same_memory(a, b) -> bool:
@@ -166,7 +166,7 @@ def test_front_padding_never_matters(make):
 
 def test_selections_of_different_length_stack(make):
     memory = make()
-    items = [memory.recall(RandomHistory(length), length - 1) for length in (10, 100)]
+    items = [memory.gather_selection(RandomHistory(length), length - 1) for length in (10, 100)]
     stacked = stack_history(items)
     assert stacked.mask.sum(1).tolist() == [GRID**2, 7 * GRID**2]
     assert stacked.mask[:, -(GRID**2) :].all()

@@ -83,7 +83,7 @@ def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_e
 @torch.no_grad()
 def test_frames_before_the_episode_are_not_seen_and_those_in_it_are() -> None:
     policy = small()
-    batch, draws = random_batch(policy), policy.loss_draws(2, torch.Generator().manual_seed(0))
+    batch, draws = random_batch(policy), policy.training_noise(2, torch.Generator().manual_seed(0))
     assert batch.past is not None and not batch.past.mask[0, 0]
     policy.eval()
     plain = float(policy(batch, draws)[0])
@@ -111,8 +111,9 @@ def test_augmentation_changes_past_views_as_it_does_the_current_ones() -> None:
     assert batch.past is not None
     still = batch.images[:, None].expand_as(batch.past.images)
     drawn = torch.rand(2, 7, generator=torch.Generator().manual_seed(1))
-    seen, views = policy._current_views(replace(batch, past=replace(batch.past, images=still)), drawn)
-    assert seen.past is not None and not torch.equal(views, policy._views(batch))
+    seen = policy.prepare_images(replace(batch, past=replace(batch.past, images=still)), drawn)
+    views = seen.images
+    assert seen.past is not None and not torch.equal(views, policy.prepare_images(batch).images)
     assert torch.equal(seen.past.images[:, 0], views) and torch.equal(seen.past.images[:, 1], views)
 
 
@@ -142,7 +143,7 @@ def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_differenc
             seen = policy.observation([episode])
             assert seen.past is not None and batch.past is not None and batch.history is not None
             assert torch.equal(seen.past.images, batch.past.images) and torch.equal(seen.past.mask, batch.past.mask)
-            assert torch.allclose(episode.recall().features, batch.history.features[0], atol=1e-6)
+            assert torch.allclose(episode.gather_selection().features, batch.history.features[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("model", ["spacetime_context", "spacetime_modul"])

@@ -46,7 +46,7 @@ def test_selection_is_the_same_online_and_from_the_cache(policy, frames, offline
     for step in (0, 6, 7, 40, FRAMES - 1):
         online = online_history(policy, frames[: step + 1], chunk, exec_start=min(20, step + 1))
         assert np.array_equal(policy.memory.select(online, step), policy.memory.select(offline, step)), step
-        a, b = policy.memory.recall(online, step), policy.memory.recall(offline, step)
+        a, b = policy.memory.gather_selection(online, step), policy.memory.gather_selection(offline, step)
         assert torch.equal(a.mask, b.mask)
         assert torch.equal(a.positions, b.positions)
         assert torch.allclose(a.features, b.features, atol=1e-5)
@@ -74,7 +74,7 @@ def test_streaming_and_offline_give_the_same_actions(policy, frames):
     episode = feed(policy, frames)
     streamed = policy.act([episode])
     processor = policy.processor
-    history = stack_history([policy.memory.recall(cached_history(policy, frames, exec_start=30), FRAMES - 1)])
+    history = stack_history([policy.memory.gather_selection(cached_history(policy, frames, exec_start=30), FRAMES - 1)])
     prompt, prompt_mask = processor.prompt("pick up the cube")
     batch = Batch(
         images=processor.images([frames[-1], frames[-1][::-1]])[None],
@@ -138,7 +138,7 @@ def test_bfloat16_history_is_what_the_cache_stores(frames):
     online = online_history(policy, frames, 16)
     cached = cached_history(policy, frames)
     step = FRAMES - 1
-    a, b = policy.memory.recall(online, step), policy.memory.recall(cached, step)
+    a, b = policy.memory.gather_selection(online, step), policy.memory.gather_selection(cached, step)
     assert a.features.dtype == b.features.dtype == torch.bfloat16
     assert torch.allclose(a.features.float(), b.features.float(), rtol=1e-2, atol=1e-3)
 
@@ -160,7 +160,7 @@ def test_tokendrop_encodes_only_the_frames_it_can_choose(frames, monkeypatch):
 
 def test_an_error_leaves_the_episode_as_it_was(policy, frames):
     episode = feed(policy, frames, upto=20, demo=0)
-    before = episode.recall()
+    before = episode.gather_selection()
     both = {"front": frames[:3], "wrist": frames[:3]}
     states = np.zeros((3, 8), np.float32)
     for wrong in (
@@ -173,7 +173,7 @@ def test_an_error_leaves_the_episode_as_it_was(policy, frames):
     with pytest.raises(UserError, match="finite"):
         episode.observe(both, np.full((3, 8), np.nan))
     assert (len(episode.history), episode.n_observed_frames) == (20, 20)
-    assert torch.equal(episode.recall().features, before.features)
+    assert torch.equal(episode.gather_selection().features, before.features)
 
 
 def test_acting_without_statistics_is_refused_before_anything_moves(policy, frames):

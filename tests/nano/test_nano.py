@@ -123,7 +123,7 @@ def test_decisions_are_the_samples_and_hold_what_an_episode_would_show() -> None
     episode = policy.start_episode(made.goal)
     frames = np.stack([made.images["front"].get(frame, made.images["front"][0]) for frame in range(67)])
     episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
-    history = episode.recall()
+    history = episode.gather_selection()
     assert batch.history is not None
     assert torch.equal(history.features, batch.history.features[0])
     assert torch.equal(history.positions, batch.history.positions[0])
@@ -135,7 +135,7 @@ def test_tokens_made_beforehand_give_the_loss_of_the_pictures() -> None:
     processor.stats = statistics([made], policy)
     batch = Decisions.of(policy, [made]).collate([0, 1, 2])
     shown = processor.images([np.stack([made.images["front"][frame] for frame in (66, 120, 155)])])
-    draws = policy.loss_draws(3, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(3, torch.Generator().manual_seed(0))
     with torch.no_grad():
         ready, drawn = policy(batch, draws)[0], policy(replace(batch, images=shown, view_tokens=None), draws)[0]
     assert torch.allclose(ready, drawn, atol=1e-5)
@@ -200,7 +200,7 @@ def test_what_the_goal_names_first_is_marked_in_pictures_and_memory() -> None:
     ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
     plain, plain_mask = processor.prompt("press the button")
     tokens = torch.arange(96.0).expand(2, 3, 96)
-    marked = backbone.mark(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
+    marked = backbone.condition_on_prompt(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
     assert marked[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
     assert torch.equal(marked[1], tokens[1])
 

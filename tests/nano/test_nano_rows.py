@@ -43,7 +43,7 @@ def test_decisions_hold_what_an_episode_would_remember(memory: str) -> None:
     episode = policy.start_episode(made.goal)
     frames = np.stack([pictures.get(frame, pictures[0]) for frame in range(67)])
     episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
-    history = episode.recall()
+    history = episode.gather_selection()
     assert batch.history is not None
     for name in ("features", "positions", "mask"):
         here, there = getattr(history, name).float(), getattr(batch.history, name)[0].float()

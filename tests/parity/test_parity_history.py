@@ -9,6 +9,7 @@ from golden import error, load, params, vision_config
 
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.siglip import VisionTower, pool_grid
+from mme_vla.memory.base import make_scorer
 from mme_vla.memory.encoder import position_features
 from mme_vla.memory.framesamp import FrameSamp
 from mme_vla.memory.history import OnlineHistory
@@ -48,7 +49,7 @@ def tokens(buffer):
 
 def history_of(memory, frames, tokens, until: int) -> OnlineHistory:
     """An online history fed one frame at a time up to and including `until`."""
-    history = OnlineHistory(memory.storage, memory.make_scorer())
+    history = OnlineHistory(memory.storage, make_scorer(memory))
     pooled = pool_grid(tokens, memory.storage.grid)
     for t in range(until + 1):
         wanted = history.to_encode(1) + t
@@ -82,7 +83,7 @@ def test_selected_tokens_and_positions(buffer, tokens):
     steps = sorted({int(k.split("/")[1].removeprefix("step")) for k in tensors if k.startswith("out/step")})
     for kind, memory in memories(about).items():
         for step in steps:
-            recalled = memory.recall(history_of(memory, frames, tokens, step), step)
+            recalled = memory.gather_selection(history_of(memory, frames, tokens, step), step)
             key = f"out/step{step}/{kind}"
             assert torch.equal(recalled.mask, tensors[f"{key}/mask"])
             assert error(recalled.features, tensors[f"{key}/image_emb"]) <= TOLERANCE
@@ -108,7 +109,7 @@ def test_recurrent_selection_is_exact(buffer, tokens):
         assert chosen.tolist() == [[f, p] for f in entry["indices"] for p in range(patches)], entry["step"]
         key = f"out/recurrent_step{entry['step']}_exec{entry['exec_start']}"
         if f"{key}/mask" in tensors:
-            recalled = memory.recall(history, entry["step"])
+            recalled = memory.gather_selection(history, entry["step"])
             assert torch.equal(recalled.mask.unflatten(0, (-1, patches)).all(-1), tensors[f"{key}/mask"])
             assert error(recalled.features, tensors[f"{key}/image_emb"].flatten(0, 2)) <= TOLERANCE
             position = position_features(recalled.positions, about["pos_dim"]) * recalled.mask[:, None]

@@ -8,8 +8,7 @@ import torch
 from golden import error, load, params, vision_config
 
 from mme_vla.backbone import flow
-from mme_vla.backbone.attention import additive_mask, attend
-from mme_vla.backbone.blocks import Span, attention_mask, token_positions
+from mme_vla.backbone.attention import Span, additive_mask, attend, attention_mask, token_positions
 from mme_vla.backbone.config import BackboneConfig, ExpertConfig
 from mme_vla.backbone.gemma import JointBlock
 from mme_vla.backbone.layers import AdaRMSNorm, RMSNorm, rms_normalise, rotate, rotation
@@ -233,7 +232,7 @@ def test_modulator(unit):
     layer.load_state_dict(read(table, params(tensors)))
     k, v = layer.keys_values(tensors["in/memory"])
     mask = additive_mask(tensors["in/memory_mask"][:, None], torch.float32)
-    assert error(layer.recall(tensors["in/x"], k, v, mask), tensors["out/r"]) <= TOLERANCE
+    assert error(layer.gather_selection(tensors["in/x"], k, v, mask), tensors["out/r"]) <= TOLERANCE
     assert error(layer(tensors["in/x"], k, v, mask), tensors["out/x_hat"]) <= TOLERANCE
 
 

@@ -7,7 +7,6 @@ import torch
 
 from mme_vla import UserError, build_policy
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.processing.images import to_unit_range
 from mme_vla.testing.small import MODELS, NEURAL, SMALL_VISION, random_batch, random_history, small_policy
 from mme_vla.utils import SUMS
 
@@ -185,8 +184,8 @@ def test_released_modulator_starts_near_the_memoryless_policy():
 def prefill(policy, batch):
     """Keys and values of the prefix, and what the memory injects."""
     memory = policy.encode_memory(batch.history)
-    images = to_unit_range(batch.images)
-    return policy.backbone.prefill(batch, images, lambda blocks: policy.integration.inject(blocks, memory))
+    injection = policy.inject(policy.prepare_images(batch), memory)
+    return policy.backbone.prefill(injection), injection
 
 
 @torch.no_grad()

@@ -109,7 +109,7 @@ def test_through_the_probe_an_unprobed_policy_answers_as_it_does(name: str) -> N
     for episode in (mine, its):
         recording.show(episode, 0, 41)
     recollection, stores = probe.snapshot(mine)
-    drawn = [policy.sample_draws(torch.Generator().manual_seed(7))]
+    drawn = [policy.sampling_noise(torch.Generator().manual_seed(7))]
     asked = probe.ask(mine, recollection, [stores], drawn, 2)[0, 0]
     given = policy.sample_actions(policy.observation([its]), {k: v[None] for k, v in drawn[0].items()}, 2,
                                   memory=policy._memory_tokens([its], policy.observation([its])))  # fmt: skip

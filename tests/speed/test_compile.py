@@ -57,7 +57,7 @@ def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
     policy = small_policy(model, **{"backbone.depth": depth}, **SHORT_TOWER, policy={"augment": False}).train()
     policy.backbone.vision.requires_grad_(False)
     first, second = batch_of(policy, 2, 32, 16), batch_of(policy, 2, 16, 8)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     eager, _ = policy(first, draws)
     policy.compile(backend=(counted := Counted()))
     loss, _ = policy(first, draws)

@@ -22,8 +22,9 @@ MODELS = ["pi05", "tokendrop_expert", "framesamp_modul", "framesamp_context", "r
 def joined_anew(policy: MMEPolicy, batch: Batch, noise: Tensor, steps: int) -> Tensor:
     """Sampling by the parts: every step puts its keys behind the prefix's in a new tensor."""
     backbone = policy.backbone
-    memory = policy.encode_memory(policy._conditioned_history(batch))
-    prefix, injection = backbone.prefill(batch, policy._views(batch), policy._inject(memory))
+    memory = policy.encode_memory(policy.conditioned_history(batch))
+    injection = policy.inject(policy.prepare_images(batch), memory)
+    prefix = backbone.prefill(injection)
     layout = backbone.transformer.layout([backbone.action_block(noise)], injection.visibility, prefix)
     times = backbone.time_condition(flow.euler_times(steps, noise.device))
     conditions = backbone.transformer.conditioning(times)

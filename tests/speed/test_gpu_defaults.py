@@ -15,11 +15,13 @@ from mme_vla.types import send
 def test_pictures_are_changed_alike_however_an_update_is_divided() -> None:
     policy = small_policy("pi05").train()
     batch = random_batch(policy, 4)
-    changes = policy.image_draws(4, torch.Generator().manual_seed(3))["changes"]
-    whole = policy._views(batch, changes)
-    pieces = [policy._views(batch.rows(torch.tensor(rows)), changes[rows]) for rows in ([0], [1, 2], [3])]
+    changes = policy.augmentation_params(4, torch.Generator().manual_seed(3))["changes"]
+    whole = policy.prepare_images(batch, changes).images
+    pieces = [
+        policy.prepare_images(batch.rows(torch.tensor(rows)), changes[rows]).images for rows in ([0], [1, 2], [3])
+    ]
     assert torch.equal(torch.cat(pieces), whole)
-    assert not torch.equal(whole, policy._views(batch))
+    assert not torch.equal(whole, policy.prepare_images(batch).images)
 
 
 def test_weights_for_acting_are_rounded_where_they_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

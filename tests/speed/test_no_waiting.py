@@ -43,7 +43,7 @@ def on_meta(policy: MMEPolicy) -> tuple[Any, dict[str, torch.Tensor]]:
     """A batch and the draws of its loss there, and the policy moved."""
     batch = random_batch(policy, 2)
     generator = torch.Generator().manual_seed(0)
-    draws = policy.loss_draws(2, generator) | policy.image_draws(2, generator)
+    draws = policy.training_noise(2, generator) | policy.augmentation_params(2, generator)
     policy.to("meta")
     return batch.to("meta"), {name: value.to("meta") for name, value in draws.items()}
 
@@ -89,8 +89,8 @@ count = lambda: [ctypes.c_long.in_dll(driver, name).value for name in names]
 for model in ("framesamp_modul", "rmt_context"):
     policy = small_policy(model).cuda()
     batch = random_batch(policy, 2).to("cuda")
-    draws = {k: v.cuda() for k, v in policy.train().loss_draws(2, torch.Generator()).items()}
-    draws["changes"] = policy.picture_draws(2, torch.Generator())["changes"].cuda()
+    draws = {k: v.cuda() for k, v in policy.train().training_noise(2, torch.Generator()).items()}
+    draws["changes"] = policy.augmentation_params(2, torch.Generator())["changes"].cuda()
     noise = draws["noise"]
     def update():
         policy(batch, draws)[0].backward()

@@ -6,7 +6,7 @@ import torch
 
 from mme_vla.errors import UserError
 from mme_vla.policy.mme import MMEPolicy
-from mme_vla.speed.rtc import STRONGEST, agreeing, overlap_weights, strength
+from mme_vla.speed.rtc import STRONGEST, overlap_weights, rtc_guidance, strength
 from mme_vla.testing.small import moving_frames, small_policy
 from mme_vla.types import Overlap
 
@@ -54,13 +54,13 @@ def test_the_pull_is_the_gradient_through_the_network() -> None:
         return (x.flatten(1) @ mixing).reshape(x.shape)
 
     with torch.no_grad():
-        given = agreeing(velocity, overlap, time)(x, 0)
+        given = rtc_guidance(velocity, overlap, time)(x, 0)
     jacobian = torch.eye(6) - 0.5 * mixing.T
     missing = (overlap.actions - (x - 0.5 * velocity(x, 0))) * overlap.weight
     expected = velocity(x, 0) - 2.0 * (missing.flatten() @ jacobian).reshape(x.shape)
     assert not given.requires_grad
     torch.testing.assert_close(given, expected)
-    assert agreeing(velocity, None, time) is velocity
+    assert rtc_guidance(velocity, None, time) is velocity
 
 
 def test_the_next_chunk_honours_what_was_promised(policy: MMEPolicy, before: np.ndarray) -> None:

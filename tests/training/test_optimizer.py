@@ -88,9 +88,9 @@ def test_impossible_batches_are_refused() -> None:
 
 def test_what_a_loss_draws_depends_on_the_key_alone() -> None:
     policy = small_policy("pi05")
-    first = policy.loss_draws(4, generator_for(1, "train", 7))
+    first = policy.training_noise(4, generator_for(1, "train", 7))
     torch.manual_seed(123)
-    again = policy.loss_draws(4, generator_for(1, "train", 7))
+    again = policy.training_noise(4, generator_for(1, "train", 7))
     assert {name: len(value) for name, value in first.items()} == {"noise": 4, "time": 4}
     assert all(torch.equal(first[name], again[name]) for name in first)
     assert seed_of(1, "train", 7) != seed_of(1, "train", 8)

@@ -11,6 +11,7 @@ from mme_vla.embodiment.robomme import CAMERAS, LETTERS
 from mme_vla.envs.episodes import spans
 from mme_vla.envs.render_request import RenderRequest
 from mme_vla.errors import UserError
+from mme_vla.memory.base import past_view_spec
 from mme_vla.registry import MEMORIES
 
 if TYPE_CHECKING:
@@ -62,7 +63,7 @@ class FrameChoice:
         frames = {camera: frozenset(numbers) for camera in CAMERAS}
         if self.memory is not None:
             read = self.read(np.array(numbers, np.int64), video)
-            for camera in CAMERAS if _build(self.memory).past_view_spec is not None else (MEMORY_CAMERA,):
+            for camera in CAMERAS if past_view_spec(_build(self.memory)) is not None else (MEMORY_CAMERA,):
                 frames[camera] |= read
         return RenderRequest(frames, now=())
 

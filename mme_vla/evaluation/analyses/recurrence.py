@@ -40,7 +40,7 @@ def recurrence_curves(policy: MMEPolicy, source: EpisodeSource, episode: int, st
     assert last is not None
     step, running = last
     history = running.required_history()
-    window = running.recall()
+    window = running.gather_selection()
     with policy.autocast():
         features, positions, mask = (
             x[None].to(policy.device) for x in (window.features, window.positions, window.mask)

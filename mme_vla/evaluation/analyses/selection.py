@@ -8,7 +8,7 @@ from PIL import Image
 from mme_vla.data.episodes import EpisodeSource
 from mme_vla.data.memory_image import memory_sheet
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, make_scorer
 from mme_vla.memory.history import OnlineHistory
 
 
@@ -30,7 +30,7 @@ def selection_sheets(
         raise UserError(f"every={every} must be at least 1: the steps between two images.")
     start, length = int(source.exec_starts[episode]), int(source.lengths[episode])
     frames = source.frames(episode, np.arange(length))
-    history, patches = OnlineHistory(memory.storage, memory.make_scorer(), start), memory.storage.grid**2
+    history, patches = OnlineHistory(memory.storage, make_scorer(memory), start), memory.storage.grid**2
     n_observed = 0
     for step in range(start, length, every):
         part = frames[n_observed : step + 1]

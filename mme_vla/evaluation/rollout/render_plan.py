@@ -13,6 +13,7 @@ import numpy as np
 from mme_vla.envs.render_request import RenderRequest
 from mme_vla.evaluation.rollout.environment import Observation
 from mme_vla.evaluation.rollout.settings import RolloutSettings
+from mme_vla.memory.base import past_view_spec
 from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 
@@ -34,7 +35,7 @@ class RenderPlan:
         self._sees_video = subgoals is not None and subgoals.sees_video
         self._sees_passing = subgoals is not None and subgoals.sees_passing
         memory = policy.memory
-        every = memory is not None and memory.past_view_spec is not None
+        every = past_view_spec(memory) is not None
         self._cameras = self._robot.camera_names if every else (self._robot.memory_camera,)
         self._reads = cache(self._reads_of)
         # Depth and poses of cameras come with every frame.

@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
+from mme_vla.memory.base import ProprioMemory
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.memory.recurrent import (
     RecurrentLayer,
@@ -123,10 +124,8 @@ class LSTMLayer(RecurrentLayer):
 
 
 @MEMORIES.register("actions")
-class ActionMemory(RecurrentMemory):
+class ActionMemory(RecurrentMemory, ProprioMemory):
     """`budget` tokens of what an LSTM makes of the robot's own states and actions."""
-
-    reads_motion = True
 
     def __init__(
         self,
@@ -158,8 +157,8 @@ class ActionMemory(RecurrentMemory):
     def frames_read(self, steps: Sequence[int] | np.ndarray, exec_start: int) -> np.ndarray:
         return np.zeros(0, np.int64)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(self._motion_rows(history), step, rng)
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        return super().gather_selection(self._motion_rows(history), step, rng)
 
     def encode(self, histories: Sequence[History], streams: Sequence[Any]) -> MemoryTokens:
         return super().encode([self._motion_rows(history, self.output.weight.device) for history in histories], streams)

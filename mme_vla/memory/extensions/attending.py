@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, all_patches, union_frames
+from mme_vla.memory.base import MemoryModule, all_patches, union_frames
 from mme_vla.memory.history import History
 
 MLP = 4
@@ -62,7 +62,7 @@ def rows_at(x: Tensor, at: Tensor) -> Tensor:
     return torch.gather(x, 1, index)
 
 
-class FrameMemory(Memory):
+class FrameMemory(MemoryModule):
     """A subclass says which frames; all tokens of these are selected, and as many as there are."""
 
     @abstractmethod

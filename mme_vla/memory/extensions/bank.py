@@ -144,7 +144,7 @@ class RetrievalBlock(nn.Module):
 class Retrieval(nn.Module):
     """How tokens of now, of width d, read entries of the past and are fused with the answer.
 
-    The entries are a bank's own (`MemoryBank`), or the tokens of any memory (`recall`).
+    The entries are a bank's own (`MemoryBank`), or the tokens of any memory (`gather_selection`).
     """
 
     def __init__(

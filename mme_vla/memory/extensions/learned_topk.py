@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, all_patches, union_frames
+from mme_vla.memory.base import MemoryModule, all_patches, union_frames
 from mme_vla.memory.encoder import FeatureEncoder, position_features
 from mme_vla.memory.extensions.attending import ReadingBlock, heads_of, rows_at
 from mme_vla.memory.framesamp import evenly_spaced_frames
@@ -31,7 +31,7 @@ EPS = 1e-4
 
 
 @MEMORIES.register("learned_topk")
-class LearnedTopK(Memory):
+class LearnedTopK(MemoryModule):
     """The budget − 1 best tokens of `pool` evenly spaced frames, in the order of time, and one for all the others."""
 
     timed = True

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from mme_vla.errors import UserError
-from mme_vla.memory.base import Memory, PastViewSpec, union_frames
+from mme_vla.memory.base import MemoryModule, PastViewMemory, PastViewSpec, ProprioMemory, union_frames
 from mme_vla.memory.extensions.actions import NEVER, MotionRows
 from mme_vla.memory.history import History, StorageSpec
 from mme_vla.registry import MEMORIES
@@ -26,7 +26,7 @@ from mme_vla.types import HistoryTokens, MemoryTokens
 
 
 @MEMORIES.register("spacetime")
-class SpaceTime(Memory):
+class SpaceTime(MemoryModule, PastViewMemory, ProprioMemory):
     """Views of `frames` frames for the tower, and their states as so many tokens; `select` names the frames.
 
     No cache serves it: it would have to hold what every layer that looks through time makes of every frame of every
@@ -71,7 +71,7 @@ class SpaceTime(Memory):
         self.width, self.state_dim = width, state_dim
         self.d_vision = d_vision
         self.past_view_spec = PastViewSpec(frames, stride, every) if views else None
-        self.reads_motion = states
+        self.uses_proprio = states
         self.budget = self.capacity = frames if states else 0
         self.storage = StorageSpec(1, "mean", NEVER)
         self.states = nn.Linear(state_dim, width) if states else None
@@ -87,8 +87,10 @@ class SpaceTime(Memory):
         frames = frames[frames >= 0]
         return np.stack([frames, np.zeros_like(frames)], 1)
 
-    def recall(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
-        return super().recall(MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng)
+    def gather_selection(self, history: History, step: int, rng: np.random.Generator | None = None) -> HistoryTokens:
+        return super().gather_selection(
+            MotionRows(history, self._proprio_rows(history), self.d_vision, "spacetime"), step, rng
+        )
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
         if self.states is None:

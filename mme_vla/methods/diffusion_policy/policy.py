@@ -7,26 +7,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
 from mme_vla.integration.film import PooledIntegration
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, encode_histories, full_history
 from mme_vla.methods.diffusion_policy import model
 from mme_vla.methods.diffusion_policy.config import DiffusionSizes
 from mme_vla.methods.diffusion_policy.model import DiffusionNetwork
 from mme_vla.methods.diffusion_policy.processor import DiffusionBatch, DiffusionProcessor
+from mme_vla.model import masked_mean
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.masking import masked_mean
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
 from mme_vla.registry import INTEGRATIONS, POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, MemoryTokens, Noise, map_noise, stack_noise
 
 if TYPE_CHECKING:
     from mme_vla.processing.base import PolicyProcessor
@@ -115,7 +114,7 @@ class DiffusionPolicy(Policy):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """The `noise` [n, h, a] that is added and the `step` [n] that says how much."""
         step = torch.randint(self.sizes.diffusion_steps, (count,), generator=generator)
         return {"noise": torch.randn(count, self.horizon, self.action_dim, generator=generator), "step": step}
@@ -129,13 +128,13 @@ class DiffusionPolicy(Policy):
         """The mean squared error of the predicted noise, and metrics to log (detached).
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` makes them.
+            batch: with `actions`. draws: as `training_noise` makes them.
             corner: (top, left) of the crop; by default drawn while training and the centre's else.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunk (it is None).")
-        values = draws or self.loss_draws(len(batch.actions), torch.default_generator)
-        sampled = map_draws(values, lambda value: value.to(self.device))
+        values = draws or self.training_noise(len(batch.actions), torch.default_generator)
+        sampled = map_noise(values, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history)
         with self.autocast():
             condition = self.condition(batch, memory, corner)
@@ -185,7 +184,7 @@ class DiffusionPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a], and what is `added` [99, h, a] after each step but the last."""
         shape, steps = (self.horizon, self.action_dim), self.sizes.diffusion_steps
         noise = torch.randn(shape, generator=generator)
@@ -202,12 +201,12 @@ class DiffusionPolicy(Policy):
         """A normalised chunk [b, h, a], from the first step of the current frame on.
 
         Args:
-            draws: as `sample_draws` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
+            draws: as `sampling_noise` makes them, with a batch axis. steps: of the sampler; 100 as trained by default.
             memory: memory tokens encoded beforehand.
         """
         if draws is None:
-            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.state))])
-        sampled = map_draws(draws, lambda value: value.to(self.device))
+            draws = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.state))])
+        sampled = map_noise(draws, lambda value: value.to(self.device))
         memory = self.encode_memory(batch.history) if memory is None else memory
         with self.autocast():
             condition = self.condition(batch, memory)
@@ -234,7 +233,9 @@ class DiffusionPolicy(Policy):
         memory = None
         if self.memory is not None:
             with torch.no_grad(), self.autocast():
-                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+                memory = encode_histories(
+                    self.memory, [e.required_history() for e in episodes], [e.stream for e in episodes]
+                )
         return self.sample_actions(batch, draws, steps, memory)
 
     @torch.no_grad()
@@ -292,7 +293,7 @@ class DiffusionPolicy(Policy):
             state=torch.zeros(1, sizes.window, robot.state.width, device=device),
             text=torch.zeros(1, sizes.text_dim, device=device),
             actions=torch.zeros(1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(sizes.memory_width, device),
+            history=None if self.memory is None else full_history(self.memory, sizes.memory_width, device),
         )
 
     def warm_up_vision(self) -> None:

@@ -8,21 +8,20 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mme_vla.backbone.base import Draws, map_draws, stack_draws
 from mme_vla.backbone.config import shapes_only
 from mme_vla.config.sections import read_section
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, encode_histories, full_history
 from mme_vla.methods.memoryvla.episode import MemoryVlaEpisode, words
 from mme_vla.methods.memoryvla.model import BankStates, Core, MemoryVlaConfig, MemoryVlaCore, build_core, read_moments
 from mme_vla.methods.memoryvla.processor import GroupBatch, MemoryVlaProcessor
 from mme_vla.methods.openvla_oft.processor import augment, centre_cut, draw_changes
 from mme_vla.methods.prismatic import IMAGENET, Prismatic
+from mme_vla.model import masked_mean
 from mme_vla.policy.base import Policy
 from mme_vla.policy.build import build_memory, check_past
 from mme_vla.policy.episode import Episode
-from mme_vla.policy.masking import masked_mean
 from mme_vla.policy.saving import policy_options
 from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.policy.vision_cache import encode_frames, prepare, tower_fingerprint
@@ -31,7 +30,7 @@ from mme_vla.processing.images import to_unit_range
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup
-from mme_vla.types import HistoryTokens, MemoryTokens
+from mme_vla.types import HistoryTokens, MemoryTokens, Noise, map_noise, stack_noise
 
 
 @POLICIES.register("memoryvla")
@@ -172,7 +171,7 @@ class MemoryVlaPolicy(Policy):
         """Moments of a training sample: its processor's, else its configuration's."""
         return self.config["processor"]["group_size"] if self.processor is None else self.processor.group_size
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Of `count` groups: `noise` [n, r, m, h, a], `steps` and `drop` [n, r, m], for r copies of m moments."""
         shape = (count, self.sizes.repeats, self.group_size)
         return {
@@ -181,7 +180,7 @@ class MemoryVlaPolicy(Policy):
             "drop": torch.rand(shape, generator=generator),
         }
 
-    def image_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def augmentation_params(self, count: int, generator: torch.Generator) -> Noise:
         """While training with augmentation `changes` [n, m, 6]: what happens to the images of `count` groups."""
         if not (self.training and self.augment):
             return {}
@@ -192,20 +191,20 @@ class MemoryVlaPolicy(Policy):
         """The mean squared error of the predicted noise over all moments, copies and numbers.
 
         Args:
-            batch: with `actions`. draws: as `loss_draws` and `picture_draws` make them; fresh ones by default.
+            batch: with `actions`. draws: of `training_noise` and `augmentation_params`; fresh ones by default.
         """
         if batch.actions is None:
             raise ValueError("forward() computes a loss: batch.actions must hold the recorded chunks (it is None).")
-        values = dict(draws or self.loss_draws(len(batch.images), torch.default_generator))
+        values = dict(draws or self.training_noise(len(batch.images), torch.default_generator))
         if "changes" not in values:
-            values |= self.image_draws(len(batch.images), torch.default_generator)
+            values |= self.augmentation_params(len(batch.images), torch.default_generator)
         changes = values.pop("changes", None)
         copies = batch.valid.shape[1]
 
         def repeat_batch(value: Tensor) -> Tensor:  # copies of the whole batch, one after the other
             return value[:, :, :copies].transpose(0, 1)[:, batch.valid].flatten(0, 1)
 
-        sampled = map_draws(values, lambda value: repeat_batch(value.to(self.device)))
+        sampled = map_noise(values, lambda value: repeat_batch(value.to(self.device)))
         memory = self.encode_memory(batch.histories())
         cognition, features, groups = self._of_batch(batch, None if changes is None else changes.to(self.device))
         with self.autocast():
@@ -239,7 +238,7 @@ class MemoryVlaPolicy(Policy):
 
     # Sampling
 
-    def sample_draws(self, generator: torch.Generator) -> Draws:
+    def sampling_noise(self, generator: torch.Generator) -> Noise:
         """The starting `noise` [h, a]."""
         return {"noise": torch.randn(self.horizon, self.action_dim, generator=generator)}
 
@@ -257,7 +256,7 @@ class MemoryVlaPolicy(Policy):
             memory: memory tokens of the last moments, encoded beforehand.
         """
         if draws is None:
-            draws = stack_draws([self.sample_draws(torch.default_generator) for _ in range(len(batch.images))])
+            draws = stack_noise([self.sampling_noise(torch.default_generator) for _ in range(len(batch.images))])
         if self.memory is not None:
             batch = batch.last()
             memory = self.encode_memory(batch.history) if memory is None else memory
@@ -289,7 +288,9 @@ class MemoryVlaPolicy(Policy):
         """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""
         if self.memory is not None:
             with torch.no_grad(), self.autocast():
-                memory = self.memory.encode([e.required_history() for e in episodes], [e.stream for e in episodes])
+                memory = encode_histories(
+                    self.memory, [e.required_history() for e in episodes], [e.stream for e in episodes]
+                )
             return self.sample_actions(batch, draws, steps, memory)
         with torch.no_grad():
             cognition, features, _ = self._of_batch(batch)
@@ -370,7 +371,7 @@ class MemoryVlaPolicy(Policy):
             times=torch.zeros(1, 1, dtype=torch.int64, device=known),
             valid=torch.ones(1, 1, dtype=torch.bool, device=known),
             actions=torch.zeros(1, 1, self.horizon, self.action_dim, device=device),
-            history=None if self.memory is None else self.memory.full_history(self.sizes.vision.width, device),
+            history=None if self.memory is None else full_history(self.memory, self.sizes.vision.width, device),
         )
 
     def warm_up_vision(self) -> None:

@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.attention import additive_mask
-from mme_vla.backbone.base import Backbone, Inject
-from mme_vla.backbone.blocks import Block
+from mme_vla.backbone.attention import Block, additive_mask
+from mme_vla.backbone.base import Backbone, HasExtraExperts, HasLoraTargets, Injection
 from mme_vla.methods.openvla_oft.config import OpenVlaConfig
 from mme_vla.methods.prismatic import Prismatic
 from mme_vla.registry import BACKBONES
+from mme_vla.speed import Recomputes, Sharded
 from mme_vla.speed.recompute import Recompute
-from mme_vla.speed.sharding import ShardGroup
+from mme_vla.speed.sharding import ShardGroup, backbone_groups
 from mme_vla.types import Batch
 
 
@@ -71,7 +71,7 @@ class TokenSequence:
 
 
 @BACKBONES.register("openvla")
-class OpenVlaBackbone(Backbone):
+class OpenVlaBackbone(Backbone, HasExtraExperts, HasLoraTargets, Recomputes, Sharded):
     """`<s>`, images, state, memory, words, a slot of zeros for each number of the chunk, `</s>`.
 
     Nothing is causal and no block is hidden from another, so an integration's visibility table has no say here; memory
@@ -97,9 +97,7 @@ class OpenVlaBackbone(Backbone):
         super().__init__(config, extra_experts)
         self.config = config
         width = config.vlm.width
-        self.vision_width, self.token_width = config.vision.width, width
-        self.vocab_size = config.vocab_size
-        self.depth, self.head_dim = config.vlm.depth, width // config.vlm.num_heads
+        self.vision_width = config.vision.width
         self.image_size, self.grid = config.vision.image_size, config.vision.grid
         self.horizon, self.action_dim = config.horizon, config.action_dim
         self.vlm = Prismatic(config.vision, config.vlm, config.vocab_size)
@@ -107,9 +105,8 @@ class OpenVlaBackbone(Backbone):
         self.head = ActionHead(width, config.action_dim)
         self.heads = ("head",) if self.state_token is None else ("state_token", "head")
 
-    def draw_experts(self, names: Sequence[str]) -> None:
+    def init_experts(self, names: Sequence[str]) -> None:
         """Draw the head and the state's token, which OpenVLA itself has nothing of."""
-        super().draw_experts(names)
         for name in self.heads:
             for module in self.get_submodule(name).modules():
                 if isinstance(module, nn.Linear | nn.LayerNorm):
@@ -126,17 +123,9 @@ class OpenVlaBackbone(Backbone):
         """Images [n, 3, s, s] in [−1, 1] → fused tokens [n, grid², d_vision], before the projector."""
         return self.vlm.encode_images(images)
 
-    def pooled_tokens(self, images: Tensor, grid: int, pooling: str) -> Tensor:
-        """Fused tokens [n, grid², d_vision] as memories store them."""
-        return self.vlm.pooled_tokens(images, grid, pooling)
-
-    def observation_blocks(self, batch: Batch, images: Tensor) -> list[Block]:
-        """Blocks `begin`, `images`, `state` (where it is read) and `prompt`, in sequence order.
-
-        Args:
-            batch: masks, prompt, and the normalised state. images: [b, v, 3, s, s] in [−1, 1].
-        """
-        fused = self.encode_images(images.flatten(0, 1)).unflatten(0, images.shape[:2])
+    def embed(self, batch: Batch) -> list[Block]:
+        """Blocks `begin`, `images`, `state` (where it is read) and `prompt`, in sequence order."""
+        fused = self.encode_images(batch.images.flatten(0, 1)).unflatten(0, batch.images.shape[:2])
         return self.blocks_of(batch, fused)
 
     def blocks_of(self, batch: Batch, fused: Tensor) -> list[Block]:
@@ -194,26 +183,22 @@ class OpenVlaBackbone(Backbone):
         answers = hidden.gather(1, sequence.read[..., None].expand(-1, -1, hidden.shape[-1]))
         return answers.unflatten(1, (self.horizon, self.action_dim)).flatten(2)
 
-    def answer(self, batch: Batch, images: Tensor, inject: Inject) -> Tensor:
-        """The chunk [b, h, a]."""
-        return self.predict_from(inject(self.observation_blocks(batch, images)).blocks)
-
     def predict_from(self, blocks: Sequence[Block]) -> Tensor:
         """The chunk [b, h, a] for the blocks of an injection."""
         sequence = self.sequence(blocks)
         return self.head(self.slots(sequence, self.hidden(sequence)))
 
-    def loss(self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor]) -> Tensor:
+    def loss(self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor]) -> Tensor:
         """The absolute error [b, h], averaged over the numbers of an action."""
         assert batch.actions is not None
-        return absolute_error(self.answer(batch, images, inject), batch.actions)
+        return absolute_error(self.predict_from(injection.blocks), batch.actions)
 
     @torch.no_grad()
     def sample(
-        self, batch: Batch, images: Tensor, inject: Inject, draws: Mapping[str, Tensor], steps: int | None = None
+        self, batch: Batch, injection: Injection, noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        """The chunk [b, h, a]; there is nothing to draw."""
-        return self.answer(batch, images, inject)
+        """The chunk [b, h, a], without random numbers."""
+        return self.predict_from(injection.blocks)
 
     def recompute(self, mode: Recompute) -> None:
         """Recompute the language model's layers in the backward pass."""
@@ -221,7 +206,7 @@ class OpenVlaBackbone(Backbone):
 
     def shard_groups(self) -> Sequence[ShardGroup]:
         """Towers, word embedding, and every layer of the language model."""
-        return [*super().shard_groups(), ShardGroup(self.vlm.language.model.embed_tokens, full=True)]
+        return [*backbone_groups(self), ShardGroup(self.vlm.language.model.embed_tokens, full=True)]
 
     def compile(self, **options: Any) -> None:
         """Compile the towers and every layer of the language model, each by itself."""

@@ -33,11 +33,11 @@ class OpenVlaPolicy(MMEPolicy):
         """As `MMEPolicy.full_batch`, with a state."""
         return replace(super().full_batch(device), proprio=torch.zeros(1, self.embodiment.state.width, device=device))
 
-    def _draw_changes(self, count: int, generator: torch.Generator) -> Tensor:
+    def _sample_augmentation(self, count: int, generator: torch.Generator) -> Tensor:
         views = len(self.embodiment.cameras)
         return draw_changes(count * views, generator).unflatten(0, (count, views))
 
-    def _views(self, batch: Batch, changes: Tensor | None = None) -> Tensor:
-        images = batch.images.flatten(0, 1)
-        cropped = centre_crop(images) if changes is None else augment(images, changes.flatten(0, 1))
-        return to_unit_range(cropped).view(batch.images.shape)
+    def transform_images(self, images: Tensor, augmentation: Tensor | None) -> Tensor:
+        flat = images.flatten(0, 1)
+        cropped = centre_crop(flat) if augmentation is None else augment(flat, augmentation.flatten(0, 1))
+        return to_unit_range(cropped).view(images.shape)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Draws
 from mme_vla.methods.sam2act.geometry import ZOOM, Cube, heatmap_loss, shift_and_rotate, to_bins
 from mme_vla.methods.sam2act.model import SAM2ActNetwork
 from mme_vla.methods.sam2act.processor import KeyframeBatch, cloud_images, zoomed_images
+from mme_vla.types import Noise
 
 SHIFT, ROTATION = 0.125, math.pi / 4
 """Augmentation as released: shifts to this part of the cube's sides, turns to this angle."""
@@ -18,7 +18,7 @@ _CLOSE_TO_EDGE = 1e-3  # metres that a shifted target keeps from the bounds
 _BIN_OFFSETS = (-2, 2)  # how far off the bins that the heads are told may be; the upper end is left out
 
 
-def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Draws:
+def augmentation_draws(count: int, keyframes: int, generator: torch.Generator) -> Noise:
     """Random numbers of `count` samples: shifts and turns in [−1, 1], and how far off told bins are."""
     return {
         "shift": 2 * torch.rand(count, keyframes, 3, generator=generator) - 1,

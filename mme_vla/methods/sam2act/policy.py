@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor, nn
 
-from mme_vla.backbone.base import Draws, map_draws
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
 from mme_vla.methods.sam2act.config import SAM2ActSizes
@@ -24,6 +23,7 @@ from mme_vla.policy.tensor_files import dtype_of
 from mme_vla.registry import POLICIES
 from mme_vla.speed.recompute import Recompute
 from mme_vla.speed.sharding import ShardGroup, stacked_layers
+from mme_vla.types import Noise, map_noise
 
 if TYPE_CHECKING:
     from mme_vla.policy.episode import Episode
@@ -150,7 +150,7 @@ class SAM2ActPolicy(Policy):
 
     # Training
 
-    def loss_draws(self, count: int, generator: torch.Generator) -> Draws:
+    def training_noise(self, count: int, generator: torch.Generator) -> Noise:
         """Shifts and turns of `count` samples' clouds, and how far off the told rotations are."""
         return augmentation_draws(count, self.keyframes, generator)
 
@@ -158,8 +158,8 @@ class SAM2ActPolicy(Policy):
         self, batch: KeyframeBatch, draws: Mapping[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The stage's loss, and its parts to log (detached)."""
-        values = self.loss_draws(len(batch.points), torch.default_generator) if draws is None else draws
-        sampled = map_draws(values, lambda value: value.to(self.device))
+        values = self.training_noise(len(batch.points), torch.default_generator) if draws is None else draws
+        sampled = map_noise(values, lambda value: value.to(self.device))
         cube, sizes = self.cube, self.backbone.sizes
         augmentation = sampled if self.training and self.augment else None
         scenes = augmented(batch, batch.language, augmentation, cube, sizes.rotation_bins)

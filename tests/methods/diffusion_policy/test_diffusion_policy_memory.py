@@ -57,7 +57,7 @@ def test_any_memory_joins_the_condition(memory: str) -> None:
 
 def test_what_is_remembered_changes_the_answer_and_learns(policy: DiffusionPolicy) -> None:
     batch = policy.full_batch()
-    draws = {name: value[None] for name, value in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    draws = {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
     chunks = []
     for seed in (0, 1, 1):
         batch.history = history(policy, seed)

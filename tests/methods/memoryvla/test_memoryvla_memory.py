@@ -56,11 +56,11 @@ def histories(policy: MemoryVlaPolicy, count: int, seed: int = 0) -> HistoryToke
 
 
 def draws(policy: MemoryVlaPolicy, groups: int = 1) -> dict[str, torch.Tensor]:
-    return policy.loss_draws(groups, torch.Generator().manual_seed(0))
+    return policy.training_noise(groups, torch.Generator().manual_seed(0))
 
 
 def noise(policy: MemoryVlaPolicy) -> dict[str, torch.Tensor]:
-    return {name: value[None] for name, value in policy.sample_draws(torch.Generator().manual_seed(0)).items()}
+    return {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
 
 
 @pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "ttt", "rmt", *BEYOND_MEMORIES, "bank"])
@@ -158,7 +158,7 @@ def test_an_episode_remembers_as_a_sample_does_and_writes_nothing(policy: Memory
     episode.noise_state = start
     np.testing.assert_array_equal(policy.act(episode, 2), chunk)
     episode.noise_state = start
-    batch = replace(policy.observation([episode]), history=stack_history([episode.recall()]))
+    batch = replace(policy.observation([episode]), history=stack_history([episode.gather_selection()]))
     drawn = {name: value[None] for name, value in episode.draw().items()}
     expected = policy.require_processor().absolute_actions(policy.sample_actions(batch, drawn, 2), torch.zeros(1, 8))
     np.testing.assert_allclose(chunk, expected[0], atol=1e-5)

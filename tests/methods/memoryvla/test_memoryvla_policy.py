@@ -80,7 +80,7 @@ def batch_of(policy: MemoryVlaPolicy, count: int = 2) -> GroupBatch:
 def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
     policy = tiny()
     batch = batch_of(policy)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
     loss, metrics = policy(batch, draws)
     assert torch.equal(loss, policy(batch, draws)[0]) and metrics["loss"] == loss
     loss.backward()
@@ -95,15 +95,15 @@ def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
 def test_pictures_are_changed_by_given_draws_alone_whatever_stands_beside_them() -> None:
     policy = tiny().train()
     batch = batch_of(policy)
-    draws = policy.loss_draws(2, torch.Generator().manual_seed(0))
-    drawn = [draws | policy.image_draws(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    draws = policy.training_noise(2, torch.Generator().manual_seed(0))
+    drawn = [draws | policy.augmentation_params(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     assert drawn[0]["changes"].shape == (2, 4, 6)
     first, again, other = (policy(batch, each)[0] for each in drawn)
     assert torch.equal(first, again) and not torch.equal(first, other)
     halves = [policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in drawn[0].items()}) for i in range(2)]
     apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
     assert abs(apart - first) < abs(other - first) / 20
-    assert policy.eval().image_draws(2, torch.Generator()) == {}
+    assert policy.eval().augmentation_params(2, torch.Generator()) == {}
 
 
 @torch.no_grad()

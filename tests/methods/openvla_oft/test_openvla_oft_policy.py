@@ -102,10 +102,10 @@ def test_training_shows_crops_of_their_own_and_acting_the_middle() -> None:
     policy = tiny()
     images = torch.randint(0, 256, (2, 2, 3, 32, 32), dtype=torch.uint8)
     batch = replace(batch_for(policy), images=images.repeat(1, 1, 1, 4, 4)[..., :112, :112])
-    assert torch.equal(policy._views(batch), policy._views(batch))
-    draws = policy.train().image_draws(4, torch.Generator().manual_seed(0))["changes"]
-    first = policy._views(batch, draws[:2])
-    assert first.shape == batch.images.shape and not torch.equal(first, policy._views(batch, draws[2:]))
+    assert torch.equal(policy.prepare_images(batch).images, policy.prepare_images(batch).images)
+    draws = policy.train().augmentation_params(4, torch.Generator().manual_seed(0))["changes"]
+    first = policy.prepare_images(batch, draws[:2]).images
+    assert first.shape == batch.images.shape and not torch.equal(first, policy.prepare_images(batch, draws[2:]).images)
 
 
 def test_what_this_backbone_cannot_do_is_refused_in_words() -> None:

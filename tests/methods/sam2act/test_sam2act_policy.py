@@ -97,7 +97,7 @@ def test_augmentation_moves_clouds_and_is_told_by_its_draws_alone(data: Path) ->
     for module in policy.modules():  # dropout off
         if module is not policy:
             module.eval()
-    one, other = (policy.loss_draws(2, torch.Generator().manual_seed(seed)) for seed in (1, 2))
+    one, other = (policy.training_noise(2, torch.Generator().manual_seed(seed)) for seed in (1, 2))
     with torch.no_grad():
         first, again, second = (policy(batch, draws)[0] for draws in (one, one, other))
         plain = policy.eval()(batch, one)[0]
