@@ -6,7 +6,7 @@
     python benchmarks/gpu_memory.py shared pi05:4:16:all                   # … :recomputation (all, selective)
 
 One process a figure, one line of JSON. Weights hold whatever was in memory: nothing is learned, only counted. It asks
-for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as docs/hardware.md has it; `shared` is one of
+for one GPU, or (with --no-cudnn) for a stand-in that computes nothing, as docs/evidence has it; `shared` is one of
 so many processes of one machine, and speaks to nobody.
 """
 

@@ -27,7 +27,7 @@ def _own_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of docs/parity.md."""
+    """With `MME_VLA_PARITY_TABLE=1`, print the largest error of every parity test as the table of docs/evidence."""
     if os.environ.get("MME_VLA_PARITY_TABLE"):
         from helpers import golden
 

@@ -1,4 +1,4 @@
-"""Every shell command of README.md and docs/*.md runs as printed, each in a process of its own.
+"""Every shell command of README.md and docs/**/*.md runs as printed, each in a process of its own.
 
 A command runs unless `NOT_RUN` gives the reason; its words must be valid all the same.
 """
@@ -18,6 +18,7 @@ import pytest
 from hydra._internal.utils import get_args_parser
 
 from helpers import REPOSITORY
+from mme_vla import cli
 from mme_vla.cli.command import check_overrides
 from mme_vla.cli.help import COMMANDS
 from mme_vla.cli.nano import with_settings
@@ -38,18 +39,17 @@ NOT_RUN = {
     r"torchrun|accelerate launch|--multirun": "needs several GPUs or a cluster",
     r"<|…": "has a place for a file or folder of the reader's own",
     r"mme_vla\.train ": "trains for minutes or hours",
-    r"mme_vla\.nano(\.vision_pretrain)?( |$)": "trains for minutes or hours",
+    r"mme_vla\.nano( |$)": "trains for minutes or hours",
     r"mme_vla\.(inspect|evaluate|serve|probe) checkpoint=(outputs|runs)/": "needs a policy that was trained before",
     r"mme_vla\.results outputs/": "needs the records of an evaluation",
     r"mme_vla\.serve ": "serves until it is stopped",
     r"mme_vla\.play ": "waits for a player, or plays hundreds of episodes",
-    r"mme_vla\.envs\.record ": "records for minutes or hours",
-    r"mme_vla\.envs\.show($| tasks=\[StopCube,BinFill\])": "renders demonstrations for minutes",
+    r"mme-vla record ": "records for minutes or hours",
     r"mme_vla\.evaluate .*checkpoint=nano|tasks=\[PickXtimes,VideoUnmask\]": "evaluates for minutes",
     r"mme_vla\.probe (checkpoint=nano|compare=)": "needs recorded episodes or finished probes",
-    r"mme_vla\.data\.(convert|exec_starts|cache) |subgoal\.build input=(path|datasets)": "needs a full dataset",
+    r"mme-vla (convert|cache) |subgoal-build input=(path|datasets)": "needs a full dataset",
     r"--config-dir configs embodiment=two_arms": "needs a robot's dataset",
-    r"mme_vla\.weights\.convert ": "needs released weights",
+    r"mme-vla weights ": "needs released weights",
     r"benchmarks/(gpu|episode_seeds)\.py": "measures for minutes",
 }
 """Pattern → why the commands that it matches are not run here."""
@@ -58,7 +58,7 @@ NOT_RUN = {
 @cache
 def documented() -> list[tuple[str, str]]:
     """Page and command of every shell command in the documentation, continued lines joined."""
-    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+    pages = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
     return list(dict.fromkeys((page.name, line) for page in pages for line in commands_of(page.read_text())))
 
 
@@ -96,7 +96,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize(("page", "command"), RUN[::-1])
 def test_a_documented_command_runs_as_printed(page: str, command: str, root: Path) -> None:
-    if "mme_vla.evaluate" in command or "mme_vla.envs" in command:
+    if re.search(r"mme_vla\.evaluate|mme-vla gallery", command):
         pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
     path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path, "PYTHONPATH": str(REPOSITORY)}
@@ -111,14 +111,20 @@ def test_a_documented_command_runs_as_printed(page: str, command: str, root: Pat
 def test_the_words_of_other_documented_commands_are_valid(page: str, command: str) -> None:
     filled = re.sub(r"<the words[^>]*>|(?<= )(…|\$B)", "", command)  # what means several words, and may be none
     words = shlex.split(re.sub(r"<[^>]*>|…", "x", filled), comments=True)
-    module = next((word for word in words if re.match(r"mme_vla(\.|$)", word)), None)
-    if module is None:
+    start = next((i for i, word in enumerate(words) if re.match(r"mme-vla$|mme_vla(\.|$)", word)), None)
+    if start is None:
         return
-    assert find_spec(module) is not None
-    name = {module: name for name, module in COMMANDS.items()}.get(f"python -m {module}")
+    program, arguments = words[start], words[start + 1 :]
+    if program in ("mme-vla", "mme_vla"):
+        assert arguments[0] in cli.COMMANDS
+        entry, arguments = f"mme-vla {arguments[0]}", arguments[1:]
+    else:
+        assert find_spec(program) is not None
+        entry = f"python -m {program}"
+    name = {documented: name for name, documented in COMMANDS.items()}.get(entry)
     if name is None:  # it takes options instead of a configuration
         return
-    arguments = trust_as_override(words[words.index(module) + 1 :])
+    arguments = trust_as_override(arguments)
     args = get_args_parser().parse_intermixed_args(with_settings(arguments) if name == "nano" else arguments)
     example = REPOSITORY / "examples" / EXAMPLES.get(page, "")
     trees = [example / args.config_dir] if args.config_dir and (example / args.config_dir).is_dir() else []

@@ -18,7 +18,7 @@ def test_the_table_of_dials_is_the_measured_one_and_has_every_dial_of_every_task
             measured[row["actor"], row["dial"], row["task"]][int(row["value"])].append(won)
     dials = {(dial, task) for dial, tasks in DIALS.items() for task in tasks}
     assert set(measured) == {(actor, *pair) for actor in ACTORS for pair in dials}
-    page = (REPOSITORY / "docs" / "benchmark.md").read_text()
+    page = (REPOSITORY / "docs" / "evidence" / "benchmark.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "| +0: " in line]
     shown, dial = {}, ""
     for name, _, task, *solved in rows:

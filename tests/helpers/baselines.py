@@ -54,7 +54,7 @@ def rule_weight(name: str, shape: tuple[int, ...], seed: int) -> Tensor:
 
 
 def relative_error(found: Tensor, expected: Tensor) -> float:
-    """Largest difference over the largest expected number; also kept under the running test's name (docs/parity.md)."""
+    """Largest difference over the largest expected number; also kept under the running test's name (docs/evidence)."""
     assert found.shape == expected.shape, (found.shape, expected.shape)
     worst = (found.detach().double() - expected.double()).abs().max().item()
     worst /= expected.abs().max().item() or 1.0

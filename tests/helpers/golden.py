@@ -131,7 +131,7 @@ def memory_tokens(policy: MMEPolicy, tensors: dict[str, Tensor]) -> MemoryTokens
 
 
 ERRORS: dict[str, float] = {}
-"""Largest error seen per test, for the table in docs/parity.md (`MME_VLA_PARITY_TABLE=1`, see conftest.py)."""
+"""Largest error seen per test, for the table in docs/evidence/parity.md (`MME_VLA_PARITY_TABLE=1`, see conftest.py)."""
 
 
 def error(ours: Tensor, golden: Tensor) -> float:

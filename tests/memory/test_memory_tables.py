@@ -9,11 +9,12 @@ from helpers import REPOSITORY
 from mme_vla.testing.small import MODELS
 
 DOCS, BENCHMARKS = REPOSITORY / "docs", REPOSITORY / "benchmarks"
+EVIDENCE = DOCS / "evidence"
 
 
 def table(page: str, heading: str) -> dict[str, list[str]]:
     """The first table under a heading: cells by the first of each row."""
-    text = (DOCS / page).read_text().split(f"\n## {heading}\n", 1)[1].split("\n## ")[0]
+    text = (EVIDENCE / page).read_text().split(f"\n## {heading}\n", 1)[1].split("\n## ")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if line[:1] == "|"]
     return {row[0]: row[1:] for row in rows[2:]}
 
@@ -29,9 +30,9 @@ def sizes() -> ModuleType:
 
 @pytest.mark.parametrize("model", ["pi05", "tokendrop_expert", "framesamp_modul", "ttt_context", "rmt_expert"])
 def test_sizes_are_those_of_the_page(sizes: ModuleType, model: str) -> None:
-    written = (DOCS / "performance.md").read_text()
+    written = (EVIDENCE / "cost.md").read_text()
     assert sizes.of_model(model) in written.splitlines()
 
 
 def test_the_page_has_every_model() -> None:
-    assert {f"`{model}`" for model in MODELS} <= table("performance.md", "Size and memory").keys()
+    assert {f"`{model}`" for model in MODELS} <= table("cost.md", "Size and memory").keys()

@@ -144,7 +144,7 @@ def test_policies_without_such_a_memory_have_nothing_to_prepare():
 
 
 def test_a_longer_window_is_never_full_in_a_whole_episode():
-    """What docs/performance.md offers: 128 frames hold the longest video and 1,300 frames of execution."""
+    """What docs/evidence/performance.md offers: 128 frames hold the longest video and 1,300 frames of execution."""
     longest = max(len(recurrent_frames(video + 1300, video, max_steps=1000)) for video in range(0, 1000, 7))
     assert 64 < longest <= 128
 

@@ -197,7 +197,7 @@ def page_row(records: list[EpisodeRecord]) -> str:
 
 
 def test_the_pages_figures_follow_from_the_records() -> None:
-    page, folder = (REPOSITORY / "docs" / "nano.md").read_text(), REPOSITORY / "benchmarks" / "nano"
+    page, folder = (REPOSITORY / "docs" / "evidence" / "nano.md").read_text(), REPOSITORY / "benchmarks" / "nano"
     rows = sorted((folder / "VideoUnmask").iterdir())
     assert len(rows) >= 4
     for row in rows:

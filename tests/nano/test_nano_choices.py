@@ -48,7 +48,7 @@ def test_a_row_by_choices_is_of_a_hundred_scenes_of_one_difficulty(task: str, le
 def test_the_figures_of_rows_by_choices_follow_from_the_records(task: str, model: str) -> None:
     read = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / task / model]))
     records = {record.episode: record for record in read}.values()  # one that ended in an error was tried twice
-    page = (REPOSITORY / "docs" / "nano.md").read_text()
+    page = (REPOSITORY / "docs" / "evidence" / "nano.md").read_text()
     (row,) = [line for line in page.splitlines() if line.startswith(f"| {task}, ") and f"choices | `{model}`" in line]
     done = sum(record.success for record in records)
     assert f"| {len(records)} |" in row and f"{100 * done / len(records):.0f} % (" in row

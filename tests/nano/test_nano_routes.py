@@ -102,5 +102,5 @@ def test_the_pages_figures_of_routes_follow_from_the_records() -> None:
     won = {model: {r.episode for r in records if r.model.startswith(model) and r.success} for model in ROWS}
     assert len(records) == 300 and {model: len(found) for model, found in won.items()} == ROWS
     assert won["pi05"] < won["framesamp"]
-    page = (REPOSITORY / "docs" / "nano.md").read_text()
+    page = (REPOSITORY / "docs" / "evidence" / "nano.md").read_text()
     assert "| **73 %** (64 … 81) | 50/50 | 19/25 | 4/25 |" in page and "| 3 % (1 … 8) | 3/50 | 0/25 | 0/25 |" in page
