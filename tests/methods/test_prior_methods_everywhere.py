@@ -126,7 +126,9 @@ def test_it_trains_and_goes_on_from_its_checkpoint(
 def test_it_is_evaluated(model: str, loaded: Callable[[str], Policy]) -> None:
     policy = loaded(model)
     base = make_depth_env if policy.embodiment.readings else make_scripted_env
-    envs = InlineEnvs(base=base, robot=policy.embodiment, max_steps=20, max_actions=policy.max_actions)
+    envs = InlineEnvs(
+        base=base, robot=policy.embodiment, max_steps=20, max_actions=getattr(policy, "max_actions", None)
+    )
     (record,) = roll(policy, [Job("VideoUnmask", "test", 1)], envs, max_steps=20)
     assert record.outcome in ("success", "fail", "timeout") and record.steps > 0 and record.extra["chunks"] > 0
     assert record.action_space == policy.embodiment.action.space
