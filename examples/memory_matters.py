@@ -34,7 +34,7 @@ import torch
 from mme_vla import build_policy
 from mme_vla.cli.errors import print_user_errors
 from mme_vla.config.composition import compose
-from mme_vla.memory.base import stack_history
+from mme_vla.memory.base import past_view_spec, stack_history
 from mme_vla.memory.history import CachedHistory
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.processing.images import past_views, stack_past

@@ -129,16 +129,16 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def command(module: str, *arguments: str | Path) -> str:
-    """Run `python -m mme_vla.<module> <arguments>` in this process; what it prints."""
-    before, sys.argv = sys.argv, [f"mme_vla.{module}", *map(str, arguments)]
+def command(name: str, *arguments: str | Path) -> str:
+    """Run `mme-vla <name> <arguments>` in this process; what it prints."""
+    before, sys.argv = sys.argv, ["mme-vla", name, *map(str, arguments)]
     printed = StringIO()
     try:
         with redirect_stdout(printed), mock.patch.dict(os.environ, COLUMNS="120"):
-            runpy.run_module(f"mme_vla.{module}", run_name="__main__")
+            runpy.run_module("mme_vla", run_name="__main__")
     except SystemExit as end:
         if end.code not in (None, 0):
-            raise RuntimeError(f"{module} {' '.join(map(str, arguments))} ended with {end.code}") from end
+            raise RuntimeError(f"{name} {' '.join(map(str, arguments))} ended with {end.code}") from end
     finally:
         sys.argv = before
     return printed.getvalue()
@@ -183,10 +183,10 @@ def make_dataset(folder: Path, scratch: Path) -> None:
     recordings = scratch / "h5"
     recordings.mkdir()
     write_file(recordings / "record_dataset_PickXtimes.h5", [22, 20], [6, 0], poses=True, depth=True, choices=True)
-    command("data.convert", f"input={recordings}", f"output={folder / 'dataset'}", "images=png")
-    command("data.convert", f"input={recordings}", f"output={folder / 'dataset_video'}", "names=lerobot",
+    command("convert", f"input={recordings}", f"output={folder / 'dataset'}", "images=png")
+    command("convert", f"input={recordings}", f"output={folder / 'dataset_video'}", "names=lerobot",
             "keyframes=true")  # fmt: skip
-    command("data.exec_starts", f"input={recordings}", f"output={folder / 'exec_starts.json'}")
+    command("exec-starts", f"input={recordings}", f"output={folder / 'exec_starts.json'}")
 
 
 def make_policies(folder: Path) -> None:
@@ -238,7 +238,7 @@ def policy_figures(folder: Path, scratch: Path) -> dict[str, Any]:
 
 def export(folder: Path) -> None:
     for target in ("lerobot", "openpi", "released"):
-        command("weights.convert", folder / "pretrained" / "pi05_past_actions", folder / "exports" / target,
+        command("weights", folder / "pretrained" / "pi05_past_actions", folder / "exports" / target,
                 "--to", target)  # fmt: skip
 
 

@@ -156,6 +156,9 @@ class FedEpisode(Episode):
 class FedPolicy(Policy):
     """`inner` with a feed before it. It evaluates and rolls out as any policy does, with the same noise."""
 
+    n_distractor_episodes: int = 0
+    """Episodes of a stress split's sessions, which a run names; those of a probe's arm do not count."""
+
     def __init__(self, inner: Policy, feed: Feed, sessions: Sequence[Recording] = ()) -> None:
         """Wrap a policy.
 

@@ -5,11 +5,11 @@ import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from mme_vla.config.sections import read_section
 from mme_vla.errors import UserError, brief
-from mme_vla.evaluation.store import read_lines
-from mme_vla.utils import parse_json, verified, with_checksum
+from mme_vla.utils import parse_json, read_lines, verified, with_checksum
 
 LINES = "offline*.jsonl"
 """The files of all shards."""
@@ -106,7 +106,7 @@ def read(path: Path) -> tuple[list[Line], set[str]]:
     """The lines of recorded episodes that are done, and which these are; nothing where there is no file."""
     pending: dict[str, list[Line]] = {}
     done: dict[str, list[Line]] = {}
-    for line in read_lines(path, _parse, "a line of a probe") if path.exists() else []:
+    for line in read_lines(path, _from_dict, "lines of a probe") if path.exists() else []:
         if isinstance(line, DoneLine):
             done[line.recording] = pending.pop(line.recording, [])
         else:
@@ -120,7 +120,10 @@ def read_all(folder: Path) -> list[Line]:
 
 
 def _parse(text: bytes) -> Line | DoneLine:
-    row = verified(parse_json(text, "the line"), "the line")
+    return _from_dict(verified(parse_json(text, "the line"), "the line"))
+
+
+def _from_dict(row: dict[str, Any]) -> Line | DoneLine:
     name = row.pop("kind", None)
     if name not in _NAMES.values():
         raise UserError(f"kind={brief(name)} must be {', '.join(_KINDS)}.")

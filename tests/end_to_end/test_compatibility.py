@@ -89,9 +89,7 @@ def test_cache_command_finds_every_episode(tmp_path: Path) -> None:
     cache = copied("cache", tmp_path / "cache")
     chosen = [word for word in EXPECTED["words"]["framesamp"] if word.startswith(("model=", "backbone.", "memory."))]
     start = f"init_from={FOLDER / 'training' / 'framesamp'}"
-    assert ": 0 episodes encoded, 2 in all" in command(
-        "data.cache", *chosen, "data=lerobot", *places(FOLDER, cache), start
-    )
+    assert ": 0 episodes encoded, 2 in all" in command("cache", *chosen, "data=lerobot", *places(FOLDER, cache), start)
 
 
 @pytest.mark.parametrize("dataset", ["dataset", "dataset_video"])
@@ -108,7 +106,7 @@ def test_export_converts_back_to_the_same_weights(format: str, tmp_path: Path) -
     from make_compatibility_files import command
 
     source = FOLDER / "pretrained" / "pi05_past_actions"
-    command("weights.convert", FOLDER / "exports" / format, tmp_path / "ours", *EXPECTED["export_words"])
+    command("weights", FOLDER / "exports" / format, tmp_path / "ours", *EXPECTED["export_words"])
     tensors, expected = (load_file(folder / "model.safetensors") for folder in (tmp_path / "ours", source))
     assert tensors.keys() == expected.keys()
     for name, tensor in expected.items():

@@ -9,11 +9,13 @@ from torch import Tensor
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
 from helpers.scripted_env import make_far_env
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
+from mme_vla.envs import Job
 from mme_vla.evaluation.recordings import Recording
 from mme_vla.policy.mme import MMEPolicy
 from mme_vla.probing.arms import Arm, read_arm, read_arms
 from mme_vla.probing.lines import Line
 from mme_vla.probing.offline import OfflineSettings, probe_offline
+from mme_vla.probing.probed import ProbedPolicy
 
 SIDE = 64
 

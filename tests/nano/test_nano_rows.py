@@ -135,7 +135,7 @@ def test_the_page_compares_every_model_with_the_one_without_memory(tmp_path: Pat
         "framesamp_modul": records("framesamp_modul", 60, 100, 4), "pi05": records("pi05", 5, 100),
         "ttt_modul": records("ttt_modul", 20, 50, 4), "planner": records("planner", 100, 100),
     }  # fmt: skip
-    page = write_page(tmp_path, config, runs, "pi05", {"videos": [2.0, 1.0]}, [film]).read_text()
+    page = write_page(tmp_path, config, runs, "pi05", {"videos": [2.0, 1.0]}, [video]).read_text()
     assert "| framesamp_modul | 4 | 60 % (60/100) | 50 … 69 % | 60/100 |  |  | 2.0 cm | 67 % |" in page
     assert "| planner |  | 100 % (100/100) |" in page and "| ttt_modul | 4 | 40 % (20/50) |" in page
     assert "framesamp_modul@4 − pi05" in page and "ttt_modul@4 − pi05" in page and "films/a.mp4" in page

@@ -12,7 +12,7 @@ from mme_vla.data.memory_image import memory_sheet
 from mme_vla.data.statistics import compute_norm_stats
 from mme_vla.errors import UserError
 from mme_vla.evaluation.results.plots import COLOURS, FAINT, figure, svg
-from mme_vla.memory.base import Memory
+from mme_vla.memory.base import Memory, make_scorer
 from mme_vla.memory.history import OnlineHistory
 from mme_vla.memory.recurrent import RecurrentMemory
 from mme_vla.policy.episode import Episode
@@ -121,7 +121,7 @@ def recurrence_curves(policy: MMEPolicy, source: EpisodeSource, episode: int, st
     assert last is not None
     step, running = last
     history = running.required_history()
-    window = running.recall()
+    window = running.gather_selection()
     with policy.autocast():
         features, positions, mask = (
             x[None].to(policy.device) for x in (window.features, window.positions, window.mask)

@@ -22,7 +22,7 @@ from mme_vla.config.composition import compose
 from mme_vla.data.sources import open_sources
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.recordings import all_recordings
-from mme_vla.memory.base import stack_history
+from mme_vla.memory.base import full_history, stack_history
 from mme_vla.methods.memoryvla.model import MemoryVlaCore, RecallingCore
 from mme_vla.methods.memoryvla.policy import MemoryVlaPolicy
 from mme_vla.policy.base import Policy
