@@ -294,10 +294,11 @@ def evaluate(folder: Path) -> None:
 
 def evaluate_scripted(folder: Path, output: Path) -> Any:
     """Run, or continue with, four episodes in the tests' own environment, which needs no simulator."""
-    from helpers.scripted_env import make_far_env
+    from helpers.scripted_env import make_moving_env
 
     return mme_vla.evaluate(
-        folder / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3, output=output, base=make_far_env,
+        folder / "training" / "framesamp", ["PickXtimes", "VideoUnmask"], 2, seed=3, output=output,
+        base=make_moving_env,
         show_progress=False, max_steps=24, flow_steps=2, workers=1, max_batch=1, video="all",
     )  # fmt: skip
 

@@ -19,7 +19,7 @@ def _folder(variable: str, default: Path, what: str) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _own_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
+def _isolated_plugins(monkeypatch: pytest.MonkeyPatch) -> None:
     """Forget the plugins that a test imports when it ends."""
     from mme_vla.config import plugins
 

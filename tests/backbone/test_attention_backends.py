@@ -27,35 +27,35 @@ def inputs(table: Visibility, kv_heads: int) -> tuple[MaskLayout, list[Tensor]]:
 @pytest.mark.parametrize("backend", OTHERS)
 @pytest.mark.parametrize("kv_heads", [1, 2])
 def test_answers_and_gradients_are_those_of_the_mask(backend: str, table: Visibility, kv_heads: int) -> None:
-    sight, tensors = inputs(table, kv_heads)
-    assert sight.visible.any(-1).all(), "every run should see a key here"
+    layout, tensors = inputs(table, kv_heads)
+    assert layout.visible.any(-1).all(), "every run should see a key here"
 
     def computed(name: str) -> list[Tensor]:
         learning = backend != "flex"  # which has no backward pass on a CPU
-        given = [x.clone().requires_grad_(learning) for x in tensors]
-        answer = attend(*given, build_mask(sight, torch.float32, name, compiled=False))
+        leaves = [x.clone().requires_grad_(learning) for x in tensors]
+        output = attend(*leaves, build_mask(layout, torch.float32, name, compiled=False))
         if learning:
-            answer.square().sum().backward()
-        return [answer.detach(), *(x.grad for x in given if x.grad is not None)]
+            output.square().sum().backward()
+        return [output.detach(), *(x.grad for x in leaves if x.grad is not None)]
 
-    for found, expected in zip(computed(backend), computed("sdpa"), strict=True):
-        assert torch.allclose(found, expected, atol=1e-4, rtol=1e-4)
+    for actual, expected in zip(computed(backend), computed("sdpa"), strict=True):
+        assert torch.allclose(actual, expected, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("backend", OTHERS)
 def test_queries_that_see_nothing_get_numbers(backend: str) -> None:
-    sight, tensors = inputs(TABLES["memory"], 1)
-    blind = MaskLayout(sight.lengths, sight.visible & (torch.arange(len(sight.lengths)) > 0)[:, None])
+    layout, tensors = inputs(TABLES["memory"], 1)
+    blind = MaskLayout(layout.lengths, layout.visible & (torch.arange(len(layout.lengths)) > 0)[:, None])
     assert torch.isfinite(attend(*tensors, build_mask(blind, torch.float32, backend, compiled=False))).all()
 
 
 @pytest.mark.parametrize("backend", ["sdpa", *OTHERS])
-def test_the_last_layer_asks_for_a_part_of_the_queries(backend: str) -> None:
-    sight, _ = inputs(TABLES["own"], 1)
-    whole, rows = build_mask(sight, torch.float32, "sdpa", compiled=False), [slice(3, 5), slice(18, 22)]
-    assert isinstance(whole, Tensor)
-    found = select_rows(build_mask(sight, torch.float32, backend, compiled=False), rows, torch.float32)
-    assert torch.equal(found, torch.cat([whole[:, :, at] for at in rows], 2))
+def test_the_last_layer_reads_a_subset_of_the_queries(backend: str) -> None:
+    layout, _ = inputs(TABLES["own"], 1)
+    full, rows = build_mask(layout, torch.float32, "sdpa", compiled=False), [slice(3, 5), slice(18, 22)]
+    assert isinstance(full, Tensor)
+    selected = select_rows(build_mask(layout, torch.float32, backend, compiled=False), rows, torch.float32)
+    assert torch.equal(selected, torch.cat([full[:, :, at] for at in rows], 2))
 
 
 @pytest.mark.parametrize("model", ["pi05", "tokendrop_expert", "framesamp_modul"])

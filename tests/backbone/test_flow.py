@@ -30,13 +30,13 @@ def test_uniform_times_are_an_option():
         build_policy("pi05", backbone={"time_distribution": "normal"})
 
 
-def test_the_drawn_times_follow_the_option(monkeypatch):
-    asked = []
-    monkeypatch.setattr(flow, "sample_time", lambda n, kind, *_: (n and asked.append(kind)) or torch.full((n,), 0.5))
+def test_the_sampled_times_follow_the_option(monkeypatch):
+    shapes = []
+    monkeypatch.setattr(flow, "sample_time", lambda n, kind, *_: (n and shapes.append(kind)) or torch.full((n,), 0.5))
     for kind in ("beta", "uniform"):
         policy = small_policy("pi05", backbone={"time_distribution": kind})
         policy(random_batch(policy))
-    assert asked == ["beta", "uniform"]
+    assert shapes == ["beta", "uniform"]
 
 
 def test_the_path_runs_from_actions_to_noise():

@@ -37,11 +37,11 @@ def full_size(variant: str) -> Policy:
 def test_names_and_shapes_equal_the_released_tree(variant: str, shared):
     tree = json.loads((shared / "spec" / f"param_tree_{VARIANTS[variant]}.json").read_text())
     policy = full_size(variant)
-    ours = policy.state_dict()
+    state = policy.state_dict()
     table = released_table(policy)
-    assert set(table) == set(ours), "every tensor of ours has a released place, and no place is invented"
-    written = write(table, released_unread(policy), ours, released_derived(policy))
-    assert {k: tuple(v.shape) for k, v in written.items()} == {k: tuple(v["shape"]) for k, v in tree["params"].items()}
+    assert set(table) == set(state), "every tensor of ours has a released place, and no place is invented"
+    exported = write(table, released_unread(policy), state, released_derived(policy))
+    assert {k: tuple(v.shape) for k, v in exported.items()} == {k: tuple(v["shape"]) for k, v in tree["params"].items()}
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -38,7 +38,7 @@ def test_the_page_shows_the_files_that_are_tested() -> None:
         assert (EXAMPLE / file).read_text().strip() in page, file
 
 
-def test_it_keeps_a_backbones_promises() -> None:
+def test_it_keeps_a_backbones_contract() -> None:
     own()
     check_backbone("regression", **SMALL)
 
@@ -59,11 +59,11 @@ def test_memory_reaches_its_actions_and_it_learns(memory: str) -> None:
     assert policy.memory.get_parameter("encoder.project.weight").grad.abs().sum() > 0  # type: ignore[union-attr]
     torch.optim.SGD(policy.parameters(), 1e-3).step()
     assert policy(batch)[0] < before
-    kept, _ = policy(batch)
+    loss, _ = policy(batch)
     policy.recompute(True)
     again, _ = policy(batch)
     again.backward()
-    assert torch.equal(kept, again)
+    assert torch.equal(loss, again)
 
 
 def run(name: str, *words: str) -> None:
@@ -104,7 +104,7 @@ def test_a_checkpoint_of_it_works_in_every_command(
     assert [record.outcome for record in read_records(tmp_path / "records" / "episodes.jsonl")] == ["timeout"]
 
 
-def test_what_a_memory_remembers_is_drawn_for_its_grid(
+def test_what_a_memory_stores_is_rendered_for_its_grid(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(sys, "argv", [])
@@ -117,10 +117,10 @@ def test_what_a_memory_remembers_is_drawn_for_its_grid(
     assert "8×8 tokens a view pool to 1, 2, 4, 8 a side" in capsys.readouterr().err.replace("\n", " ")
 
 
-def test_a_backbone_whose_file_names_no_processor_is_told_how(tmp_path: Path) -> None:
-    given = (EXAMPLE / "configs" / "backbone" / "regression.yaml").read_text()
+def test_a_backbone_whose_file_names_no_processor_is_reported_how(tmp_path: Path) -> None:
+    lines = (EXAMPLE / "configs" / "backbone" / "regression.yaml").read_text()
     (tmp_path / "backbone").mkdir()
-    kept = [line for line in given.splitlines() if "processor" not in line]
-    (tmp_path / "backbone" / "bare.yaml").write_text("\n".join(kept))
+    remaining = [line for line in lines.splitlines() if "processor" not in line]
+    (tmp_path / "backbone" / "bare.yaml").write_text("\n".join(remaining))
     with pytest.raises(UserError, match="No processor goes with the backbone 'regression': under `defaults`"):
         build_policy("pi05", config_dir=tmp_path, backbone="bare")

@@ -28,9 +28,9 @@ def test_what_a_valid_token_sees_is_what_the_table_says(table: Visibility) -> No
     spans = blocks_of(table)
     valid = validity(sum(span.length for span in spans))
     expected = attention_mask(spans, spans, valid, valid, table)
-    sight = MaskLayout.of(spans, spans, valid, table)
-    assert torch.equal(sight.expand(sight.visible) & valid[:, :, None], expected)
-    assert sum(sight.lengths) == valid.shape[1] and len(sight.lengths) <= len(spans)
+    layout = MaskLayout.of(spans, spans, valid, table)
+    assert torch.equal(layout.expand(layout.visible) & valid[:, :, None], expected)
+    assert sum(layout.lengths) == valid.shape[1] and len(layout.lengths) <= len(spans)
 
 
 def test_neighbours_that_see_the_same_are_one_run() -> None:
@@ -38,13 +38,13 @@ def test_neighbours_that_see_the_same_are_one_run() -> None:
     assert MaskLayout.of(spans, spans, validity(18), PI05_VISIBILITY).lengths == (12, 6)
 
 
-def test_a_part_of_the_queries_sees_what_it_saw_in_the_whole() -> None:
+def test_a_subset_of_the_queries_has_the_mask_rows_of_all_queries() -> None:
     spans = blocks_of(MEMORY_VISIBILITY)
-    sight = MaskLayout.of(spans, spans, validity(22), MEMORY_VISIBILITY)
+    layout = MaskLayout.of(spans, spans, validity(22), MEMORY_VISIBILITY)
     rows = [slice(2, 4), slice(11, 22)]
-    part = sight.part(rows)
-    whole = sight.expand(sight.visible)
-    assert torch.equal(part.expand(part.visible), torch.cat([whole[:, at] for at in rows], 1))
+    part = layout.part(rows)
+    full = layout.expand(layout.visible)
+    assert torch.equal(part.expand(part.visible), torch.cat([full[:, at] for at in rows], 1))
 
 
 def test_a_block_without_a_row_is_named() -> None:
@@ -60,10 +60,10 @@ def test_the_number_behind_hidden_keys_survives_kernels_that_count_in_base_two()
 
 @pytest.mark.parametrize("keys", [5, 16, 596])
 def test_rows_of_a_mask_lie_where_fused_kernels_want_them(keys: int) -> None:
-    sight = MaskLayout((3, 2), torch.ones(2, 2, keys, dtype=torch.bool))
+    layout = MaskLayout((3, 2), torch.ones(2, 2, keys, dtype=torch.bool))
     for mask in (
-        layout_mask(sight, torch.bfloat16),
-        layout_mask(MaskLayout((5,), sight.visible[:, :1]), torch.bfloat16),
+        layout_mask(layout, torch.bfloat16),
+        layout_mask(MaskLayout((5,), layout.visible[:, :1]), torch.bfloat16),
     ):
         assert mask.shape == (2, 1, 5, keys) and mask.stride(-1) == 1
         assert all(stride % ALIGNMENT == 0 for stride in mask.stride()[2:-1])

@@ -203,18 +203,18 @@ def test_what_is_hidden_is_what_only_other_extras_bring() -> None:
 
 @cache
 def installed() -> dict[str, Distribution]:
-    return {canonicalize_name(found.metadata["Name"]): found for found in distributions()}
+    return {canonicalize_name(distribution.metadata["Name"]): distribution for distribution in distributions()}
 
 
 @cache
 def needs() -> dict[str, list[str]]:
     """The packages that each extra names."""
-    found: dict[str, list[str]] = {}
+    requirements: dict[str, list[str]] = {}
     for requirement in required("mme-vla"):
         named = re.search(r"extra == ['\"](\w+)['\"]", str(requirement.marker))
         if named:
-            found.setdefault(named[1], []).append(canonicalize_name(requirement.name))
-    return found
+            requirements.setdefault(named[1], []).append(canonicalize_name(requirement.name))
+    return requirements
 
 
 @cache
@@ -228,24 +228,24 @@ def is_installed(extra: str) -> bool:
 
 def closure(names: Iterable[tuple[str, str]]) -> set[str]:
     """Distributions, and all that they need; each with the extra that is asked of it."""
-    seen: set[tuple[str, str]] = set()
-    rest = list(names)
-    while rest:
-        name, extra = rest.pop()
-        if (name, extra) in seen or name not in installed():
+    visited: set[tuple[str, str]] = set()
+    pending = list(names)
+    while pending:
+        name, extra = pending.pop()
+        if (name, extra) in visited or name not in installed():
             continue
-        seen.add((name, extra))
-        for wanted in required(name):
-            if wanted.marker is None or wanted.marker.evaluate({"extra": extra}):
-                rest += [(canonicalize_name(wanted.name), each) for each in ("", *wanted.extras)]
-    return {name for name, _ in seen}
+        visited.add((name, extra))
+        for requirement in required(name):
+            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
+                pending += [(canonicalize_name(requirement.name), each) for each in ("", *requirement.extras)]
+    return {name for name, _ in visited}
 
 
 @cache
 def modules() -> dict[str, set[str]]:
     """Each module and package, down to the first folder with an `__init__`, and the distributions that bring it."""
     owners: dict[str, set[str]] = {}
-    listed = {name: (found.read_text("RECORD") or "").splitlines() for name, found in installed().items()}
+    listed = {name: (paths.read_text("RECORD") or "").splitlines() for name, paths in installed().items()}
     files = {name: {line.partition(",")[0] for line in lines} for name, lines in listed.items()}
     packages = {file.removesuffix("/__init__.py") for each in files.values() for file in each}
     for name, each in files.items():
@@ -281,6 +281,6 @@ def module_of(distribution: str) -> str:
 def test_install_lines_name_what_a_clone_has_and_no_index() -> None:
     pages = [REPOSITORY / "README.md", *REPOSITORY.glob("docs/*.md"), *REPOSITORY.glob("mme_vla/**/*.py")]
     text = {page.name: page.read_text() for page in pages}
-    assert [name for name, found in text.items() if re.search(r"pip install \S*mme-vla", found)] == []
-    named = {extra for found in text.values() for extra in re.findall(r"--extra ([a-z]\w*)", found)}
+    assert [name for name, content in text.items() if re.search(r"pip install \S*mme-vla", content)] == []
+    named = {extra for content in text.values() for extra in re.findall(r"--extra ([a-z]\w*)", content)}
     assert {"sim", "serve"} <= named <= set(needs())

@@ -73,5 +73,5 @@ def said() -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("what", WITHOUT)
-def test_it_is_imported_without_what_it_does_not_need(said: dict[str, str], what: str) -> None:
-    assert said[what] == ""
+def test_it_is_imported_without_what_it_does_not_need(reports: dict[str, str], what: str) -> None:
+    assert reports[what] == ""

@@ -48,11 +48,11 @@ def test_an_episode_shows_its_phases_and_subgoals(sample: EpisodeSource, console
 
 
 @pytest.mark.parametrize("name", ["tokendrop", "framesamp"])
-def test_a_memory_is_drawn_as_it_selects(sample: EpisodeSource, console: Console, tmp_path: Path, name: str) -> None:
+def test_a_memory_is_rendered_as_it_selects(sample: EpisodeSource, console: Console, tmp_path: Path, name: str) -> None:
     memory = build_memory(compose("inspect", [f"memory={name}"]))
     path = draw_memory(sample, 3, 120, memory, name, tmp_path, console)
-    with Image.open(path) as picture:
-        assert picture.width > 800
+    with Image.open(path) as image:
+        assert image.width > 800
     assert f"of {memory.budget} tokens" in console.export_text()
 
 

@@ -85,15 +85,15 @@ def test_nothing_slow_is_imported_before_a_command_can_be_stopped(room: str) -> 
         (OSError("4000 requested and 96 written"), "no room left"),
     ],
 )
-def test_what_the_disk_refuses_is_said_in_one_sentence(
+def test_what_the_disk_refuses_is_reported_in_one_sentence(
     capsys: pytest.CaptureFixture[str], error: Exception, words: str
 ) -> None:
     with pytest.raises(SystemExit) as ended, print_user_errors():
         raise error
-    said = capsys.readouterr().err
+    stderr = capsys.readouterr().err
     assert ended.value.code == 1
-    assert words in said
-    assert "epeat" in said
+    assert words in stderr
+    assert "epeat" in stderr
 
 
 def test_other_errors_keep_their_traceback() -> None:
@@ -118,17 +118,17 @@ def test_a_released_lock_leaves_nothing_and_work_stays(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_drafts_of_killed_processes_are_removed_and_those_of_others_are_not(tmp_path: Path) -> None:
-    mine, theirs = draft_of(tmp_path / "a"), tmp_path / ".a.elsewhere-1-00000000.partial"
+    mine, other_draft = draft_of(tmp_path / "a"), tmp_path / ".a.elsewhere-1-00000000.partial"
     ended = subprocess.Popen(["true"])
     ended.wait()
     dead = tmp_path / mine.name.replace(f"-{os.getpid()}-", f"-{ended.pid}-")
-    for path in (mine, theirs, dead):
+    for path in (mine, other_draft, dead):
         path.touch()
     remove_drafts(tmp_path)
-    assert set(tmp_path.iterdir()) == {mine, theirs}
+    assert set(tmp_path.iterdir()) == {mine, other_draft}
 
 
-def test_a_plan_that_was_never_written_whole_is_nobodys(tmp_path: Path) -> None:
+def test_an_incomplete_plan_is_ignored(tmp_path: Path) -> None:
     (tmp_path / PLAN).write_text('{"epis')
     (tmp_path / "episodes").mkdir()
     assert claim_plan(tmp_path, {"a": 1})
@@ -160,14 +160,14 @@ def test_a_second_conversion_into_one_folder_is_refused(tmp_path: Path) -> None:
         convert(refs, tmp_path / "out", PNG)
 
 
-def test_runs_that_begin_in_one_second_take_folders_of_their_own(tmp_path: Path) -> None:
+def test_runs_that_begin_in_one_second_take_separate_folders(tmp_path: Path) -> None:
     place = tmp_path / "2026-01-01_00-00-00"
-    first, held = claim_run(place, False, None, CONFIG)
+    first, first_lock = claim_run(place, False, None, CONFIG)
     second, too = claim_run(place, False, None, CONFIG)
     assert (first.folder, second.folder) == (place, place.with_name(f"{place.name}-2"))
     with pytest.raises(UserError, match="in use by another training run"):
         claim_run(place, True, None, CONFIG)
-    held.release()
+    first_lock.release()
     too.release()
     write_json(place / SUMMARY, {})
     third, lock = claim_run(place, False, None, CONFIG)

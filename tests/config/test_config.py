@@ -56,7 +56,7 @@ def tree(tmp_path: Path) -> Path:
     return write_tree(tmp_path / "tree", TREE)
 
 
-def test_a_model_brings_its_memory(tree: Path) -> None:
+def test_a_model_defines_its_memory(tree: Path) -> None:
     cfg = compose("demo", ["model=tokendrop_expert", "train.lr=1e-4"], directory=tree)
     assert (cfg.name, cfg.memory.budget, cfg.train.lr) == ("tokendrop_expert", 512, 1e-4)
     assert "hydra" not in cfg
@@ -94,7 +94,7 @@ def test_a_mistake_is_answered_with_the_near_names(tree: Path, override: str, me
 @pytest.mark.parametrize(
     "words", [["model=framesamp_modul", "~memory.name"], ["model=pi05", "integration=modulator", "+memory.budget=64"]]
 )
-def test_a_memory_without_a_name_is_said(words: list[str]) -> None:
+def test_a_memory_without_a_name_is_reported(words: list[str]) -> None:
     with pytest.raises(UserError, match="`memory` has no name, only budget"):
         compose("train", words)
 
@@ -145,7 +145,7 @@ def test_every_choice_of_a_sweep_is_checked(tree: Path) -> None:
         check_overrides("demo", ["model=small,tokendrop_expert,third", "train.lr=1,2"], directory=tree)
 
 
-def test_the_same_words_give_the_same_configuration_and_one_of_ones_own_each_time() -> None:
+def test_the_same_words_give_equal_but_separate_configurations() -> None:
     words = ["model=framesamp_modul", "train.steps=3", "output=runs/one"]  # the default folder's name holds the time
     one, other = (compose("train", words) for _ in range(2))
     assert one == other
@@ -155,7 +155,7 @@ def test_the_same_words_give_the_same_configuration_and_one_of_ones_own_each_tim
     assert again == other and again.train.steps == 3
 
 
-def test_files_of_ones_own_are_read_again_each_time(tree: Path) -> None:
+def test_files_of_the_user_are_read_again_each_time(tree: Path) -> None:
     before = compose("demo", directory=tree).seed
     file = tree / "demo.yaml"
     file.write_text(file.read_text().replace(f"seed: {before}", f"seed: {before + 1}"))
@@ -256,7 +256,7 @@ def test_a_mistyped_command_ends_before_it_starts(app: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_user_error_is_printed_whole_and_a_bug_keeps_its_traceback(app: Path) -> None:
+def test_a_user_error_is_printed_completely_and_a_bug_keeps_its_traceback(app: Path) -> None:
     done = run(app, "seed=13")
     assert done.returncode == 2
     assert "Error: Seed 13 brings [bad] luck." in done.stderr
@@ -268,7 +268,7 @@ def test_a_user_error_is_printed_whole_and_a_bug_keeps_its_traceback(app: Path) 
 
 
 @pytest.mark.slow
-def test_a_value_still_needed_is_asked_for(app: Path, tree: Path) -> None:
+def test_a_value_still_needed_is_requested(app: Path, tree: Path) -> None:
     (tree / "train" / "default.yaml").write_text("lr: 1\ndata: ???")
     done = run(app)
     assert done.returncode == 2
@@ -277,15 +277,15 @@ def test_a_value_still_needed_is_asked_for(app: Path, tree: Path) -> None:
 
 
 @pytest.mark.slow
-def test_hydras_own_switches_still_work(app: Path, tmp_path: Path) -> None:
+def test_hydras_switches_still_work(app: Path, tmp_path: Path) -> None:
     mine = write_tree(tmp_path / "mine", {"memory/mine.yaml": "{name: mine, budget: 7}"})
     swept = run(app, "--multirun", "--config-dir", str(mine), "train.lr=1,2", "memory=mine")
     assert [line for line in swept.stdout.splitlines() if line.startswith("ran")] == [
         "ran mine 7 1 app",
         "ran mine 7 2 app",
     ], swept.stderr
-    shown = run(app, "--cfg", "job", "seed=5")
-    assert "seed: 5" in shown.stdout
+    output = run(app, "--cfg", "job", "seed=5")
+    assert "seed: 5" in output.stdout
     assert run(app, "--help").returncode == 0
     wrong = run(app, "--config-dir", "nowhere")
     assert wrong.returncode == 2

@@ -35,13 +35,13 @@ def test_help_tells_what_a_command_does_with_examples_and_every_key(name: str) -
     for key in keys(file):
         assert not key.default or f"{key.name}={key.default}" in flat
         assert re.sub(r"\s+", " ", key.comment) in flat, key
-    for group, chosen in defaults(file).groups.items():
+    for group, option in defaults(file).groups.items():
         if not group.startswith("override"):
-            assert f"{group}={chosen}" in flat
+            assert f"{group}={option}" in flat
             assert all(choice in flat for choice in choices([config_dir()], group))
 
 
-def test_help_names_the_files_of_a_group_and_own_ones_too(tmp_path: Path) -> None:
+def test_help_names_the_files_of_a_group_and_custom_ones_too(tmp_path: Path) -> None:
     (tmp_path / "memory").mkdir()
     (tmp_path / "memory" / "mine.yaml").write_text("# Remembers what I like.\nname: mine\nspacing: 4 # steps apart\n")
     text = help_text("train", ["memory"], [config_dir(), tmp_path])
@@ -94,7 +94,7 @@ def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(
         ("serve", "batch=3", "Did you mean 'max_batch'"),
     ],
 )
-def test_a_key_that_is_called_otherwise_here_is_found(command: str, word: str, said: str) -> None:
+def test_a_key_with_another_name_here_is_suggested(command: str, word: str, said: str) -> None:
     with pytest.raises(UserError, match=re.escape(said)):
         compose(command, [word])
 

@@ -15,7 +15,7 @@ from mme_vla.processing.prompt import checked_text
 from mme_vla.utils import verified, with_checksum
 
 
-def test_a_digit_that_changed_in_a_record_is_found(tmp_path: Path) -> None:
+def test_a_digit_that_changed_in_a_record_is_detected(tmp_path: Path) -> None:
     artefacts.write_logs(tmp_path)
     path = tmp_path / RECORDS
     assert len(read_records(path)) == 5
@@ -24,7 +24,7 @@ def test_a_digit_that_changed_in_a_record_is_found(tmp_path: Path) -> None:
         read_records(path)
 
 
-def test_records_written_without_a_checksum_still_read(tmp_path: Path) -> None:
+def test_records_saved_without_a_checksum_still_read(tmp_path: Path) -> None:
     artefacts.write_logs(tmp_path)
     path = tmp_path / RECORDS
     lines = [json.loads(line) for line in path.read_text().splitlines()]
@@ -54,7 +54,7 @@ def test_an_endless_device_in_a_logs_place_is_refused(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
-def test_notes_of_a_run_that_changed_are_found(tmp_path: Path) -> None:
+def test_notes_of_a_run_that_changed_are_detected(tmp_path: Path) -> None:
     artefacts.write_logs(tmp_path)
     path = tmp_path / "run.json"
     path.write_text(path.read_text().replace('"cpu"', '"gpu"'))
@@ -63,14 +63,14 @@ def test_notes_of_a_run_that_changed_are_found(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ['{"text": "a", "input_tokens": Infinity, "output_tokens": 1}', "[", "[]", "null"])
-def test_a_damaged_answer_is_asked_for_again(tmp_path: Path, damage: str, caplog) -> None:
+def test_a_damaged_reply_is_requested_again(tmp_path: Path, damage: str, caplog) -> None:
     artefacts.write_answers(tmp_path)
-    kept = next((tmp_path / "answers").rglob("*.json"))
-    kept.write_text(damage)
+    cached = next((tmp_path / "answers").rglob("*.json"))
+    cached.write_text(damage)
     assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
     assert "asked again" in caplog.text
-    kept.unlink()
-    kept.mkdir()
+    cached.unlink()
+    cached.mkdir()
     assert artefacts.read_answers(tmp_path) == ("pick up the cube at <1, 2>", 12, 7)
 
 
@@ -89,7 +89,7 @@ def test_a_seal_does_not_depend_on_the_order_of_keys() -> None:
         verified({**with_checksum(values), "a": 0}, "x")
 
 
-def test_states_far_beyond_the_statistics_are_a_broken_driver() -> None:
+def test_states_well_beyond_the_statistics_are_a_broken_driver() -> None:
     ones = np.ones(8)
     stats = QuantileStats(mean=0 * ones, std=ones, q01=-ones, q99=ones)
     check_reach(np.full((3, 8), 100, np.float32), stats, "a state")

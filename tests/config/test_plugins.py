@@ -130,28 +130,28 @@ def opened_by_analyse(folder: Path, trust: bool) -> None:
 
 @pytest.mark.parametrize("opened", [opened_by_python, opened_by_inspect, opened_by_convert, opened_by_analyse])
 def test_a_checkpoints_plugins_are_imported_only_when_the_user_says_so(
-    opened: Callable[[Path, bool], None], stranger: Path
+    opened: Callable[[Path, bool], None], foreign_run: Path
 ) -> None:
     with pytest.raises(UserError, match=rf"plugin {OWN}\.memory.*{TRUST_FLAG}.*trust_plugins=True"):
-        opened(stranger / "checkpoint", False)
+        opened(foreign_run / "checkpoint", False)
     assert f"{OWN}.memory" not in sys.modules
-    opened(stranger / "checkpoint", True)
+    opened(foreign_run / "checkpoint", True)
 
 
-def test_what_constructors_compute_is_there_after_loading(stranger: Path) -> None:
-    policy = MMEPolicy.from_pretrained(stranger / "checkpoint", trust_plugins=True)
+def test_what_constructors_compute_is_there_after_loading(foreign_run: Path) -> None:
+    policy = MMEPolicy.from_pretrained(foreign_run / "checkpoint", trust_plugins=True)
     memory = policy.require_memory()
     assert torch.equal(memory.fade, torch.linspace(1, 0.5, 32))
     assert torch.equal(memory.ages, torch.arange(32))
     assert torch.isfinite(policy(random_batch(policy, 1, valid=32))[0])
     before = torch.random.get_rng_state()
-    MMEPolicy.from_pretrained(stranger / "checkpoint", trust_plugins=True)
+    MMEPolicy.from_pretrained(foreign_run / "checkpoint", trust_plugins=True)
     assert torch.equal(torch.random.get_rng_state(), before)
 
 
-def test_what_the_user_has_imported_needs_no_further_word(stranger: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_user_has_imported_needs_no_further_word(foreign_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import_modules([f"{OWN}.memory"])
-    MMEPolicy.from_pretrained(stranger / "checkpoint")
+    MMEPolicy.from_pretrained(foreign_run / "checkpoint")
     assert f"{OWN}.memory" in imported_plugins()
 
 
@@ -164,8 +164,8 @@ def test_plugins_are_names_of_modules(names: str) -> None:
 
 
 @pytest.mark.skipif(find_spec("mani_skill") is None, reason="the simulator (extra `sim`) is not installed")
-def test_a_memory_and_a_task_of_ones_own_are_evaluated_in_a_worker_process(stranger: Path, tmp_path: Path) -> None:
-    policy = MMEPolicy.from_pretrained(stranger / "checkpoint", trust_plugins=True)
+def test_a_memory_and_a_task_of_the_user_are_evaluated_in_a_worker_process(foreign_run: Path, tmp_path: Path) -> None:
+    policy = MMEPolicy.from_pretrained(foreign_run / "checkpoint", trust_plugins=True)
     import_modules([f"{OWN}.task"])
     settings = RolloutSettings(max_steps=3, execute=2, flow_steps=1, workers=1, render=False)
     facts = RunFacts("fading", 1, 42, max_steps=3)
@@ -181,7 +181,7 @@ def test_both_spellings_of_trust_reach_every_command(monkeypatch: pytest.MonkeyP
         assert compose(name).trust_plugins is False, name
 
 
-def test_episodes_of_an_own_task_have_seeds_of_their_own(stranger: Path) -> None:
+def test_episodes_of_a_custom_task_have_separate_seeds(foreign_run: Path) -> None:
     if find_spec("mani_skill") is None:
         pytest.skip("the simulator (extra `sim`) is not installed")
     import_modules([f"{OWN}.task"])

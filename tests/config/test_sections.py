@@ -35,9 +35,10 @@ class Outer:
 
 
 def test_a_section_becomes_its_dataclass_with_sections_inside_it() -> None:
-    given = {"name": "a", "inner": {"width": 3, "share": 1}, "other": {"width": 2}, "betas": [0, 1.0], "places": [4, 5],
+    options = {"name": "a", "inner": {"width": 3, "share": 1}, "other": {"width": 2}, "betas": [0, 1.0],
+        "places": [4, 5],
              "fast": True, "limit": None, "anything": [{"x": 1}]}  # fmt: skip
-    read = read_section(Outer, given, "outer")
+    read = read_section(Outer, options, "outer")
     assert read == Outer("a", Inner(3, 1), Inner(2), (0, 1.0), (4, 5), True, None, None, [{"x": 1}])
     assert read_section(Outer, {"name": "a", "inner": Inner(7)}) == Outer("a", Inner(7))
     assert read_section(Inner, {"share": 0.1}, "inner", width=9) == Inner(9, 0.1)
@@ -74,7 +75,7 @@ def test_a_mistake_names_key_value_and_expectation(given: Any, message: str) -> 
         read_section(Outer, given, "outer")
 
 
-def test_a_secret_is_not_told() -> None:
+def test_a_secret_is_not_reported() -> None:
     with pytest.raises(UserError, match="secret must be a text or null") as error:
         read_section(Outer, {"name": "a", "secret": 5317})
     assert "5317" not in str(error.value)

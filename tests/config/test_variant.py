@@ -63,12 +63,15 @@ def own(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_own_memories_are_named_by_their_files_and_parts(own: Path) -> None:
-    assert name_of("model=mine_context", extra=own) == "mine_context"
-    assert name_of("model=mine_context", "memory.spacing=2", extra=own) == "mine_context-spacing_2"
-    assert name_of("memory=mine", "integration=modulator", extra=own) == "mine_modulator"
-    assert name_of("memory=mine", "integration=modulator", "memory.spacing=2", extra=own) == "mine_modulator-spacing_2"
-    assert name_of("memory=mine", "integration=context", extra=own) == "mine_context"
+def test_custom_memories_are_named_by_their_files_and_components(config_folder: Path) -> None:
+    assert name_of("model=mine_context", extra=config_folder) == "mine_context"
+    assert name_of("model=mine_context", "memory.spacing=2", extra=config_folder) == "mine_context-spacing_2"
+    assert name_of("memory=mine", "integration=modulator", extra=config_folder) == "mine_modulator"
+    assert (
+        name_of("memory=mine", "integration=modulator", "memory.spacing=2", extra=config_folder)
+        == "mine_modulator-spacing_2"
+    )
+    assert name_of("memory=mine", "integration=context", extra=config_folder) == "mine_context"
 
 
 @pytest.mark.slow
@@ -99,10 +102,10 @@ def test_from_python_the_policy_and_its_card_have_the_true_name(tmp_path: Path) 
 def test_the_digest_tells_compositions_apart_and_nothing_else() -> None:
     config = json.loads(json.dumps(build_policy("framesamp_modul", device="meta").config))
     digest = composition_digest(config)
-    elsewhere = {**config, "name": "x", "card": {"data": "y"}, "plugins": ["z"], "later_option": None}
-    elsewhere["processor"] = {**config["processor"], "tokenizer": "tokenizer.model"}
-    elsewhere["memory"] = {**config["memory"], "later_option": None}
-    assert composition_digest(elsewhere) == digest
+    unrelated = {**config, "name": "x", "card": {"data": "y"}, "plugins": ["z"], "later_option": None}
+    unrelated["processor"] = {**config["processor"], "tokenizer": "tokenizer.model"}
+    unrelated["memory"] = {**config["memory"], "later_option": None}
+    assert composition_digest(unrelated) == digest
     for section, change in (("memory", {"grid": 8}), ("integration", {"num_heads": 2}), ("backbone", {"depth": 9})):
         assert composition_digest({**config, section: {**config[section], **change}}) != digest
 
@@ -136,11 +139,11 @@ def test_records_of_earlier_versions_load_and_stay_apart_from_new_ones(tmp_path:
 
 
 def test_a_run_begun_before_there_were_digests_is_one_run(tmp_path: Path) -> None:
-    for name, kept in (
+    for name, digest in (
         ("episodes-0of2.jsonl", record(0, True)),
         ("episodes-1of2.jsonl", record(1, True, composition="d" * 12)),
     ):
-        (tmp_path / name).write_text(kept.to_json() + "\n")
+        (tmp_path / name).write_text(digest.to_json() + "\n")
     assert {r.composition for r in read_folders(sorted(tmp_path.glob("*.jsonl")))} == {"d" * 12}
     two = [record(0, True), record(1, True, composition="d" * 12), record(2, True, composition="e" * 12)]
     assert complete_compositions(two)[0].composition is None

@@ -58,8 +58,8 @@ def test_cached_and_online_histories_are_the_same(source, tmp_path, keep_every, 
         online = OnlineHistory(memory.storage, make_scorer(memory), int(source.exec_starts[episode]))
         for t in range(int(source.lengths[episode])):
             frame = source.frames(episode, [t])
-            wanted = frame[online.to_encode(1)]
-            tokens = encode(wanted) if len(wanted) else torch.zeros(0, 4, WIDTH)
+            expected = frame[online.to_encode(1)]
+            tokens = encode(expected) if len(expected) else torch.zeros(0, 4, WIDTH)
             online.append(frame, tokens.to(torch.bfloat16) if dtype == "bfloat16" else tokens)
             cached, streamed = memory.gather_selection(history, t), memory.gather_selection(online, t)
             for one, other in zip(cached.tensors(), streamed.tensors(), strict=True):
@@ -87,11 +87,11 @@ def test_an_interrupted_build_continues_with_the_missing_episodes(source, tmp_pa
     first = token_file(folder, 0).stat().st_mtime_ns
     assert build_cache(source, memory, encode, folder, expected, batch_size=3) == 2
     assert token_file(folder, 0).stat().st_mtime_ns == first
-    whole = ensure(source, memory, tmp_path / "whole")
+    straight = ensure(source, memory, tmp_path / "whole")
     resumed = VisionCache(folder, source, expected)
     for episode in range(3):
-        assert np.array_equal(np.load(token_file(whole.folder, episode)), np.load(token_file(folder, episode)))
-    assert resumed.width == whole.width
+        assert np.array_equal(np.load(token_file(straight.folder, episode)), np.load(token_file(folder, episode)))
+    assert resumed.width == straight.width
 
 
 @pytest.mark.slow
@@ -115,11 +115,11 @@ def test_processes_share_the_episodes(source, tmp_path, monkeypatch) -> None:
     expected = fingerprint(source, memory.storage, "abc", "float32")
     folder = cache_folder(tmp_path, source, expected)
     monkeypatch.setenv("WORLD_SIZE", "2")
-    written = []
+    episodes = []
     for rank in ("1", "0"):
         monkeypatch.setenv("RANK", rank)
-        written.append(build_cache(source, memory, encode, folder, expected))
-    assert written == [1, 2]
+        episodes.append(build_cache(source, memory, encode, folder, expected))
+    assert episodes == [1, 2]
     VisionCache(folder, source, expected)
 
 
@@ -197,14 +197,14 @@ def test_clearing_removes_the_cache_only(source, tmp_path) -> None:
     assert [path.name for path in folder.iterdir()] == ["notes.txt"]
 
 
-def test_an_estimate_counts_frames_and_bytes_and_writes_nothing(source, tmp_path) -> None:
+def test_an_estimate_counts_frames_and_bytes_and_saves_nothing(source, tmp_path) -> None:
     plan = estimate(source, LastFrames(keep_every=4), encode, "bfloat16")
-    kept = 8 + 5 + 3  # frame 0 and 3, 7, … of 30, 17 and 8
-    assert (plan.frames, plan.bytes) == (kept, kept * 4 * WIDTH * 2) and plan.seconds > 0
+    n_frames = 8 + 5 + 3  # frame 0 and 3, 7, … of 30, 17 and 8
+    assert (plan.frames, plan.bytes) == (n_frames, n_frames * 4 * WIDTH * 2) and plan.seconds > 0
 
 
 def test_few_histories_stay_at_hand(source, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(store, "files_to_hold", lambda wanted: 2)
+    monkeypatch.setattr(store, "files_to_hold", lambda files: 2)
     cache = ensure(source, LastFrames(), tmp_path)
     for episode in (0, 1, 2, 0):
         cache.history(episode)

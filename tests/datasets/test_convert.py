@@ -71,8 +71,8 @@ def test_columns_may_be_spelt_as_lerobots_policies_ask_for(tmp_path: Path, recor
         ConvertOptions(names="lerobbot")
 
 
-def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(filmed) -> None:
-    folder, episodes = filmed
+def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(video_dataset) -> None:
+    folder, episodes = video_dataset
     source = EpisodeSource(folder)
     assert source.video_cameras == ("front", "wrist") and source.fps == 20
     check(source, episodes, tolerance=3)
@@ -83,22 +83,22 @@ def test_video_conversion_only_rounds_colours_and_keeps_still_pixels_still(filme
 def test_a_conversion_says_what_is_done_and_nothing_of_what_the_libraries_do(tmp_path: Path, recorded, capfd) -> None:
     episodes, _ = recorded
     convert(episodes, tmp_path / "out", ConvertOptions())
-    out, said = capfd.readouterr()
+    out, stderr = capfd.readouterr()
     assert out == ""
-    assert [line.partition(":")[0] for line in said.splitlines()] == ["read", "convert"], said
-    assert f"{len(episodes)} of {len(episodes)} episodes" in said
+    assert [line.partition(":")[0] for line in stderr.splitlines()] == ["read", "convert"], stderr
+    assert f"{len(episodes)} of {len(episodes)} episodes" in stderr
 
 
-def test_a_flipped_bit_in_a_converted_dataset_is_found(tmp_path: Path, filmed) -> None:
-    shutil.copytree(filmed[0], tmp_path / "out")
+def test_a_flipped_bit_in_a_converted_dataset_is_detected(tmp_path: Path, video_dataset) -> None:
+    shutil.copytree(video_dataset[0], tmp_path / "out")
     assert EpisodeSource(tmp_path / "out").verify() > 5
     for pattern in ("data/**/*.parquet", "videos/**/*.mp4"):
         file = next((tmp_path / "out").glob(pattern))
-        whole = file.read_bytes()
-        file.write_bytes(whole[:-9] + bytes([whole[-9] ^ 1]) + whole[-8:])
+        content = file.read_bytes()
+        file.write_bytes(content[:-9] + bytes([content[-9] ^ 1]) + content[-8:])
         with pytest.raises(UserError, match=f"{file.name} is damaged"):
             EpisodeSource(tmp_path / "out").verify()
-        file.write_bytes(whole)
+        file.write_bytes(content)
 
 
 def test_an_interrupted_conversion_continues_with_the_missing_episodes(tmp_path: Path, recorded, monkeypatch) -> None:
@@ -119,15 +119,15 @@ def test_an_interrupted_conversion_continues_with_the_missing_episodes(tmp_path:
             convert(refs, tmp_path / "out", PNG)
     assert not (tmp_path / "out").exists()
     assert len(list((tmp_path / "out.partial" / "episodes").iterdir())) == 1
-    written = []
+    converted = []
     write = convert_module._write_part
     monkeypatch.setattr(
         convert_module,
         "_write_part",
-        lambda ref, part, options: (written.append(part.name), write(ref, part, options)),
+        lambda ref, part, options: (converted.append(part.name), write(ref, part, options)),
     )
     assert convert(refs, tmp_path / "out", PNG) == 2
-    assert written == ["000001-Alpha-episode_1", "000002-Beta-episode_0"]
+    assert converted == ["000001-Alpha-episode_1", "000002-Beta-episode_0"]
     check(EpisodeSource(tmp_path / "out"), episodes, tolerance=0)
 
 

@@ -76,7 +76,7 @@ def test_empty_table_of_episodes_is_reported(copy: Path) -> None:
         EpisodeSource(copy)
 
 
-def test_what_stands_in_a_files_place_is_said_without_waiting_and_without_the_hub(copy: Path) -> None:
+def test_what_stands_in_a_files_place_is_reported_without_waiting_and_without_the_hub(copy: Path) -> None:
     (copy / EPISODES).unlink()
     os.mkfifo(copy / EPISODES)
     with pytest.raises(UserError, match="is not a file"):
@@ -94,7 +94,7 @@ def test_a_template_of_videos_stays_in_the_dataset(copy: Path, template: object)
         video_file(copy, template, "image", 0, 0)
 
 
-def test_a_dataset_with_sums_is_checked_where_it_is_read_and_whole_on_request(copy: Path) -> None:
+def test_a_dataset_with_sums_is_checked_where_it_is_read_and_entirely_on_request(copy: Path) -> None:
     assert EpisodeSource(copy).verify() == 0  # without sums there is nothing to compare
     write_sums(copy)
     assert EpisodeSource(copy).verify() > 5
@@ -118,7 +118,7 @@ def opened(folder: Path) -> VisionCache:
     return VisionCache(folder, source, artefacts.expected_fingerprint())
 
 
-def test_a_flipped_bit_in_cached_tokens_is_found_when_the_episode_is_first_read(cache: Path) -> None:
+def test_a_flipped_bit_in_cached_tokens_is_detected_when_the_episode_is_first_read(cache: Path) -> None:
     path = token_file(cache, 1)
     content = path.read_bytes()
     path.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
@@ -131,14 +131,14 @@ def test_a_flipped_bit_in_cached_tokens_is_found_when_the_episode_is_first_read(
 def test_each_process_compares_an_episode_once(cache: Path, monkeypatch) -> None:
     from mme_vla.utils import checksums
 
-    asked: list[Path] = []
+    paths: list[Path] = []
     real = checksums.file_sum
-    monkeypatch.setattr(checksums, "file_sum", lambda path: asked.append(path) or real(path))
+    monkeypatch.setattr(checksums, "file_sum", lambda path: paths.append(path) or real(path))
     vision = opened(cache)
     vision.max_open = 1
     for episode in (0, 1, 0, 1):
         vision.history(episode)
-    assert len(asked) == 4  # tokens and scores of two episodes
+    assert len(paths) == 4  # tokens and scores of two episodes
 
 
 def test_a_cache_without_sums_still_opens(cache: Path) -> None:
@@ -163,7 +163,7 @@ def test_rows_of_another_form_are_refused_by_line(tmp_path: Path, row: str) -> N
         read_rows(tmp_path / "rows.jsonl")
 
 
-def test_a_picture_of_the_rows_that_changed_is_found(tmp_path: Path) -> None:
+def test_an_image_of_the_rows_that_changed_is_detected(tmp_path: Path) -> None:
     artefacts.write_rows(tmp_path)
     flip(tmp_path / "a.mp4")
     with pytest.raises(UserError, match=r"a.mp4 is damaged"):

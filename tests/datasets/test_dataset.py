@@ -99,7 +99,7 @@ def test_a_chunk_starts_at_the_offset_and_repeats_the_last_action(data, processo
         assert np.allclose(back.numpy(), step.actions, atol=1e-5)
 
 
-def test_an_item_holds_the_current_pictures_and_words(data, processor) -> None:
+def test_an_item_holds_the_current_images_and_words(data, processor) -> None:
     item = TrainingDataset(data[0], processor)[10]
     frames = [data[0][0].frames(0, [16], view)[0] for view in ("front", "wrist")]
     assert torch.equal(item["images"], processor.images(frames)) and item["images"].dtype == torch.uint8
@@ -107,7 +107,7 @@ def test_an_item_holds_the_current_pictures_and_words(data, processor) -> None:
     assert item["subgoals"]["grounded_subgoal"] == "pick up 4 at <1, 2>" and item["place"] == (0, 0, 16)
 
 
-def test_the_history_is_the_memorys_own_selection_up_to_the_step(data, processor, caches) -> None:
+def test_the_history_is_the_memorys_selection_up_to_the_step(data, processor, caches) -> None:
     memory = LastFrames()
     item = TrainingDataset(data[0], processor, memory, caches)[10]
     expected = encode(data[0][0].frames(0, [14, 15, 16])).flatten(0, 1)
@@ -145,17 +145,17 @@ def test_without_options_a_batch_has_no_history_and_no_action_mask(data, process
     assert batch.history is None and batch.action_mask is None
 
 
-def test_an_item_decodes_its_two_current_pictures_only(data, processor, caches, monkeypatch) -> None:
-    asked = []
+def test_an_item_decodes_its_two_current_images_only(data, processor, caches, monkeypatch) -> None:
+    requests = []
     frames = EpisodeSource.frames
     monkeypatch.setattr(
-        EpisodeSource, "frames", lambda self, e, i, view=None: (asked.append(i), frames(self, e, i, view))[1]
+        EpisodeSource, "frames", lambda self, e, i, view=None: (requests.append(i), frames(self, e, i, view))[1]
     )
     TrainingDataset(data[0], processor, LastFrames(), caches)[10]
-    assert asked == [[16], [16]]
+    assert requests == [[16], [16]]
 
 
-def test_subgoals_reach_the_prompt_through_the_choice_given(data) -> None:
+def test_subgoals_reach_the_prompt_through_the_choice(data) -> None:
     processor = Processor(28, Tokenizer.load("sample"), prompt="subgoal", stats=compute_norm_stats(data[0]))
     dataset = TrainingDataset(data[0], processor, subgoal=SubgoalText("simple_subgoal", online_probability=1.0))
     assert torch.equal(dataset[0]["prompt"], processor.prompt("do task 0", "pick up 1 online")[0])
@@ -168,7 +168,7 @@ def test_a_memory_without_caches_is_refused(data, processor) -> None:
         TrainingDataset(data[0], processor, action_offset=2)
 
 
-def test_splits_hold_out_whole_episodes(data, processor) -> None:
+def test_splits_hold_out_full_episodes(data, processor) -> None:
     split = split_episodes(data[0], val_episodes=["Alpha/1"])
     assert [part.tolist() for part in split.train] == [[0], [0]]
     assert [part.tolist() for part in split.val] == [[1], []]
@@ -188,7 +188,7 @@ def test_only_the_sample_holds_out_an_episode_by_default(named: list[str], held_
     assert {split.val.locate(i)[:2] for i in steps} == held_out
 
 
-def test_hashed_splits_are_stable_and_of_the_asked_size() -> None:
+def test_hashed_splits_are_stable_and_of_the_requested_size() -> None:
     class Named:
         name = "robomme"
 

@@ -47,11 +47,11 @@ def test_things_are_made_ahead_and_no_further() -> None:
                 third.set()
             yield i
 
-    found = ahead(things(), 1)
-    assert next(found) == 0
+    items = ahead(things(), 1)
+    assert next(items) == 0
     assert third.wait(10)  # one is held, one waits to be held
     assert made[:3] == [0, 1, 2] and len(made) <= 3
-    assert list(found) == [1, 2, 3, 4]
+    assert list(items) == [1, 2, 3, 4]
 
 
 def test_what_goes_wrong_ahead_is_raised_where_it_is_used() -> None:
@@ -59,16 +59,16 @@ def test_what_goes_wrong_ahead_is_raised_where_it_is_used() -> None:
         yield 1
         raise UserError("broken image")
 
-    found = ahead(things(), 2)
-    assert next(found) == 1
+    items = ahead(things(), 2)
+    assert next(items) == 1
     with pytest.raises(UserError, match="broken image"):
-        next(found)
+        next(items)
 
 
 def test_leaving_early_ends_the_thread() -> None:
-    found = ahead(iter(range(10**6)), 1)
-    next(found)
-    found.close()
+    items = ahead(iter(range(10**6)), 1)
+    next(items)
+    items.close()
     assert not [thread for thread in threading.enumerate() if thread.name == "ahead"]
 
 
@@ -83,12 +83,12 @@ def test_rows_of_a_cache_begin_on_pages(tmp_path: Path, shape: tuple[int, ...]) 
     assert mapped.offset == PAGE
 
 
-def test_as_many_files_are_held_as_the_system_allows(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[int, int]] = []
+def test_as_many_files_are_open_as_the_system_allows(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[tuple[int, int]] = []
     monkeypatch.setattr(resource, "getrlimit", lambda what: (1024, 4096))
-    monkeypatch.setattr(resource, "setrlimit", lambda what, limits: asked.append(limits))
-    assert files_to_hold(100) == 100 and asked == []
-    assert files_to_hold(2000) == 2000 and asked == [(2256, 4096)]
+    monkeypatch.setattr(resource, "setrlimit", lambda what, limits: calls.append(limits))
+    assert files_to_hold(100) == 100 and calls == []
+    assert files_to_hold(2000) == 2000 and calls == [(2256, 4096)]
     assert files_to_hold(10**6) == 4096 - 256
 
 
@@ -113,9 +113,9 @@ def gradients(recompute: bool | str) -> dict[str, torch.Tensor]:
 
 
 def test_selective_recomputation_changes_no_gradient_and_keeps_products() -> None:
-    plain, selective = gradients(False), gradients("selective")
-    assert plain.keys() == selective.keys()
-    for name, gradient in plain.items():
+    baseline, selective = gradients(False), gradients("selective")
+    assert baseline.keys() == selective.keys()
+    for name, gradient in baseline.items():
         torch.testing.assert_close(gradient, selective[name], msg=name)
     counts = {how: _products(how) for how in (False, True, "selective")}
     assert counts["selective"] == counts[False] < counts[True]
@@ -126,10 +126,10 @@ def _products(how: bool | str) -> int:
     from torch.utils._python_dispatch import TorchDispatchMode
 
     class Count(TorchDispatchMode):
-        found = 0
+        n_products = 0
 
         def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-            self.found += func in SAVED_OPS
+            self.n_products += func in SAVED_OPS
             return func(*args, **(kwargs or {}))
 
     built = policy(policy={"augment": False}).train()
@@ -137,20 +137,20 @@ def _products(how: bool | str) -> int:
     draws = built.training_noise(1, torch.Generator().manual_seed(0))
     with Count() as count:
         built(built.full_batch(), draws)[0].backward()
-    return count.found
+    return count.n_products
 
 
-def test_recomputation_is_asked_for_in_words() -> None:
+def test_recomputation_is_requested_in_words() -> None:
     assert TrainSettings.from_dict(RECIPE).recomputation is False
-    asked = {**RECIPE, "gradient_checkpointing": True}
-    assert TrainSettings.from_dict(asked).recomputation is True
-    assert TrainSettings.from_dict({**asked, "recompute": "selective"}).recomputation == "selective"
+    options = {**RECIPE, "gradient_checkpointing": True}
+    assert TrainSettings.from_dict(options).recomputation is True
+    assert TrainSettings.from_dict({**options, "recompute": "selective"}).recomputation == "selective"
     with pytest.raises(UserError, match=r"train\.recompute='most' must be all or selective"):
         TrainSettings.from_dict({**RECIPE, "recompute": "most"})
     assert "context_fn" not in checkpoint_options(True)
 
 
-def test_what_does_not_learn_may_be_held_in_bfloat16() -> None:
+def test_what_does_not_learn_may_be_stored_in_bfloat16() -> None:
     built = policy("framesamp_modul", policy={"compute_dtype": "bfloat16"})
     apply_finetuning(built, "expert_only", frozen_dtype="bfloat16")
     for name, parameter in built.named_parameters():

@@ -77,14 +77,14 @@ def test_a_folder_that_is_a_dataset_already_is_called_so(tmp_path: Path) -> None
 
 
 def test_official_files_are_read(h5_folder: Path) -> None:
-    found = {}
+    episodes = {}
     for ref in list_episodes(find_files([h5_folder])):
         with open_episode(ref) as episode:
             frame = next(iter(episode))
             assert frame.front.shape == frame.wrist.shape == (256, 256, 3) and frame.front.dtype == np.uint8
             assert frame.state.shape == frame.action.shape == (8,)
-            found[ref.task, ref.index] = (len(episode), episode.exec_start, episode.difficulty)
-    assert found == {
+            episodes[ref.task, ref.index] = (len(episode), episode.exec_start, episode.difficulty)
+    assert episodes == {
         ("PatternLock", 8): (148, 74, "easy"),
         ("PickXtimes", 8): (332, 0, "easy"),
         ("VideoUnmask", 4): (263, 66, "easy"),

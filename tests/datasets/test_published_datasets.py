@@ -33,20 +33,20 @@ def recordings(tmp_path: Path) -> Path:
     return folder
 
 
-def publish(root: Path, recordings: Path, pictures: str, more: Mapping[str, Any], order: tuple[int, ...]) -> Path:
+def publish(root: Path, recordings: Path, image_format: str, more: Mapping[str, Any], order: tuple[int, ...]) -> Path:
     """A dataset of these recordings in the published columns, at 10 frames per second, without demonstration flags."""
     from lerobot.configs import RGBEncoderConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     from mme_vla.data.hdf5 import open_episode
 
-    view = {"dtype": pictures, "shape": (64, 64, 3), "names": ["height", "width", "channel"]}
+    view = {"dtype": image_format, "shape": (64, 64, 3), "names": ["height", "width", "channel"]}
     features = {"image": view, "wrist_image": view, "state": VECTOR, "actions": VECTOR, "simple_subgoal": TEXT}
-    films = pictures == "video"
+    as_video = image_format == "video"
     dataset = LeRobotDataset.create(
-        "lerobot/robomme", 10, features | dict(more), root=root, robot_type="panda", use_videos=films,
+        "lerobot/robomme", 10, features | dict(more), root=root, robot_type="panda", use_videos=as_video,
         video_backend="pyav",
-        rgb_encoder=RGBEncoderConfig(vcodec="libsvtav1", crf=30, pix_fmt="yuv420p") if films else None,
+        rgb_encoder=RGBEncoderConfig(vcodec="libsvtav1", crf=30, pix_fmt="yuv420p") if as_video else None,
     )  # fmt: skip
     refs = list_episodes(find_files([recordings]))
     for number in order:
@@ -69,7 +69,7 @@ def make_side_file(recordings: Path, dataset: Path, output: Path, monkeypatch: p
     return output
 
 
-def test_films_in_av1_without_flags_are_read_with_a_side_file(
+def test_videos_in_av1_without_flags_are_read_with_a_side_file(
     tmp_path: Path, recordings: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = publish(tmp_path / "av1", recordings, "video", {}, order=(2, 0, 1))
@@ -85,7 +85,7 @@ def test_films_in_av1_without_flags_are_read_with_a_side_file(
         make_side_file(recordings, root, starts, monkeypatch)
 
 
-def test_a_memory_that_scores_patches_is_warned_of_lossy_films(
+def test_a_memory_that_scores_patches_is_warned_of_lossy_videos(
     tmp_path: Path, recordings: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     root = publish(tmp_path / "av1", recordings, "video", {}, order=(1,))
@@ -99,14 +99,14 @@ def test_a_memory_that_scores_patches_is_warned_of_lossy_films(
         assert ("passes for motion" in caplog.text) == warned
 
 
-def test_pictures_inside_the_tables_are_read_as_they_are(tmp_path: Path, recordings: Path) -> None:
+def test_images_inside_the_tables_are_read_as_they_are(tmp_path: Path, recordings: Path) -> None:
     root = publish(tmp_path / "tables", recordings, "image", {}, order=(0, 1, 2))
     (tmp_path / "starts.json").write_text('{"0": 4, "1": 0, "2": 2}')
     source = EpisodeSource(root, exec_starts=tmp_path / "starts.json")
     assert source.video_cameras == () and source.lossy == {}
     convert(list_episodes(find_files([recordings])), tmp_path / "ours", ConvertOptions(images="png"))
-    ours = EpisodeSource(tmp_path / "ours")
-    np.testing.assert_array_equal(source.frames(2, range(9), "wrist"), ours.frames(2, range(9), "wrist"))
+    converted = EpisodeSource(tmp_path / "ours")
+    np.testing.assert_array_equal(source.frames(2, range(9), "wrist"), converted.frames(2, range(9), "wrist"))
 
 
 def test_columns_of_subtasks_are_left_alone(tmp_path: Path, recordings: Path) -> None:
@@ -117,7 +117,9 @@ def test_columns_of_subtasks_are_left_alone(tmp_path: Path, recordings: Path) ->
     assert source.subgoal_names == ("simple_subgoal",)
 
 
-def test_our_own_demonstrations_mark_videos_too_and_strangers_are_named(tmp_path: Path, recordings: Path) -> None:
+def test_our_demonstrations_mark_videos_too_and_unauthenticated_clients_are_named(
+    tmp_path: Path, recordings: Path
+) -> None:
     convert(list_episodes(find_files([recordings])), tmp_path / "ours", ConvertOptions(images="png"))
     root = publish(tmp_path / "tables", recordings, "image", {}, order=(1, 2, 0))
     assert first_frames(root, annotated_episodes([tmp_path / "ours"])) == [0, 2, 4]

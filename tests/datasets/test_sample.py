@@ -24,13 +24,13 @@ def test_the_sample_holds_four_real_demonstrations() -> None:
     assert source.frames(0, [0, 172], "wrist").shape == (2, 256, 256, 3)
 
 
-def test_the_first_episode_has_its_own_picture_wherever_something_moved(shared: Path) -> None:
+def test_the_first_episode_has_a_separate_image_wherever_something_changed(shared: Path) -> None:
     source = EpisodeSource("sample")
     with open_episode(EpisodeRef(shared / "robomme_h5_full/record_dataset_VideoUnmask.h5", 6, "VideoUnmask")) as raw:
         recorded = np.stack([raw.front(k) for k in range(raw.length)])
     stored = source.frames(0, np.arange(173))
-    moved = (recorded[1:] != recorded[:-1]).any(axis=(1, 2, 3))
-    assert np.array_equal((stored[1:] != stored[:-1]).any(axis=(1, 2, 3)), moved)
+    changed = (recorded[1:] != recorded[:-1]).any(axis=(1, 2, 3))
+    assert np.array_equal((stored[1:] != stored[:-1]).any(axis=(1, 2, 3)), changed)
     assert np.abs(stored.astype(np.int16) - recorded).mean() < 4  # colours at half resolution
 
 

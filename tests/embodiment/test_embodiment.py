@@ -84,7 +84,7 @@ def test_a_robot_and_a_network_that_do_not_fit_are_refused() -> None:
         build_policy("pi05", device="meta", backbone={"horizon": 5})
 
 
-def test_a_checkpoint_written_before_robots_could_be_chosen_is_the_panda(tmp_path: Path) -> None:
+def test_a_checkpoint_saved_before_robots_could_be_selected_is_the_panda(tmp_path: Path) -> None:
     policy = build_policy("pi05", backbone=TINY)
     policy.require_processor().stats = unit_stats()
     policy.save_pretrained(tmp_path)
@@ -103,7 +103,7 @@ def test_a_checkpoint_written_before_robots_could_be_chosen_is_the_panda(tmp_pat
     assert torch.equal(loaded.sample_actions(batch, noise, 2), policy.sample_actions(batch, noise, 2))
 
 
-def test_a_run_begun_before_robots_could_be_chosen_goes_on(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_run_begun_before_robots_could_be_selected_resumes(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     config: Any = OmegaConf.to_container(compose("train", [f"output={tmp_path}"]), resolve=True)
     old = {key: value for key, value in config.items() if key != "embodiment"}
     checkpoint = tmp_path / "checkpoints" / "step_000001"

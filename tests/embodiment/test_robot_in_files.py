@@ -40,7 +40,7 @@ def test_the_robot_tells_compositions_apart_and_the_panda_goes_without_saying() 
     assert composition_digest({**config, "embodiment": absolute}) != digest
 
 
-def test_a_camera_is_a_column_of_pictures(tmp_path: Path) -> None:
+def test_a_camera_is_a_column_of_images(tmp_path: Path) -> None:
     numbers = {"dtype": "float32", "shape": (8,)}
     features = {"image": numbers, "wrist_image": {"dtype": "video", "shape": (8, 8, 3)}, "state": numbers}
     with pytest.raises(UserError, match=r"image holds 'float32', no images.*cameras\.front\.key"):

@@ -55,9 +55,9 @@ def write_dataset(root: Path, lengths: tuple[int, ...] = (14, 11)) -> None:
     rng = np.random.default_rng(0)
     for length in lengths:
         for _ in range(length):
-            pictures = {name: rng.integers(0, 255, (24, 32, 3), np.uint8) for name in views}
+            images = {name: rng.integers(0, 255, (24, 32, 3), np.uint8) for name in views}
             state = rng.normal(size=14).astype(np.float32)
-            dataset.add_frame({**pictures, "observation.state": state, "action": state + 0.1, "task": "Fold the towel"})
+            dataset.add_frame({**images, "observation.state": state, "action": state + 0.1, "task": "Fold the towel"})
         dataset.save_episode()
     dataset.finalize()
 
@@ -80,7 +80,7 @@ class Robot:
     def __init__(self) -> None:
         self.executed: list[np.ndarray] = []
 
-    def seen_since_last_time(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    def new_observations(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
         count = 1 + len(self.executed) * 8
         frames = np.random.default_rng(count).integers(0, 255, (count, 24, 32, 3), np.uint8)
         return dict.fromkeys(CAMERAS, frames), np.zeros((count, 14), np.float32)
@@ -95,12 +95,12 @@ def test_the_page_shows_the_file_that_is_tested() -> None:
 
 
 def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    look, cached, training = (shlex.split(line) for line in blocks("bash")[0].splitlines())
-    assert look[:5] == ["python", "-m", "mme_vla.inspect", "--config-dir", "configs"]
+    inspecting, cached, training = (shlex.split(line) for line in blocks("bash")[0].splitlines())
+    assert inspecting[:5] == ["python", "-m", "mme_vla.inspect", "--config-dir", "configs"]
     assert cached[:4] == ["mme-vla", "cache", "--config-dir", "configs"]
     assert training[:5] == ["python", "-m", "mme_vla.train", "--config-dir", "configs"]
     folders = [place / "configs"]
-    inspect_main(compose("inspect", look[5:], extra_dirs=folders))
+    inspect_main(compose("inspect", inspecting[5:], extra_dirs=folders))
     looked = capsys.readouterr().out
     assert "25" in looked, "frames of both episodes"
     assert "left_0" in looked and "number 1" not in looked
@@ -127,33 +127,33 @@ def test_the_page_from_the_dataset_to_a_served_policy(place: Path, capsys: pytes
         assert served.server.metadata["cameras"] == list(CAMERAS) and served.server.metadata["action_dim"] == 14
         exec(asking.replace("ws://127.0.0.1:8001", f"ws://127.0.0.1:{served.server.port}"), {"robot": robot})
         with served.client() as client, pytest.raises(UserError, match="observation/left_wrist"):
-            picture = np.zeros((24, 32, 3), np.uint8)
-            client.infer({"observation/top": picture, "observation/state": np.zeros(14), "prompt": "fold"})
+            image = np.zeros((24, 32, 3), np.uint8)
+            client.infer({"observation/top": image, "observation/state": np.zeros(14), "prompt": "fold"})
     alone = policy.start_episode("fold the towel", seed=0)
-    alone.observe(*Robot().seen_since_last_time())
+    alone.observe(*Robot().new_observations())
     assert np.allclose(robot.executed[0], policy.act([alone])[0][:8], atol=1e-5)
 
 
-def test_columns_are_found_in_both_spellings_joined_or_by_name(place: Path) -> None:
+def test_columns_are_detected_in_both_spellings_joined_or_by_name(place: Path) -> None:
     section = OmegaConf.to_container(OmegaConf.load(EXAMPLE / "configs" / "embodiment" / "two_arms.yaml"))
     assert isinstance(section, dict)
-    plain = Embodiment.from_dict({str(key): value for key, value in section.items()})
-    found = EpisodeSource("demonstrations", robot=plain)
-    assert found.exec_starts.tolist() == [0, 0] and found.goal(1) == "fold the towel"
-    assert found.columns["top"] == "observation.images.top" and found.frames(1, [3, 10]).shape == (2, 24, 32, 3)
+    robot = Embodiment.from_dict({str(key): value for key, value in section.items()})
+    source = EpisodeSource("demonstrations", robot=robot)
+    assert source.exec_starts.tolist() == [0, 0] and source.goal(1) == "fold the towel"
+    assert source.columns["top"] == "observation.images.top" and source.frames(1, [3, 10]).shape == (2, 24, 32, 3)
     twice = {"state": {"key": ["state", "action"], "width": 28}, "action": {"key": "actions", "width": 14}}
-    joined = EpisodeSource("demonstrations", robot=Embodiment.from_dict({**plain.to_dict(), **twice}))
-    assert np.array_equal(joined.states(0), np.concatenate([found.states(0), found.actions(0)], axis=1))
+    joined = EpisodeSource("demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), **twice}))
+    assert np.array_equal(joined.states(0), np.concatenate([source.states(0), source.actions(0)], axis=1))
     with pytest.raises(UserError, match=r"action has shape \[14\]; expected \[7\]"):
-        EpisodeSource("demonstrations", robot=Embodiment.from_dict({**plain.to_dict(), "action": {"width": 7}}))
+        EpisodeSource("demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), "action": {"width": 7}}))
     with pytest.raises(UserError, match=r"lacks the features image, wrist_image.*choose embodiment="):
         EpisodeSource("demonstrations")
     hand = EpisodeSource(
-        "demonstrations", robot=Embodiment.from_dict({**plain.to_dict(), "memory_camera": "left_wrist"})
+        "demonstrations", robot=Embodiment.from_dict({**robot.to_dict(), "memory_camera": "left_wrist"})
     )
-    places = [cache_folder(place, s, fingerprint(s, StorageSpec(4), "encoder")) for s in (found, hand)]
+    places = [cache_folder(place, s, fingerprint(s, StorageSpec(4), "encoder")) for s in (source, hand)]
     assert places[0] != places[1], "tokens of two cameras lie beside each other"
-    video = Embodiment.from_dict({**plain.to_dict(), "conditioning_video": True})
+    video = Embodiment.from_dict({**robot.to_dict(), "conditioning_video": True})
     with pytest.raises(UserError, match="does not mark its conditioning videos"):
         EpisodeSource("demonstrations", robot=video)
 
@@ -170,7 +170,7 @@ def test_three_cameras_get_a_loss_while_training_with_augmentation() -> None:
     assert torch.isfinite(loss) and policy.backbone.action_in.weight.grad is not None
 
 
-def test_a_third_camera_is_seen_in_rollouts_and_another_can_feed_memory(tmp_path: Path) -> None:
+def test_a_third_camera_is_visible_in_rollouts_and_another_can_feed_memory(tmp_path: Path) -> None:
     (tmp_path / "embodiment").mkdir()
     yaml = "defaults: [robomme_joint, _self_]\nname: watched\ncameras: {side: {}}\nmemory_camera: side\n"
     (tmp_path / "embodiment" / "watched.yaml").write_text(yaml)
@@ -181,15 +181,15 @@ def test_a_third_camera_is_seen_in_rollouts_and_another_can_feed_memory(tmp_path
     robot = policy.embodiment
     assert robot.camera_names == ("front", "wrist", "side") and robot.action == ROBOMME_JOINT.action
     policy.require_processor().stats = unit_stats(robot)
-    seen: list[np.ndarray] = []
+    encoded: list[np.ndarray] = []
     encode = policy.encode_frames
-    policy.encode_frames = lambda frames, *rest: (seen.append(frames), encode(frames, *rest))[1]  # type: ignore
+    policy.encode_frames = lambda frames, *arguments: (encoded.append(frames), encode(frames, *arguments))[1]  # type: ignore
     job = Job("PickXtimes", "test", 0)
     with pytest.raises(UserError, match="The environment has no camera 'side'"):
         roll(policy, [job], InlineEnvs(robot=robot))
     (record,) = roll(policy, [job], InlineEnvs(robot=robot, base=make_watched_env, max_steps=20))
     assert record.outcome == "timeout" and record.steps == 21
-    assert seen and all((frames == 77).all() for frames in seen), "memory is fed by the third camera alone"
+    assert encoded and all((frames == 77).all() for frames in encoded), "memory is fed by the third camera alone"
 
 
 def make_watched_env(**options: Any) -> ScriptedEnv:

@@ -59,11 +59,11 @@ def _remember_pictures(source: EpisodeSource) -> None:
     decode = source.frames
 
     @cache
-    def picture(episode: int, index: int, camera: str | None) -> np.ndarray:
+    def image(episode: int, index: int, camera: str | None) -> np.ndarray:
         return decode(episode, [index], camera)
 
     def frames(episode: int, indices: Sequence[int] | np.ndarray, camera: str | None = None) -> np.ndarray:
-        return picture(episode, int(indices[0]), camera) if len(indices) == 1 else decode(episode, indices, camera)
+        return image(episode, int(indices[0]), camera) if len(indices) == 1 else decode(episode, indices, camera)
 
     source.frames = frames  # type: ignore[method-assign]
 
@@ -100,12 +100,12 @@ def test_every_model_trains_on_the_sample(model: str, tmp_path: Path, caches: Pa
 
 
 def test_a_recurrent_model_resumes_where_it_stopped(tmp_path: Path, caches: Path) -> None:
-    whole = run("ttt_modul", tmp_path / "whole", caches, "train.steps=12")
+    straight = run("ttt_modul", tmp_path / "whole", caches, "train.steps=12")
     parts = tmp_path / "parts"
     run("ttt_modul", parts, caches, "train.steps=6")
     resumed = run("ttt_modul", tmp_path / "unused", caches, "train.steps=12", f"resume={parts}")
     assert losses(parts) == losses(tmp_path / "whole")
     assert len(losses(parts)) == 12
     after = load_tensors(resumed)
-    for name, tensor in load_tensors(whole).items():
+    for name, tensor in load_tensors(straight).items():
         assert torch.equal(tensor, after[name]), name

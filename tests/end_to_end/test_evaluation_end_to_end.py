@@ -63,11 +63,11 @@ def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(
     steps = ["train.steps=10", "train.warmup=3", "train.open_loop_chunks=0", "train.val_every=10", "train.workers=0"]
     call("train", "model=framesamp_modul", f"output={trained}", *steps)
 
-    said = call("evaluate", f"checkpoint={trained}", *EPISODES, ONE, f"output={tmp_path / 'whole'}", "video=all")
-    assert "python -m mme_vla.results" in said
-    whole = {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "whole")}
-    assert len(whole) == 4 and len({digest for _, _, digest in whole.values()}) == 4
-    assert all(outcome in ("timeout", "fail", "success") for outcome, _, _ in whole.values()), whole
+    output = call("evaluate", f"checkpoint={trained}", *EPISODES, ONE, f"output={tmp_path / 'whole'}", "video=all")
+    assert "python -m mme_vla.results" in output
+    straight = {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "whole")}
+    assert len(straight) == 4 and len({digest for _, _, digest in straight.values()}) == 4
+    assert all(outcome in ("timeout", "fail", "success") for outcome, _, _ in straight.values()), straight
     assert len(list((tmp_path / "whole" / "videos").glob("*.mp4"))) == 4
 
     words = ("evaluate", f"checkpoint={trained}", *EPISODES, f"output={tmp_path / 'killed'}")
@@ -84,13 +84,13 @@ def test_a_trained_policy_is_evaluated_killed_and_resumed_with_the_same_results(
             time.sleep(0.1)
     finished = lines(tmp_path / "killed")
     assert 2 <= len(finished) < 4
-    said = call(*words, ONE)
-    assert "of 4 episodes: continuing" in said
+    output = call(*words, ONE)
+    assert "of 4 episodes: continuing" in output
     assert lines(tmp_path / "killed")[: len(finished)] == finished, "what was finished was run again"
-    assert {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "killed")} == whole
+    assert {r.key: (r.outcome, r.steps, r.extra["actions_sha256"]) for r in records(tmp_path / "killed")} == straight
 
-    shown = call("results", str(tmp_path / "killed"), "--tasks", "PickXtimes", "StopCube", "--episodes", "2")
-    assert "framesamp_modul" in shown and "18" in shown
+    table = call("results", str(tmp_path / "killed"), "--tasks", "PickXtimes", "StopCube", "--episodes", "2")
+    assert "framesamp_modul" in table and "18" in table
 
 
 def records(folder: Path) -> list:

@@ -39,9 +39,9 @@ def test_latest_is_the_run_that_wrote_a_checkpoint_last(tmp_path: Path) -> None:
 
 
 def test_the_papers_recipe_asks_for_the_weights_it_starts_from() -> None:
-    asked = compose("train", ["experiment=robomme"]).init_from
+    start = compose("train", ["experiment=robomme"]).init_from
     with pytest.raises(UserError, match="init_from=none"):
-        weights_to_start_from(asked)
+        weights_to_start_from(start)
     assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=none"]).init_from) is None
     assert weights_to_start_from(compose("train", ["experiment=robomme", "init_from=x/y"]).init_from) == "x/y"
     assert weights_to_start_from(compose("train", []).init_from) is None
@@ -90,7 +90,9 @@ def test_a_narrow_terminal_cuts_no_number(capsys: pytest.CaptureFixture[str]) ->
     assert "framesamp_modul" in printed
 
 
-def test_the_demonstration_takes_own_memories_and_always_shows_the_one_without(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demonstration_takes_custom_memories_and_always_shows_the_one_without(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.syspath_prepend(REPOSITORY / "examples")
     import memory_matters
 

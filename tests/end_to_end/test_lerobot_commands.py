@@ -27,7 +27,7 @@ def test_a_policy_is_trained_resumed_and_evaluated_with_the_conditioning_video(t
     data, run, judged = tmp_path / "data", tmp_path / "run", tmp_path / "judged"
     convert(list_episodes(find_files([tmp_path])), data, ConvertOptions(images="png", names="lerobot"))
     trained = run / "checkpoints/last/pretrained_model"
-    said = run_lerobot(
+    output = run_lerobot(
         tmp_path,
         [
             [TRAIN, "--policy.type=mme_vla", "--policy.model=tokendrop_expert", "--policy.device=cpu",
@@ -40,12 +40,12 @@ def test_a_policy_is_trained_resumed_and_evaluated_with_the_conditioning_video(t
         ],
         plugins={"lerobot_policy_mme_vla": "lerobot_policy_mme_vla"},
     )  # fmt: skip
-    losses = [float(part.split()[0]) for part in said.split(" loss:")[1:]]
-    assert len(losses) == 4 and all(0.1 < loss < 20 for loss in losses), said[-3000:]
+    losses = [float(part.split()[0]) for part in output.split(" loss:")[1:]]
+    assert len(losses) == 4 and all(0.1 < loss < 20 for loss in losses), output[-3000:]
     info = json.loads((judged / "eval_info.json").read_text())
     assert info["overall"]["n_episodes"] == 1 and info["overall"]["pc_success"] == 0.0
-    film = next(judged.glob("videos/**/*.mp4"))
-    assert frames_of(film) > 60  # the video of 66 frames is in it
+    video = next(judged.glob("videos/**/*.mp4"))
+    assert frames_of(video) > 60  # the video of 66 frames is in it
     assert {"policy_preprocessor.json", "norm_stats.json", "processor.json"} <= {f.name for f in trained.iterdir()}
 
 
@@ -84,22 +84,22 @@ def test_a_resumed_run_equals_an_uninterrupted_one_but_for_one_random_number_tha
     assert weights["resumed"] != weights["uninterrupted"]
 
 
-def frames_of(film: Path) -> int:
+def frames_of(video: Path) -> int:
     import av
 
-    with av.open(str(film)) as opened:
+    with av.open(str(video)) as opened:
         return sum(1 for _ in opened.decode(video=0))
 
 
 @pytest.mark.filterwarnings("ignore:load_recording:DeprecationWarning")
-def test_act_is_trained_and_evaluated_and_the_curves_are_drawn(tmp_path: Path) -> None:
+def test_act_is_trained_and_evaluated_and_the_curves_are_rendered(tmp_path: Path) -> None:
     rerun = pytest.importorskip("rerun", reason="lerobot-dataset-viz needs the extra viz")
     write_file(tmp_path / "record_dataset_PickXtimes.h5", [9, 7], size=64)
     data, run = tmp_path / "data", tmp_path / "run"
     convert(list_episodes(find_files([tmp_path])), data, ConvertOptions(names="lerobot"))
     dataset = ("--dataset.repo_id=local/data", f"--dataset.root={data}", "--dataset.video_backend=pyav")
     trained = run / "checkpoints/last/pretrained_model"
-    said = run_lerobot(
+    output = run_lerobot(
         tmp_path,
         [
             [TRAIN, *dataset, *SMALL_ACT, f"--output_dir={run}", "--steps=3", "--batch_size=4", "--num_workers=0",
@@ -111,10 +111,10 @@ def test_act_is_trained_and_evaluated_and_the_curves_are_drawn(tmp_path: Path) -
         ],
         plugins={"robomme": "robomme"},
     )  # fmt: skip
-    losses = [part.split()[0] for part in said.split(" loss:")[1:]]
-    assert len(losses) == 3 and all(float(loss) > 0 for loss in losses), said[-3000:]
+    losses = [part.split()[0] for part in output.split(" loss:")[1:]]
+    assert len(losses) == 3 and all(float(loss) > 0 for loss in losses), output[-3000:]
     judged = json.loads((tmp_path / "e/eval_info.json").read_text())
     assert judged["overall"]["n_episodes"] == 1 and judged["overall"]["pc_success"] == 0.0
-    shown = str(rerun.recording.load_recording(tmp_path / "local_data_episode_0.rrd").schema())
+    schema = str(rerun.recording.load_recording(tmp_path / "local_data_episode_0.rrd").schema())
     for entity in ("action", "state", "observation.images.image"):
-        assert f"/{entity}:" in shown
+        assert f"/{entity}:" in schema

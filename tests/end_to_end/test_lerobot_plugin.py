@@ -71,10 +71,10 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def theirs(package: ModuleType, ours: Path) -> Path:
+def theirs(package: ModuleType, our_folder: Path) -> Path:
     """The same policy as LeRobot's commands know it."""
-    folder = ours.parent / "theirs"
-    package.convert.main([str(ours), str(folder)])
+    folder = our_folder.parent / "theirs"
+    package.convert.main([str(our_folder), str(folder)])
     return folder
 
 
@@ -114,47 +114,49 @@ def through_lerobot(package: ModuleType, folder: Path, monkeypatch: pytest.Monke
     before, after = make_pre_post_processors(config, pretrained_path=str(folder))
     envs = settings.create_envs(2)["VideoUnmask"][0]
     observation, _ = envs.reset(seed=[1, 2], options={"lerobot_new_rollout": True})
-    given: list[list[np.ndarray]] = [[], []]
-    while min(map(len, given)) < STEPS:
+    received: list[list[np.ndarray]] = [[], []]
+    while min(map(len, received)) < STEPS:
         batch = preprocess_observation(observation) | {"task": list(envs.call("task_description"))}
         playing = observation["is_demo"][:, 0] > 0
         with torch.inference_mode():
             action = after(policy.select_action(before(batch))).numpy()
         for i in range(2):
             if not playing[i]:
-                given[i].append(action[i])
+                received[i].append(action[i])
         observation, *_ = envs.step(action)
-    return np.stack([np.stack(actions[:STEPS]) for actions in given])
+    return np.stack([np.stack(actions[:STEPS]) for actions in received])
 
 
 def test_actions_are_those_of_the_policy_in_process(
-    package: ModuleType, ours: Path, theirs: Path, monkeypatch: pytest.MonkeyPatch
+    package: ModuleType, our_folder: Path, lerobot_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    expected = in_process(ours)
-    found = through_lerobot(package, theirs, monkeypatch)
+    expected = in_process(our_folder)
+    actions = through_lerobot(package, lerobot_folder, monkeypatch)
     assert np.abs(expected[0] - expected[1]).max() > 1e-3  # the episodes do differ
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(actions, expected)
 
 
-def test_a_checkpoint_goes_there_and_back(package: ModuleType, ours: Path, theirs: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_goes_there_and_back(
+    package: ModuleType, our_folder: Path, lerobot_folder: Path, tmp_path: Path
+) -> None:
     assert {"policy_preprocessor.json", "policy_postprocessor.json", "processor.json", "norm_stats.json"} <= {
-        file.name for file in theirs.iterdir()
+        file.name for file in lerobot_folder.iterdir()
     }
-    package.convert.main([str(theirs), str(tmp_path / "back")])
-    first, second = Policy.from_pretrained(ours), Policy.from_pretrained(tmp_path / "back")
+    package.convert.main([str(lerobot_folder), str(tmp_path / "back")])
+    first, second = Policy.from_pretrained(our_folder), Policy.from_pretrained(tmp_path / "back")
     assert first.config == second.config
     for name, tensor in first.state_dict().items():
         assert torch.equal(tensor, second.state_dict()[name]), name
     with pytest.raises(SystemExit):
-        package.convert.main([str(theirs), str(ours)])
+        package.convert.main([str(lerobot_folder), str(our_folder)])
 
 
-def test_damage_and_strange_code_are_refused(package: ModuleType, theirs: Path, tmp_path: Path) -> None:
+def test_damage_and_strange_code_are_refused(package: ModuleType, lerobot_folder: Path, tmp_path: Path) -> None:
     from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 
-    config = json.loads((theirs / "config.json").read_text())
+    config = json.loads((lerobot_folder / "config.json").read_text())
     sections = json.loads(config["composition"])
-    for file in theirs.iterdir():
+    for file in lerobot_folder.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     (tmp_path / "config.json").write_text(
         json.dumps(config | {"composition": json.dumps(sections | {"plugins": ["somebodys_code"]})})
@@ -169,10 +171,10 @@ def test_damage_and_strange_code_are_refused(package: ModuleType, theirs: Path, 
         MMEVLAPolicy.from_pretrained(tmp_path)
 
 
-def test_a_chunk_agrees_with_the_one_under_way(package: ModuleType, theirs: Path) -> None:
+def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: Path) -> None:
     from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 
-    policy = MMEVLAPolicy.from_pretrained(theirs)
+    policy = MMEVLAPolicy.from_pretrained(lerobot_folder)
     assert policy.supports_rtc()
     views = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     names = ("observation.images.image", "observation.images.wrist_image")
@@ -197,12 +199,14 @@ def test_a_chunk_agrees_with_the_one_under_way(package: ModuleType, theirs: Path
         ({"observation.images.image": None}, "No images of the camera 'front'"),
     ],
 )
-def test_what_a_dataset_lacks_is_named(package: ModuleType, ours: Path, changed: dict[str, None], said: str) -> None:
+def test_what_a_dataset_lacks_is_named(
+    package: ModuleType, our_folder: Path, changed: dict[str, None], said: str
+) -> None:
     from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 
-    policy = Policy.from_pretrained(ours)
-    pictures, numbers = package.convert.features_of(policy.embodiment)
-    features = {name: feature for name, feature in pictures.items() if name not in changed}
+    policy = Policy.from_pretrained(our_folder)
+    images, numbers = package.convert.features_of(policy.embodiment)
+    features = {name: feature for name, feature in images.items() if name not in changed}
     config = package.MMEVLAConfig(device="cpu", input_features=features, output_features=numbers)
     with pytest.raises(UserError, match=said):
         MMEVLAPolicy(config, model=policy)

@@ -27,9 +27,9 @@ def test_pins_for_pip_and_for_uv_are_the_same() -> None:
 
 def test_every_direct_dependency_is_pinned() -> None:
     project = pyproject()["project"]
-    wanted = project["dependencies"] + [r for rs in project["optional-dependencies"].values() for r in rs]
+    requirements = project["dependencies"] + [r for rs in project["optional-dependencies"].values() for r in rs]
     pinned = {pin.split("==")[0] for pin in pyproject()["tool"]["uv"]["constraint-dependencies"]}
-    assert {re.match(r"[\w-]+", requirement)[0] for requirement in wanted} <= pinned
+    assert {re.match(r"[\w-]+", requirement)[0] for requirement in requirements} <= pinned
 
 
 def test_every_cap_gives_its_reason() -> None:
@@ -58,14 +58,14 @@ def test_links_in_the_documentation_lead_to_files() -> None:
 def test_no_file_names_a_place_on_somebodys_machine() -> None:
     # Bracketed so that the pattern does not find itself.
     places = re.compile(r"(?<![\w.~])/(?:wor[k]|roo[t]|hom[e]|User[s]|opt/\w+)/\w|index-ur[l]|find-link[s]|pypi\.or[g]")
-    found = []
+    hits = []
     for file in project_files():
         try:
             text = file.read_text()
         except UnicodeDecodeError:
             continue
-        found += [f"{file.relative_to(REPOSITORY)}: {hit[0]}" for hit in places.finditer(text)]
-    assert found == []
+        hits += [f"{file.relative_to(REPOSITORY)}: {hit[0]}" for hit in places.finditer(text)]
+    assert hits == []
 
 
 def test_every_exported_name_can_be_reached() -> None:

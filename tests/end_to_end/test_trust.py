@@ -123,24 +123,24 @@ def test_a_snapshot_of_the_hubs_cache_loads_through_its_links(folder: Path, poli
         inside(snapshot, "../../blobs/blob0")
 
 
-def test_a_folder_that_only_looks_like_the_hubs_cache_opens_nothing_else(folder: Path, tmp_path: Path) -> None:
-    look_alike = tmp_path / "runs" / "snapshots" / "one"
-    look_alike.parent.mkdir(parents=True)
-    folder.rename(look_alike)
+def test_a_folder_that_imitates_the_hubs_cache_opens_nothing_else(folder: Path, tmp_path: Path) -> None:
+    not_the_cache = tmp_path / "runs" / "snapshots" / "one"
+    not_the_cache.parent.mkdir(parents=True)
+    folder.rename(not_the_cache)
     (tmp_path / "runs" / "blobs").mkdir()
-    shutil.move(look_alike / "config.json", tmp_path / "runs" / "blobs" / "x")
-    (look_alike / "config.json").symlink_to(tmp_path / "runs" / "blobs" / "x")
+    shutil.move(not_the_cache / "config.json", tmp_path / "runs" / "blobs" / "x")
+    (not_the_cache / "config.json").symlink_to(tmp_path / "runs" / "blobs" / "x")
     with pytest.raises(UserError, match="lies outside of it"):
-        MMEPolicy.from_pretrained(look_alike)
+        MMEPolicy.from_pretrained(not_the_cache)
 
 
-def test_the_network_is_asked_for_nothing_but_the_librarys_own_tokenizer(
+def test_the_network_is_requested_nothing_but_the_librarys_tokenizer(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[str] = []
+    requests: list[str] = []
 
     def fetch(repository: str, name: str) -> str:
-        asked.append(f"{repository}/{name}")
+        requests.append(f"{repository}/{name}")
         return str(folder / "tokenizer.model")
 
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", fetch)
@@ -148,14 +148,14 @@ def test_the_network_is_asked_for_nothing_but_the_librarys_own_tokenizer(
     processor_says(folder, tokenizer="hf://evil/group/tokenizer.model")
     with pytest.raises(UserError, match=r"hf://evil/group/tokenizer\.model.*tokenizer=.*as tokenizer\.model"):
         MMEPolicy.from_pretrained(folder)
-    assert asked == []
+    assert requests == []
     (folder.parent / "tokenizer.model").rename(folder / "tokenizer.model")  # as the message says
     MMEPolicy.from_pretrained(folder)
-    assert asked == []
+    assert requests == []
     MMEPolicy.from_pretrained(folder, tokenizer="hf://evil/group/tokenizer.model")
     processor_says(folder, tokenizer=PALIGEMMA)
     MMEPolicy.from_pretrained(folder)
-    assert asked == ["evil/group/tokenizer.model", "google/paligemma-3b-pt-224/tokenizer.model"]
+    assert requests == ["evil/group/tokenizer.model", "google/paligemma-3b-pt-224/tokenizer.model"]
 
 
 @pytest.mark.parametrize("name", ["../../x", "/x", "a/b", "..", ""])
@@ -196,7 +196,7 @@ def test_weights_that_are_no_numbers_are_refused_by_name(value: float, folder: P
             load(folder)
 
 
-def test_whole_numbers_in_place_of_real_ones_are_refused_by_name(folder: Path) -> None:
+def test_integers_in_place_of_real_ones_are_refused_by_name(folder: Path) -> None:
     tensors = load_file(folder / "model.safetensors")
     tensors["backbone.time_in.bias"] = tensors["backbone.time_in.bias"].to(torch.int32)
     save_file(tensors, folder / "model.safetensors")
@@ -232,23 +232,23 @@ def test_a_header_larger_than_any_is_not_parsed(folder: Path) -> None:
 
 def test_missing_pieces_of_an_array_are_errors_and_not_zeros(tmp_path: Path) -> None:
     pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
-    plain = tmp_path / "plain"
-    shutil.copytree(Path(__file__).resolve().parents[1] / "data" / "orbax_plain", plain)
-    (plain / "scale" / "0").unlink()
+    folder = tmp_path / "plain"
+    shutil.copytree(Path(__file__).resolve().parents[1] / "data" / "orbax_plain", folder)
+    (folder / "scale" / "0").unlink()
     with pytest.raises(UserError, match="damaged or incomplete"):
-        read_orbax(plain)
+        read_orbax(folder)
 
 
 def test_shapes_are_compared_before_memory_is_taken(tmp_path: Path, policy: MMEPolicy) -> None:
     pytest.importorskip("tensorstore", reason="Orbax checkpoints need the extra 'orbax'")
-    plain = tmp_path / "plain"
-    shutil.copytree(Path(__file__).resolve().parents[1] / "data" / "orbax_plain", plain)
-    change(plain / "scale" / ".zarray", lambda about: about.update(shape=[10**11], chunks=[1]))
+    folder = tmp_path / "plain"
+    shutil.copytree(Path(__file__).resolve().parents[1] / "data" / "orbax_plain", folder)
+    change(folder / "scale" / ".zarray", lambda about: about.update(shape=[10**11], chunks=[1]))
     with pytest.raises(UserError, match="do not fit this policy"):
-        load_weights(small_policy("framesamp_modul"), plain)
-    change(plain / "scale" / ".zarray", lambda about: about.update(shape=[4], chunks=[10**11]))
+        load_weights(small_policy("framesamp_modul"), folder)
+    change(folder / "scale" / ".zarray", lambda about: about.update(shape=[4], chunks=[10**11]))
     with pytest.raises(UserError, match="pieces of"):
-        read_orbax(plain)
-    (plain / "scale" / "link").symlink_to("/etc")
+        read_orbax(folder)
+    (folder / "scale" / "link").symlink_to("/etc")
     with pytest.raises(UserError, match="lies outside of it"):
-        read_orbax(plain)
+        read_orbax(folder)

@@ -52,9 +52,11 @@ def installed(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         order = [uv, "pip", "install", "--offline", "--link-mode", "symlink", "--python", str(python), "-c", pins]
         if subprocess.run([*order, str(wheel)], cwd=REPOSITORY, capture_output=True).returncode == 0:
             return python
-    own = Path(run([str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], cwd=folder).strip())
-    zipfile.ZipFile(wheel).extractall(own)
-    (own / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
+    site_packages = Path(
+        run([str(python), "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"], cwd=folder).strip()
+    )
+    zipfile.ZipFile(wheel).extractall(site_packages)
+    (site_packages / "dependencies.pth").write_text(sysconfig.get_path("purelib"))
     return python
 
 

@@ -60,8 +60,8 @@ def test_a_choice_survives_the_way_through_the_robots_numbers() -> None:
         row = torch.from_numpy(choice_row(letter, point))
         state = torch.zeros(8)
         back = SPACE.to_absolute(SPACE.to_relative(row[None], state), state)
-        chosen = benchmark_action(SPACE, SPACE.decide(back, read_options(EIGHT, 8))[0].numpy())
-        assert chosen == {"choice": letter.upper(), "point": pytest.approx(point or [128, 128])}
+        action = benchmark_action(SPACE, SPACE.decide(back, read_options(EIGHT, 8))[0].numpy())
+        assert action == {"choice": letter.upper(), "point": pytest.approx(point or [128, 128])}
 
 
 def test_the_best_of_the_offered_letters_is_taken_and_no_other() -> None:
@@ -119,8 +119,8 @@ def test_every_choice_is_decided_on_one_frame_before_it_begins_even_the_same_twi
     rows = np.zeros((12, 10), np.float32)
     for frame, letter in ((2, "a"), (5, "b"), (9, "b")):
         rows[frame] = choice_row(letter, [])
-    found = find_choices(rows, 50, SPACE.choice)
-    assert found.decisions.tolist() == [50, 54, 58] and found.targets[:, 1].tolist() == [0, 1, 1]
+    choices = find_choices(rows, 50, SPACE.choice)
+    assert choices.decisions.tolist() == [50, 54, 58] and choices.targets[:, 1].tolist() == [0, 1, 1]
     assert find_choices(np.zeros((3, 10), np.float32), 0, SPACE.choice).decisions.tolist() == []
 
 
@@ -135,7 +135,7 @@ def test_recorded_choices_are_converted_and_read_as_decisions(folder: Path) -> N
     assert np.array_equal(chunk, [choice_row(c["choice"].lower(), c["point"]) for c in expected])
 
 
-def test_letters_that_are_seldom_chosen_stay_numbers_of_ordinary_size(folder: Path) -> None:
+def test_letters_that_are_seldom_selected_stay_numbers_of_ordinary_size(folder: Path) -> None:
     source = EpisodeSource(folder, robot=CHOOSER)
     stats = compute_norm_stats([source], horizon=4, robot=CHOOSER, extremes=True)
     for low, high in (stats.actions.bounds("quantiles"), stats.actions.bounds("extremes")):
@@ -161,10 +161,10 @@ def test_the_prompt_lists_what_is_offered(folder: Path) -> None:
 
 def test_the_longest_options_of_the_benchmark_fit_the_prompt() -> None:
     """RouteStick's, with its longest goal; a warning would say that the prompt was cut."""
-    turns = ("clockwise", "counterclockwise")
+    directions = ("clockwise", "counterclockwise")
     texts = [
         f"move to the nearest {side} target by circling around the stick {t}"
-        for t in turns
+        for t in directions
         for side in ("left", "right")
     ]
     options = tuple(Option("abcd"[i], text) for i, text in enumerate(texts))
@@ -203,7 +203,7 @@ def test_what_is_no_choice_is_refused(text: str) -> None:
         row_of(text)
 
 
-def test_a_damaged_choice_is_told_with_its_place(tmp_path: Path) -> None:
+def test_a_damaged_choice_is_reported_with_its_place(tmp_path: Path) -> None:
     write_file(tmp_path / "record_dataset_Alpha.h5", [8], choices=True)
     with h5py.File(tmp_path / "record_dataset_Alpha.h5", "r+") as file:
         del file["episode_0/timestep_4/action/choice_action"]
@@ -294,35 +294,35 @@ def test_an_environment_without_options_is_no_place_for_a_policy_that_chooses() 
 def test_a_policy_that_chooses_is_served_with_its_choices_in_words() -> None:
     policy = quick_policy("pi05", embodiment="robomme_choice")
     frames, states = [np.zeros((32, 32, 3), np.uint8)] * 2, np.zeros((2, 8), np.float32)
-    asked = challenge(frames, frames, states, True)
+    request = challenge(frames, frames, states, True)
     with Served(policy) as served, served.client() as client:
         about = client.metadata
         assert (about["action_space"], about["action_dim"], about["execute"]) == ("multi_choice", 10, 1)
-        answer = client.infer({**asked, "available_multi_choices": OPTIONS[1:2]})
-        assert answer["actions"].shape == (1, 10) and answer["actions"][0, 1] == 1
-        assert answer["choices"][0]["choice"] == "B"
-        assert np.allclose(answer["choices"][0]["point"], answer["actions"][0, 8:] * 256)
+        reply = client.infer({**request, "available_multi_choices": OPTIONS[1:2]})
+        assert reply["actions"].shape == (1, 10) and reply["actions"][0, 1] == 1
+        assert reply["choices"][0]["choice"] == "B"
+        assert np.allclose(reply["choices"][0]["point"], reply["actions"][0, 8:] * 256)
         later = client.infer({**challenge(frames[:1], frames[:1], states[:1], False)})
         assert later["choices"][0]["choice"] == "B", "options stay as they were until others are given"
         with pytest.raises(UserError, match="cannot be chosen"):
-            client.infer({**asked, "available_multi_choices": [{"label": "Z", "action": "go"}]})
+            client.infer({**request, "available_multi_choices": [{"label": "Z", "action": "go"}]})
     with Served(policy) as served, served.client() as client, pytest.raises(UserError, match="offers none"):
-        client.infer(asked)
+        client.infer(request)
 
 
 # Real recordings ------------------------------------------------------------------------------------------------------
 
 
 def test_choices_of_real_episodes_are_those_of_the_official_files(h5_folder: Path) -> None:
-    found = {}
+    counts = {}
     for task, number in (("PickXtimes", 8), ("PatternLock", 8)):
         with open_episode(EpisodeRef(h5_folder / f"record_dataset_{task}.h5", number, task)) as episode:
             rows, first = episode.choice_actions()[episode.exec_start :], episode.exec_start
             motions = find_choices(rows, first, SPACE.choice)
-            chosen = [benchmark_action(SPACE, row) for row in motions.targets]
-            found[task] = (motions.decisions.tolist(), [c["choice"] for c in chosen], [c["point"] for c in chosen])
-    assert found["PickXtimes"] == ([0, 143, 237], ["A", "B", "C"], [[54, 145], [93, 109], [66, 101]])
-    assert found["PatternLock"][:2] == ([74, 109], ["A", "H"])
+            actions = [benchmark_action(SPACE, row) for row in motions.targets]
+            counts[task] = (motions.decisions.tolist(), [c["choice"] for c in actions], [c["point"] for c in actions])
+    assert counts["PickXtimes"] == ([0, 143, 237], ["A", "B", "C"], [[54, 145], [93, 109], [66, 101]])
+    assert counts["PatternLock"][:2] == ([74, 109], ["A", "H"])
 
 
 @pytest.mark.parametrize(("task", "number"), [("PickXtimes", 8), ("PatternLock", 8)])

@@ -78,10 +78,10 @@ def test_the_button_before_its_time_fails_and_stays_failed(fill, hand, stage):
 
 
 def test_a_wrong_colour_fails_only_when_the_button_is_due(fill, hand):
-    asked = next(colour for colour in COLOURS if fill.goal[colour])
-    wrong = next(colour for colour in COLOURS if colour != asked)
+    colour_ = next(colour for colour in COLOURS if fill.goal[colour])
+    wrong = next(colour for colour in COLOURS if colour != colour_)
     cubes = [cube for c in COLOURS for cube in fill.cubes[c][: fill.goal[c]]]
-    cubes[cubes.index(fill.cubes[asked][0])] = fill.cubes[wrong][fill.goal[wrong]]
+    cubes[cubes.index(fill.cubes[colour_][0])] = fill.cubes[wrong][fill.goal[wrong]]
     for cube in cubes:
         assert put(fill, hand, cube) == (False, False)
     assert wait(fill) == (False, True)

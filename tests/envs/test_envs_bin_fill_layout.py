@@ -41,10 +41,10 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty):
     for _ in range(cubes - sum(spawned.values())):
         spawned[pool[stream.integer(0, len(pool)) if len(pool) > 1 else 0]] += 1
     assert {colour: len(env.cubes[colour]) for colour in pool} == spawned
-    wanted, indices = [colour for colour in COLOURS for _ in range(spawned.get(colour, 0))], Counter()
+    expected_colours, indices = [colour for colour in COLOURS for _ in range(spawned.get(colour, 0))], Counter()
     for i in stream.permutation(cubes):
-        read_cube(stream, TABLE, env.cubes[wanted[i]][indices[wanted[i]]])
-        indices[wanted[i]] += 1
+        read_cube(stream, TABLE, env.cubes[expected_colours[i]][indices[expected_colours[i]]])
+        indices[expected_colours[i]] += 1
     stream.permutation(3)  # an episode is initialised twice
     assert env.order == [("blue", "red", "green")[i] for i in stream.permutation(3)]
     assert len(env.all_cubes()) == cubes and least_distance(env.all_cubes()) >= 0.04

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_unmask import lift, make, names, push_down, released, skip_place, texts, turn, wait
+from helpers.env_unmask import lift, make, names, push_down, released, skip_place, texts, wait, yaw_of
 from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Draws, Region, button_box
 from mme_vla.envs.tasks.button_unmask import ButtonUnmask
 
@@ -36,7 +36,7 @@ def test_button_then_containers_then_colours_come_from_the_stream(seed, difficul
     offset = (stream.uniforms(2).numpy() - 0.5) * 0.1
     np.testing.assert_allclose(env.button.pose.p[:2], np.array([-0.2, 0]) + offset, atol=1e-6)
     for container in env.containers:
-        assert skip_place(stream, Region((0, 0), 0.2), container) == pytest.approx(turn(container), abs=1e-6)
+        assert skip_place(stream, Region((0, 0), 0.2), container) == pytest.approx(yaw_of(container), abs=1e-6)
         assert button_box(env.button).distance(container.initial_pose.p[:2]) >= CONTAINER_HALF + 0.04 - 1e-6
     if difficulty == "hard":  # one more found no place
         for _ in range(TRIALS):
@@ -123,7 +123,7 @@ def test_texts_goals_and_choices(hard):
 
 
 @pytest.mark.parametrize("seed", [8303, 8304, 8305])
-def test_the_pick_that_recovery_fails_has_a_stream_of_its_own(seed):
+def test_the_pick_that_recovery_fails_has_a_separate_stream(seed):
     env = make(ButtonUnmask, seed, "hard", recovery="z")
     stream = Draws(seed)
     stream.integer(1, 6)

@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_unmask import lift, make, names, push_down, released, skip_place, texts, turn, under, wait
+from helpers.env_unmask import lift, make, names, push_down, released, skip_place, texts, under, wait, yaw_of
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.button_unmask_swap import ButtonUnmaskSwap
 
@@ -35,7 +35,7 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty):
         if on_line:
             anchors = [(-0.05 + o[5], -0.15), (-0.05 + o[6], 0.15), (-0.05 + o[7], 0.0)]
     for anchor, container in zip(anchors, env.containers, strict=True):
-        assert skip_place(stream, Region(anchor, 0.07), container) == pytest.approx(turn(container), abs=1e-6)
+        assert skip_place(stream, Region(anchor, 0.07), container) == pytest.approx(yaw_of(container), abs=1e-6)
     assert env.colours == names(stream)
     env.close()
 

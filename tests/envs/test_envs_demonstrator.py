@@ -100,17 +100,19 @@ def test_demonstrations_repeat_the_recorded_ones_step_by_step(
     assert success and len(log.actions) == steps
     joints = recorded(h5_folder, task.__name__, episode, "action/joint_action")
     waypoints = recorded(h5_folder, task.__name__, episode, "action/waypoint_action")
-    actions = [action for action, kept in zip(log.actions, stored, strict=True) if kept]
+    actions = [action for action, is_stored in zip(log.actions, stored, strict=True) if is_stored]
     assert len(actions) == len(joints)
     columns = len(actions[0])
     np.testing.assert_allclose(np.array(actions), joints[:, :columns], atol=tolerance)
-    noted = np.array([waypoint for waypoint, kept in zip(log.active, stored, strict=True) if kept])
+    noted = np.array([waypoint for waypoint, is_stored in zip(log.active, stored, strict=True) if is_stored])
     known = ~np.isnan(waypoints[:, 0])
     # A demonstrator's waypoints continue where a recorder forgets them, between video and execution.
     assert np.isfinite(noted[known]).all()
     np.testing.assert_allclose(noted[known][:, [0, 1, 2, 6]], waypoints[known][:, [0, 1, 2, 6]], atol=1e-4)
-    turn = Rotation.from_euler("xyz", noted[known][:, 3:6]).inv() * Rotation.from_euler("xyz", waypoints[known][:, 3:6])
-    assert turn.magnitude().max() < 1e-4
+    difference = Rotation.from_euler("xyz", noted[known][:, 3:6]).inv() * Rotation.from_euler(
+        "xyz", waypoints[known][:, 3:6]
+    )
+    assert difference.magnitude().max() < 1e-4
 
 
 def test_the_same_scene_is_demonstrated_the_same_way() -> None:
@@ -140,16 +142,16 @@ def test_waypoints_are_announced_before_the_motion() -> None:
     env, log, demonstrator = scene(pick_and_place)
     before = len(log.actions)
     pose = demonstrator.at([-0.1, 0.0, 0.3])
-    seen: list[int] = []
-    demonstrator._on_waypoint = lambda *_: seen.append(len(log.actions))
+    announced: list[int] = []
+    demonstrator._on_waypoint = lambda *_: announced.append(len(log.actions))
     demonstrator.move_to(pose, 1.0)
     demonstrator.move_to(pose)
-    assert seen == [before]
+    assert announced == [before]
     env.close()
 
 
 @pytest.mark.parametrize(("mode", "height"), [("z", 0.06), ("xy", 0.02)])
-def test_a_pick_told_to_fail_fails_once(mode: str, height: float) -> None:
+def test_a_pick_set_to_fail_fails_once(mode: str, height: float) -> None:
     env, log, demonstrator = scene(pick_and_place)
     cube = things(env)["cube"]
     demonstrator.fail_next_pick = mode
@@ -188,7 +190,7 @@ def test_a_container_is_lifted_by_its_handle() -> None:
     assert container.position[2] < 0.07 and env.tcp_pose.p[2] > 0.1
 
 
-def test_a_button_is_pressed_and_let_go() -> None:
+def test_a_button_is_pressed_and_released() -> None:
     env, log, demonstrator = scene(lambda env: env.add(build_button(env, (-0.2, 0.1))))
     button = things(env)["button"]
     demonstrator.hover(button)
@@ -206,7 +208,7 @@ def test_a_button_is_pressed_and_let_go() -> None:
     assert np.allclose(np.array(log.actions)[hovering:, 7], -1)
 
 
-def test_what_is_held_falls_into_the_bin() -> None:
+def test_what_is_grasped_falls_into_the_bin() -> None:
     def fill(env: Scene) -> None:
         env.add(build_cube(env, "cube", "red", (-0.2, 0.1)))
         env.add(build_board(env, (0.05, 0.0), 0.2))
@@ -219,7 +221,7 @@ def test_what_is_held_falls_into_the_bin() -> None:
     assert env.tcp_pose.p[0] == pytest.approx(-0.05, abs=0.01)
 
 
-def test_waiting_takes_whole_gripper_motions() -> None:
+def test_waiting_takes_full_gripper_motions() -> None:
     env, log, demonstrator = scene(lambda _: None)
     demonstrator.hold(20)
     assert len(log.actions) == 24 and all(action[7] == 1 for action in log.actions)
@@ -229,7 +231,7 @@ def test_waiting_takes_whole_gripper_motions() -> None:
     assert env.steps_done == 30
 
 
-def test_a_hard_reset_brings_the_arm_back() -> None:
+def test_a_hard_reset_returns_the_arm() -> None:
     env, log, demonstrator = scene(lambda _: None)
     demonstrator.move_to(demonstrator.at([-0.2, 0.2, 0.2]))
     before = len(log.actions)
@@ -274,7 +276,7 @@ def test_a_cube_is_hooked_to_a_goal_with_a_peg(cube: tuple[float, float], goal: 
 
 @pytest.mark.parametrize("motion", ["insert_peg", "insert_peg_fully"])
 @pytest.mark.parametrize(("held", "side"), [("tail", 1), ("head", 1), ("head", -1)])
-def test_a_peg_is_inserted_from_the_side_that_was_asked_for(held: str, side: int, motion: str) -> None:
+def test_a_peg_is_inserted_from_the_side_that_was_requested(held: str, side: int, motion: str) -> None:
     def fill(env: Scene) -> None:
         env.add(build_aperture_box(env, (0.0, 0.0), np.pi / 2))
         env.add(build_peg(env, "peg", 0.05, 0.01, (1, 0, 0), (0, 1, 0), (-0.15, -0.15 * side), 0.4 * side))
@@ -292,7 +294,7 @@ def test_a_peg_is_inserted_from_the_side_that_was_asked_for(held: str, side: int
     assert np.linalg.norm(free.position - box.position) < 0.05
 
 
-def test_out_of_reach_is_said_before_anything_moves() -> None:
+def test_out_of_reach_is_reported_before_anything_moves() -> None:
     _, log, demonstrator = scene(lambda _: None)
     with pytest.raises(PlanningError, match=r"No way to \[0\.9"):
         demonstrator.move_to(demonstrator.at([0.9, 0.0, 0.3]))

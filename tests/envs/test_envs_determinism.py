@@ -19,16 +19,16 @@ def states(task: str, difficulty: str) -> tuple[np.ndarray, list[str]]:
     """The simulation's state after every fourth step of an arm that sways, and the texts."""
     env = make_task(task, render=False, seed=4, difficulty=difficulty)
     env.reset()
-    seen = [env.get_state().cpu().numpy()]
+    observed = [env.get_state().cpu().numpy()]
     for k in range(STEPS.get(task, 80)):
         action = np.array(env.reset_action, np.float32)
         action[:7] += 0.05 * np.sin(0.1 * k)
         env.step(action)
         if k % LOOK == LOOK - 1:
-            seen.append(env.get_state().cpu().numpy())
+            observed.append(env.get_state().cpu().numpy())
     texts = [*env.goals(), *(subtask.text for subtask in env.progress.subtasks)]
     env.close()
-    return np.stack(seen), texts
+    return np.stack(observed), texts
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
@@ -61,7 +61,7 @@ def test_a_demonstration_takes_as_long_as_the_official_one(
     env.close()
 
 
-def test_the_benchmarks_own_words_ask_for_a_recovery_demonstration() -> None:
+def test_the_benchmarks_words_ask_for_a_recovery_demonstration() -> None:
     words = {"robomme_failure_recovery": True, "robomme_failure_recovery_mode": "xy"}
     env = make_task("PickXtimes", render=False, seed=0, difficulty="easy", **words)
     assert env.recovery == "xy"

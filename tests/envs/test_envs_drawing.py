@@ -41,32 +41,32 @@ def episode(
 
 
 def shown(frames: dict[str, list[Any]], camera: str) -> list[int]:
-    return [k for k, picture in enumerate(frames[f"{camera}_rgb_list"]) if picture is not None]
+    return [k for k, image in enumerate(frames[f"{camera}_rgb_list"]) if image is not None]
 
 
 @pytest.mark.parametrize(("space", "actions"), [("joint_angle", [HOLD] * 4), ("waypoint", [DOWN])])
-def test_frames_are_drawn_where_they_are_asked_for(space: str, actions: list[np.ndarray]) -> None:
-    whole, infos = episode(space, actions, None)
-    count = len(whole["joint_state_list"])
+def test_frames_are_rendered_where_they_are_requested(space: str, actions: list[np.ndarray]) -> None:
+    full, infos = episode(space, actions, None)
+    count = len(full["joint_state_list"])
     # The newest frame of each call: of a motion with a grip at its end the last one, which nobody can count beforehand.
     render_request = RenderRequest({"front": frozenset({2, 3})}, now=("wrist",), grounded=False)
     some, fewer = episode(space, actions, render_request)
-    assert shown(whole, "front") == shown(whole, "wrist") == list(range(count))
+    assert shown(full, "front") == shown(full, "wrist") == list(range(count))
     assert shown(some, "front") == [2, 3]
     assert shown(some, "wrist") == (list(range(count)) if space == "joint_angle" else [0, count - 1])
     for key in ("joint_state_list", "eef_state_list", "gripper_state_list"):
-        assert np.array_equal(whole[key], some[key])
+        assert np.array_equal(full[key], some[key])
     for camera in ("front", "wrist"):
         key = f"{camera}_rgb_list"
-        assert all(np.array_equal(whole[key][k], some[key][k]) for k in shown(some, camera))
+        assert all(np.array_equal(full[key][k], some[key][k]) for k in shown(some, camera))
     assert all("grounded_subgoal_online" not in info for info in fewer)
     assert [info["status"] for info in fewer] == [info["status"] for info in infos]
 
 
-def test_a_text_with_pixels_looks_for_itself() -> None:
-    (_, whole), (frames, blind) = (
+def test_a_text_with_pixels_renders_its_frame() -> None:
+    (_, full), (frames, blind) = (
         episode("joint_angle", [HOLD], render_request) for render_request in (None, RenderRequest(now=()))
     )
     assert shown(frames, "front") == shown(frames, "wrist") == []
-    texts = [info["grounded_subgoal_online"] for info in whole]
+    texts = [info["grounded_subgoal_online"] for info in full]
     assert "<" in texts[0] and texts == [info["grounded_subgoal_online"] for info in blind]

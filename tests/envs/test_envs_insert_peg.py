@@ -100,7 +100,7 @@ def test_the_right_end_up_and_the_other_in_from_the_right_side_is_success(env):
     assert insert(env, env.end, env.side) == (True, False)
 
 
-def test_an_insertion_is_shown_in_red_for_twenty_steps_after_it(env):
+def test_an_insertion_is_displayed_in_red_for_twenty_steps_after_it(env):
     hidden = env._red_disc.position[2]
     env.progress.index = INSERTING
     insert(env, env.end, env.side)
@@ -146,7 +146,7 @@ def test_on_the_way_back_from_the_video_the_pegs_are_where_they_were(env):
 
 
 @pytest.mark.parametrize("seed", [710002, 9000005, 9000014], ids=["beside the box", "flung off", "out of reach"])
-def test_where_the_official_demonstrator_fails_ours_has_another_try(seed: int):
+def test_where_the_official_demonstrator_fails_the_local_one_retries(seed: int):
     env = make(InsertPeg, seed, "easy")
     assert steps_of_demonstration(env) is not None
     env.second_tries = False

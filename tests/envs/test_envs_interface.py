@@ -84,8 +84,8 @@ def test_recorded_joint_actions_succeed_with_the_recorded_texts_and_states(
     for step in execution:
         observation, _, terminated, _, info = env.step(step["action/joint_action"][()])
         for key in ("joint_state", "eef_state", "gripper_state", "wrist_camera_extrinsic"):
-            (ours,) = observation[f"{key}_list"]
-            np.testing.assert_allclose(ours, step[f"obs/{key}"][()], atol=1e-3, err_msg=key)
+            (actual,) = observation[f"{key}_list"]
+            np.testing.assert_allclose(actual, step[f"obs/{key}"][()], atol=1e-3, err_msg=key)
         assert info["simple_subgoal_online"] == step["info/simple_subgoal_online"][()].decode()
         if terminated:
             break
@@ -116,24 +116,24 @@ def test_recorded_actions_of_the_other_spaces_succeed(h5_folder: Path, make_unre
 def test_the_video_comes_first_and_equals_the_recorded_one(h5_folder: Path, make_unrendered: MakeEnv) -> None:
     episode, video, _, _ = official_steps(h5_folder, "VideoUnmask")
     env = make_unrendered("VideoUnmask", "train", episode)
-    seen: list[tuple[str, bool]] = []
-    env.on_frame = lambda frame, info, in_video: seen.append((info["simple_subgoal_online"], in_video))
+    frames: list[tuple[str, bool]] = []
+    env.on_frame = lambda frame, info, in_video: frames.append((info["simple_subgoal_online"], in_video))
     observation, _ = env.reset()
     assert len(observation["joint_state_list"]) == len(video) + 1
-    assert seen[:-1] == [(step["info/simple_subgoal_online"][()].decode(), True) for step in video]
-    assert seen[-1][1] is False
-    for ours, step in zip(observation["joint_state_list"], video, strict=False):
-        np.testing.assert_allclose(ours, step["obs/joint_state"][()], atol=1e-5)
+    assert frames[:-1] == [(step["info/simple_subgoal_online"][()].decode(), True) for step in video]
+    assert frames[-1][1] is False
+    for actual, step in zip(observation["joint_state_list"], video, strict=False):
+        np.testing.assert_allclose(actual, step["obs/joint_state"][()], atol=1e-5)
 
 
 def test_the_stick_s_video_leaves_out_what_is_not_recorded(make_unrendered: MakeEnv) -> None:
     env = make_unrendered("PatternLock", "train", 8)
-    seen: list[str] = []
-    env.on_frame = lambda frame, info, in_video: seen.append(info["simple_subgoal_online"])
+    texts: list[str] = []
+    env.on_frame = lambda frame, info, in_video: texts.append(info["simple_subgoal_online"])
     observation, info = env.reset()
-    assert len(seen) == len(observation["joint_state_list"])
-    assert "NO RECORD" not in seen
-    assert env.task.steps_done > len(seen)
+    assert len(texts) == len(observation["joint_state_list"])
+    assert "NO RECORD" not in texts
+    assert env.task.steps_done > len(texts)
     np.testing.assert_allclose(observation["joint_state_list"][-1], env.task.stored_qpos, atol=0.01)
     assert info["simple_subgoal_online"].startswith("move ")
 
@@ -163,7 +163,7 @@ def test_a_step_gives_lists_of_one_frame_and_the_official_info(make_unrendered: 
     assert info["grounded_subgoal_online"] == info["simple_subgoal_online"]
 
 
-def test_multi_choice_brings_what_is_needed_to_choose(make_unrendered: MakeEnv) -> None:
+def test_multi_choice_provides_what_is_needed_to_choose(make_unrendered: MakeEnv) -> None:
     env = make_unrendered("PickXtimes", "train", 8, "multi_choice", include_front_camera_extrinsic=False)
     observation, info = env.reset()
     assert "front_camera_extrinsic_list" in observation
@@ -197,10 +197,10 @@ def test_a_malformed_action_is_an_error_status(make_unrendered: MakeEnv, action:
 
 
 def test_an_unreachable_pose_is_an_error_status(make_unrendered: MakeEnv) -> None:
-    far = [3.0, 0.0, 0.5, np.pi, 0.0, 0.0, 1.0]
+    unreachable = [3.0, 0.0, 0.5, np.pi, 0.0, 0.0, 1.0]
     env = make_unrendered("PickXtimes", "train", 8, "ee_pose")
     env.reset()
-    observation, _, terminated, _, info = env.step(far)
+    observation, _, terminated, _, info = env.step(unreachable)
     assert (observation, terminated, info["status"]) == ({}, True, "error")
     assert "IK failed" in info["error_message"]
 
@@ -328,10 +328,12 @@ class _Builder:
     def make_env_for_episode(self, episode: int, max_steps: int | None = None, **include: bool) -> Any:
         type(self).made |= {"episode": episode, "limit": max_steps, **include}
         frame = np.zeros((256, 256, 3), np.uint8)
-        seen = {"front_rgb_list": [frame, frame + 1]}
-        outcome = (seen, 0.0, False, False, {"task_goal": "press the button", "status": "ongoing"})
+        observation_ = {"front_rgb_list": [frame, frame + 1]}
+        outcome = (observation_, 0.0, False, False, {"task_goal": "press the button", "status": "ongoing"})
         return SimpleNamespace(
-            reset=lambda: (seen, {"task_goal": ["press the button"]}), step=lambda action: outcome, close=lambda: None
+            reset=lambda: (observation_, {"task_goal": ["press the button"]}),
+            step=lambda action: outcome,
+            close=lambda: None,
         )
 
 
@@ -367,7 +369,7 @@ def test_the_official_package_comes_through_the_same_interface(monkeypatch: pyte
 # Parts ------------------------------------------------------------------------------------------------------------
 
 
-def test_angles_go_on_past_half_a_turn() -> None:
+def test_angles_exceed_half_a_rotation() -> None:
     from scipy.spatial.transform import Rotation
 
     track = AngleTrack()
@@ -392,18 +394,18 @@ class _Thing:
         self.segmentation_ids = list(ids)
 
 
-def test_a_text_is_grounded_when_its_objects_are_seen_and_then_kept() -> None:
-    picture = np.zeros((256, 256), np.int16)
-    picture[10:13, 20:24] = 5
-    assert centroid(picture, [5]) == (11, 21)
-    assert centroid(picture, [6]) is None
-    assert ground("at <> to <>", [_Thing(5), _Thing(6)], picture) is None  # type: ignore[list-item]
-    assert ground("at <>", [_Thing(5), _Thing(6)], picture) == "at <11, 21>"  # type: ignore[list-item]
+def test_a_text_is_grounded_once_its_objects_are_visible() -> None:
+    segmentation = np.zeros((256, 256), np.int16)
+    segmentation[10:13, 20:24] = 5
+    assert centroid(segmentation, [5]) == (11, 21)
+    assert centroid(segmentation, [6]) is None
+    assert ground("at <> to <>", [_Thing(5), _Thing(6)], segmentation) is None  # type: ignore[list-item]
+    assert ground("at <>", [_Thing(5), _Thing(6)], segmentation) == "at <11, 21>"  # type: ignore[list-item]
     with pytest.raises(ValueError, match="2 places for 1"):
-        ground("at <> to <>", [_Thing(5)], picture)  # type: ignore[list-item]
+        ground("at <> to <>", [_Thing(5)], segmentation)  # type: ignore[list-item]
     subtask: Any = SimpleNamespace(text="pick", grounded_text="pick at <>", targets=[_Thing(5)])
-    empty = np.zeros_like(picture)
+    empty = np.zeros_like(segmentation)
     retrying, once = Grounding(), Grounding(retry=False)
-    texts = [retrying.update(subtask, lambda p=p: p) for p in (empty, picture, empty)]
+    texts = [retrying.update(subtask, lambda p=p: p) for p in (empty, segmentation, empty)]
     assert texts == ["pick", "pick at <11, 21>", "pick at <11, 21>"]
-    assert [once.update(subtask, lambda p=p: p) for p in (empty, picture)] == ["pick", "pick"]
+    assert [once.update(subtask, lambda p=p: p) for p in (empty, segmentation)] == ["pick", "pick"]

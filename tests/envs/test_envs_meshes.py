@@ -29,7 +29,7 @@ def test_a_coarse_mesh_is_left_as_it_is_and_a_fine_one_loses_what_lies_in_one_ce
     assert len(coarsen(tiny, 0.4)) == 0
 
 
-def test_triangles_that_become_one_are_kept_once_for_each_side() -> None:
+def test_duplicate_triangles_remain_once_for_each_side() -> None:
     nearly = SQUARE[:1] + np.float32(0.01)
     turned = np.roll(SQUARE[:1], 1, axis=1)
     back = SQUARE[:1, ::-1]
@@ -37,7 +37,7 @@ def test_triangles_that_become_one_are_kept_once_for_each_side() -> None:
     assert len(coarsen(np.concatenate([SQUARE[:1], back]), 0.4)) == 2
 
 
-def test_a_mesh_file_is_read_as_written(tmp_path: Path) -> None:
+def test_a_mesh_file_is_read_as_saved(tmp_path: Path) -> None:
     path = tmp_path / "square.stl"
     path.write_bytes(stl_bytes(SQUARE))
     np.testing.assert_array_equal(read_stl(path), SQUARE)
@@ -54,17 +54,17 @@ def test_the_cameras_body_keeps_its_size_and_a_twentieth_of_its_triangles() -> N
         np.testing.assert_allclose(extreme(coarse, (0, 1)), extreme(stock, (0, 1)), atol=CELL)
 
 
-def test_pictures_are_equal_and_where_the_body_shows_all_but_equal(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_images_are_equal_and_where_the_body_shows_all_but_equal(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    coarse, shown = pictures()
+    coarse, n_visible = pictures()
     monkeypatch.setattr(robots, "_CAMERA_MESH", "none")
     robots.description.cache_clear()
     stock, _ = pictures()
     robots.description.cache_clear()
-    assert shown > 100, "the body was not seen at all"
+    assert n_visible > 100, "the body was not seen at all"
     np.testing.assert_array_equal(coarse[0], stock[0])
     assert np.abs(coarse[1].astype(int) - stock[1]).mean() < 0.01
 
@@ -75,11 +75,11 @@ def pictures() -> tuple[np.ndarray, int]:
     env.reset()
     task = env.task
     body = task.agent.robot.links_map["camera_link"]._objs[0].entity.per_scene_id
-    seen = []
+    images = []
     for qpos in (task.qpos, SHOWN_FROM_THE_FRONT):
         task.agent.robot.set_qpos(qpos[None])
         frame = env._observer.frame({})
-        seen.append(np.stack([frame["front_rgb"], frame["wrist_rgb"]]))
-    shown = int((env._observer.segmentation() == body).sum())
+        images.append(np.stack([frame["front_rgb"], frame["wrist_rgb"]]))
+    n_pixels = int((env._observer.segmentation() == body).sum())
     env.close()
-    return np.stack(seen), shown
+    return np.stack(images), n_pixels

@@ -50,8 +50,8 @@ def test_where_the_official_demonstrator_failed_the_seed_is_the_benchmarks(
 
 @pytest.mark.parametrize(("split", "counts"), [("train", (50, 25, 25)), ("val", (26, 12, 12)), ("test", (26, 12, 12))])
 def test_difficulties_are_distributed_as_the_benchmark_says(split: str, counts: tuple[int, int, int]) -> None:
-    found = Counter(spec.difficulty for spec in episodes("MoveCube", split))
-    assert (found["easy"], found["medium"], found["hard"]) == counts
+    n_by_difficulty = Counter(spec.difficulty for spec in episodes("MoveCube", split))
+    assert (n_by_difficulty["easy"], n_by_difficulty["medium"], n_by_difficulty["hard"]) == counts
 
 
 def test_the_first_six_train_episodes_are_recovery_demonstrations() -> None:
@@ -72,7 +72,7 @@ def test_the_shipped_table_is_the_published_one(shared: Path, split: str) -> Non
         assert episode(row["task"], split, index) == expected
 
 
-def test_given_official_episodes_agree_with_the_table(h5_folder: Path) -> None:
+def test_official_episodes_match_the_table(h5_folder: Path) -> None:
     h5py = pytest.importorskip("h5py")
     compared = 0
     for path in h5_folder.glob("record_dataset_*.h5"):

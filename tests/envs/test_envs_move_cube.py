@@ -39,17 +39,17 @@ def begin(env: MoveCube, monkeypatch: pytest.MonkeyPatch, text: str) -> list[Thi
     """Go to a sub-task of the execution with nothing in the hand; what is put into the list is held."""
     steps = env.progress.subtasks
     env.progress.index = next(i for i, step in enumerate(steps) if step.text == text and not step.video)
-    held: list[Thing] = []
-    monkeypatch.setattr(env, "is_grasping", lambda thing: thing in held)
-    return held
+    in_hand: list[Thing] = []
+    monkeypatch.setattr(env, "is_grasping", lambda thing: thing in in_hand)
+    return in_hand
 
 
 def put(thing: Thing, place: np.ndarray, aside: float = 0.0, z: float = H) -> None:
     thing.move_to(sapien.Pose([place[0] + aside, place[1], z], thing.pose.q))
 
 
-def lift(env: MoveCube, held: list[Thing], thing: Thing, parts: list[Thing]) -> tuple[bool, bool]:
-    held += parts
+def lift(env: MoveCube, in_hand: list[Thing], thing: Thing, parts: list[Thing]) -> tuple[bool, bool]:
+    in_hand += parts
     put(thing, thing.position, z=0.2)
     return wait(env)
 
@@ -79,17 +79,17 @@ def test_video_and_execution_come_from_the_stream_in_order(seed, difficulty):
     stream.uniform(), stream.uniform()
     pegs = [read_peg(stream) for _ in range(2)]
     stream.integer(0, 2), stream.integer(0, 2)
-    shown = (env.peg.initial_pose, env.target.initial_pose, env.cube.initial_pose)
+    poses = (env.peg.initial_pose, env.target.initial_pose, env.cube.initial_pose)
     env.reset_in_progress = True
     wait(env)
     env.reset_in_progress = False
-    assert peg_of(shown[0]) == pytest.approx(pegs[0], abs=1e-5)
+    assert peg_of(poses[0]) == pytest.approx(pegs[0], abs=1e-5)
     assert peg_of(env.peg.pose) == pytest.approx(pegs[1], abs=1e-5)
     read_disc(stream, Region((0, 0), 0.15), env.target)
     env.target.set_home(env.target.pose)
     read_disc(stream, Region((0, 0), 0.1), env.target)
-    read_cube(stream, skip_centre(stream, shown[1].p), env.cube)
-    assert distance_xy(shown[2].p, shown[1].p) > 0.1 - 0.03 * np.sqrt(2)
+    read_cube(stream, skip_centre(stream, poses[1].p), env.cube)
+    assert distance_xy(poses[2].p, poses[1].p) > 0.1 - 0.03 * np.sqrt(2)
     env.cube.set_home(env.cube.pose)
     read_cube(stream, skip_centre(stream, env.target.position), env.cube)
     stream.integer(0, 3)  # the first initialisation's
@@ -118,8 +118,8 @@ def test_the_execution_says_what_the_video_says(tasks, seed, expected):
 
 def test_hooking_the_cube_onto_the_target_and_letting_go_is_success(tasks, monkeypatch):
     env = tasks(HOOK)
-    held = begin(env, monkeypatch, PICK_PEG)
-    assert lift(env, held, env.peg, [env.peg.tail]) == (False, False) and env.progress.index == 5
+    in_hand = begin(env, monkeypatch, PICK_PEG)
+    assert lift(env, in_hand, env.peg, [env.peg.tail]) == (False, False) and env.progress.index == 5
     put(env.cube, env.target.position, aside=0.055)
     assert wait(env) == (False, False)
     put(env.cube, env.target.position, aside=0.04)
@@ -140,11 +140,11 @@ def test_pushing_counts_once_the_gripper_opens(tasks, monkeypatch):
 
 def test_grasping_and_placing_is_success(tasks, monkeypatch):
     env = tasks(GRASP)
-    held = begin(env, monkeypatch, PICK_CUBE)
-    assert lift(env, held, env.cube, [env.cube]) == (False, False) and env.progress.index == 5
+    in_hand = begin(env, monkeypatch, PICK_CUBE)
+    assert lift(env, in_hand, env.cube, [env.cube]) == (False, False) and env.progress.index == 5
     put(env.cube, env.target.position, aside=0.04)
     assert wait(env) == (False, False)  # still in the hand
-    held.clear()
+    in_hand.clear()
     assert wait(env) == (True, False)
 
 
@@ -154,9 +154,9 @@ def test_grasping_and_placing_is_success(tasks, monkeypatch):
 )
 def test_another_thing_in_the_hand_fails(tasks, monkeypatch, seed, text, wrong):
     env = tasks(seed)
-    held = begin(env, monkeypatch, text)
+    in_hand = begin(env, monkeypatch, text)
     thing = getattr(env, wrong)
-    assert lift(env, held, thing, [thing] if wrong == "cube" else [env.peg.head]) == (False, True)
+    assert lift(env, in_hand, thing, [thing] if wrong == "cube" else [env.peg.head]) == (False, True)
 
 
 @pytest.mark.parametrize(("seed", "text"), [(HOOK, PICK_PEG), (GRASP, PICK_CUBE)])
@@ -170,8 +170,8 @@ def test_the_cube_on_the_target_too_early_fails(tasks, monkeypatch, seed, text):
 @pytest.mark.parametrize(("seed", "text", "thing"), [(HOOK, HOOK_CUBE, "cube"), (GRASP, PLACE_CUBE, "peg")])
 def test_in_the_last_stage_nothing_fails(tasks, monkeypatch, seed, text, thing):
     env = tasks(seed)
-    held = begin(env, monkeypatch, text)
-    assert lift(env, held, getattr(env, thing), [env.cube, env.peg.head]) == (False, False)
+    in_hand = begin(env, monkeypatch, text)
+    assert lift(env, in_hand, getattr(env, thing), [env.cube, env.peg.head]) == (False, False)
 
 
 @pytest.mark.parametrize("seed", [HOOK, PUSH])

@@ -101,7 +101,7 @@ def test_staying_over_a_disc_or_returning_to_it_counts_once(lock, tip):
     assert flags == (True, False) and lock.visited == lock.path
 
 
-def test_a_visited_disc_is_marked_for_40_steps_after_the_visit(lock, tip):
+def test_a_reached_disc_is_highlighted_for_40_steps_after_the_stay(lock, tip):
     disc = lock.path[0]
     mark = lock._marks[lock.discs.index(disc)]
     tip.put(disc)
@@ -137,4 +137,4 @@ def test_a_direction_means_the_neighbour_on_that_side(lock, tip, here):
         row, column = np.add(divmod(here, 5), DIRECTIONS[word])
         ear = Ear()
         option.run(ear, None)
-        assert ear.asked == ([(lock.discs[5 * row + column],)] if 0 <= row < 5 and 0 <= column < 5 else [])
+        assert ear.calls == ([(lock.discs[5 * row + column],)] if 0 <= row < 5 and 0 <= column < 5 else [])

@@ -46,7 +46,7 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, cubes, goal
 def test_highlights_lie_under_the_goal_cubes_from_step_10_to_step_100(two):
     two.reset()
 
-    def shown() -> bool:
+    def is_highlighted() -> bool:
         discs = [disc.position for disc in two._discs]
         if all(place[2] < -5 for place in discs):
             return False
@@ -54,11 +54,11 @@ def test_highlights_lie_under_the_goal_cubes_from_step_10_to_step_100(two):
             assert place == pytest.approx(cube.position - [0, 0, 0.01], abs=1e-3)
         return True
 
-    seen = []
+    highlighted = []
     for _ in range(110):
         wait(two)
-        seen.append(shown())
-    assert seen == [10 <= k <= 100 for k in range(110)]  # k steps were done before
+        highlighted.append(is_highlighted())
+    assert highlighted == [10 <= k <= 100 for k in range(110)]  # k steps were done before
 
 
 def test_the_button_and_then_every_goal_cube_are_success(two, hand):
@@ -95,7 +95,7 @@ def test_another_cube_in_the_hand_fails_once_the_button_was_pressed(two, hand):
     assert wait(two) == (False, True)
 
 
-def test_another_cube_still_held_when_the_button_is_pressed_fails(two, hand):
+def test_another_cube_still_grasped_when_the_button_is_pressed_fails(two, hand):
     other = next(cube for cube in two.cubes if cube not in two.goal_cubes)
     hand.carry(other)
     assert push_down(two, two.button) == (False, False)

@@ -50,7 +50,7 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, cubes, coun
     env.close()
 
 
-def test_as_many_picks_and_places_as_asked_then_the_button_are_success(twice, hand):
+def test_as_many_picks_and_places_as_requested_then_the_button_are_success(twice, hand):
     assert twice.repetitions == 2
     for i in range(2):
         assert hand.carry(twice.cube) == (False, False) and twice.progress.index == 2 * i + 1
@@ -59,12 +59,12 @@ def test_as_many_picks_and_places_as_asked_then_the_button_are_success(twice, ha
     assert wait(twice) == (True, False)
 
 
-def test_held_low_is_not_picked_up(twice, hand):
+def test_grasped_low_is_not_picked_up(twice, hand):
     hand.carry(twice.cube, z=0.04)
     assert twice.progress.index == 0
 
 
-def test_beside_the_target_or_still_held_is_not_placed(twice, hand):
+def test_beside_the_target_or_still_grasped_is_not_placed(twice, hand):
     hand.carry(twice.cube)
     hand.carry(twice.cube, over=twice.target, z=0.03)
     assert twice.progress.index == 1
@@ -95,7 +95,7 @@ def test_the_button_before_its_time_fails(twice, hand, stage):
     assert wait(twice) == (False, True)
 
 
-def test_once_more_than_asked_fails(twice, hand):
+def test_once_more_than_requested_fails(twice, hand):
     for _ in range(2):
         hand.carry(twice.cube)
         hand.release(twice.target.position)

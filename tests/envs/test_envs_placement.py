@@ -93,7 +93,7 @@ def test_a_cubes_full_square_is_turned_with_it(scene):
         assert np.sin(2 * (angles - 0.5 * i)) == pytest.approx(np.zeros(len(angles)), abs=1e-5)
 
 
-def test_buttons_and_boards_have_obstacles_of_their_own(scene):
+def test_buttons_and_boards_have_separate_obstacles(scene):
     button = button_box(named(scene, "button"))
     assert button.half == pytest.approx([0.05625, 0.05625]) and button.centre == pytest.approx([-0.2, 0.1])
     strips = board_boxes(named(scene, "board"))
@@ -109,13 +109,13 @@ def test_what_cannot_be_touched_is_no_obstacle(scene):
 
 @pytest.mark.parametrize("seed", [0, 1800])
 def test_a_cube_takes_three_draws_a_trial_and_keeps_inside(seed):
-    x, y, turn = stream(seed, 3)
+    x, y, share = stream(seed, 3)
     xy, yaw = draw_cube(Draws(seed), REGION)
     assert xy == pytest.approx([-0.3 + H + x * 0.36, -0.2 + H + y * 0.36], abs=1e-12)
-    assert yaw == 2 * np.pi * turn
+    assert yaw == 2 * np.pi * share
 
 
-def test_a_rejected_cube_is_drawn_again_from_the_following_numbers():
+def test_a_rejected_cube_is_sampled_again_from_the_following_numbers():
     left = Box2D.aligned((-0.2, 0), (0.1, 1))
     trials = [stream(0, 30)[i : i + 3] for i in range(0, 30, 3)]
     squares = [Box2D.square(np.array([-0.28 + 0.36 * u, -0.18 + 0.36 * v]), 0.03, 2 * np.pi * w) for u, v, w in trials]
@@ -134,7 +134,7 @@ def test_a_rejected_cube_is_drawn_again_from_the_following_numbers():
         (lambda draws: draw_container(draws, REGION, [EVERYWHERE]), 2),
     ],
 )
-def test_without_room_the_draws_of_every_trial_are_used_up(draw, per_trial):
+def test_without_free_space_the_draws_of_every_trial_are_used_up(draw, per_trial):
     draws = Draws(7)
     assert draw(draws) is None
     assert draws.uniform() == stream(7, TRIALS * per_trial + 1)[-1]
@@ -158,11 +158,11 @@ def test_a_container_counts_the_gap_twice_for_objects_but_once_for_ready_made_bo
     assert CONTAINER_HALF + 0.04 <= min(box.distance(xy) for xy in from_box) < CONTAINER_HALF + 0.045
 
 
-def test_a_containers_turn_is_drawn_after_its_place():
-    x, y, turn = stream(9, 3)
+def test_a_containers_yaw_is_sampled_after_its_place():
+    x, y, share = stream(9, 3)
     xy, yaw = draw_container(Draws(9), Region((0, 0), 0.2))
     assert xy == pytest.approx([-0.1725 + x * 0.345, -0.1725 + y * 0.345])
-    assert yaw == pytest.approx(turn * np.pi / 2)
+    assert yaw == pytest.approx(share * np.pi / 2)
 
 
 def test_a_buttons_offset_is_one_draw_of_two_numbers():

@@ -117,11 +117,11 @@ def test_plans_keep_the_limits_and_end_at_the_target(arms: dict[bool, Arm]) -> N
         assert 0.7 < np.abs(np.diff(speed, axis=0) / spacing).max() < 0.95
 
 
-def test_there_is_no_screw_for_half_a_turn_or_out_of_reach(arms: dict[bool, Arm]) -> None:
+def test_there_is_no_screw_for_half_a_rotation_or_out_of_reach(arms: dict[bool, Arm]) -> None:
     arm, start = arms[False], RESET_QPOS.astype(np.float64)
     here = arm.forward(start)
-    half_turn = sapien.Pose(here.p, [0, 0, 1, 0])
-    assert plan_screw(arm, start, half_turn) is None
+    half_rotation = sapien.Pose(here.p, [0, 0, 1, 0])
+    assert plan_screw(arm, start, half_rotation) is None
     assert plan_screw(arm, start, sapien.Pose([0.5, 0, 0.3], here.q)) is None
 
 

@@ -55,7 +55,7 @@ def test_a_recorded_episode_reads_as_an_official_one(recorded: Path) -> None:
     assert {path.suffix for path in (recorded / "previews").iterdir()} == {".png", ".mp4"}
 
 
-def test_the_command_writes_both_layouts_and_only_what_is_missing(
+def test_the_command_saves_both_layouts_and_only_what_is_missing(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "dataset"
@@ -106,7 +106,7 @@ def test_what_cannot_be_recorded_is_refused_by_name(words: list[str], message: s
 
 
 @pytest.mark.parametrize(("task", "difficulty"), ONE_OF_EACH_SUITE.items())
-def test_an_episode_of_each_suite_is_drawn_to_its_success(task: str, difficulty: str) -> None:
+def test_an_episode_of_each_suite_is_rendered_to_its_success(task: str, difficulty: str) -> None:
     env = make_task(task, render=True, seed=3, difficulty=difficulty)
     snapshots, success = show.demonstrate_with_images(env, every=40)
     env.close()

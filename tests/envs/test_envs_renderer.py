@@ -26,17 +26,17 @@ def first_pictures(episode: int) -> np.ndarray:
     return np.stack([observation[f"{view}_rgb_list"][-1] for view in ("front", "wrist")])
 
 
-def test_later_episodes_find_the_renderer_of_the_first_and_an_episode_looks_the_same_again() -> None:
+def test_later_episodes_find_the_renderer_of_the_first_and_an_episode_renders_the_same_again() -> None:
     first = first_pictures(0)
-    kept = dict(rendering._systems)
-    assert kept, "the renderer went with the scene"
+    cached = dict(rendering._systems)
+    assert cached, "the renderer went with the scene"
     other = first_pictures(1)
-    assert rendering._systems == kept
+    assert rendering._systems == cached
     assert not np.array_equal(first, other)
     assert np.array_equal(first, first_pictures(0))
 
 
-def test_a_renderer_that_cannot_take_pictures_any_more_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_renderer_that_takes_no_more_images_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     first_pictures(0)
     assert renderer_works()
 

@@ -38,8 +38,8 @@ def test_the_first_frame_and_its_grounded_text_are_the_official_ones(h5_folder: 
     env.close()
     assert info["grounded_subgoal_online"] == text
     for key, expected in official.items():
-        (ours,) = observation[f"{key}_list"]
-        assert (ours.dtype, ours.shape) == (expected.dtype, expected.shape), key
-        difference = float(np.abs(ours.astype(float) - expected).mean())
+        (actual,) = observation[f"{key}_list"]
+        assert (actual.dtype, actual.shape) == (expected.dtype, expected.shape), key
+        difference = float(np.abs(actual.astype(float) - expected).mean())
         assert difference < 1, f"{key}: mean absolute difference {difference}"
     np.testing.assert_array_equal(rendered, observation["front_rgb_list"][-1])

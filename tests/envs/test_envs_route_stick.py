@@ -35,7 +35,7 @@ def tip(stick: RouteStick, monkeypatch: pytest.MonkeyPatch) -> Tip:
 
 def follow(env: RouteStick, tip: Tip) -> list[Flags]:
     """Do every move as it is to be done."""
-    return [circle(tip, *leg, turn) for leg, turn in zip(pairwise(env.route), env.directions, strict=True)]
+    return [circle(tip, *leg, direction) for leg, direction in zip(pairwise(env.route), env.directions, strict=True)]
 
 
 def watch(env: RouteStick, tip: Tip) -> None:
@@ -55,11 +55,11 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, monkeypatch
     env = make(RouteStick, seed, difficulty)
     stream = Draws(seed)
     turn = Rotation.from_euler("z", -30 + 60 * stream.uniform(), degrees=True)
-    shown, hidden, blocks = (
+    visible, hidden, blocks = (
         turn.apply([(-0.1, 0.07 * i, z) for i in range(first, 5, 2)])
         for first, z in ((-4, 0.01), (-3, -0.01), (-3, 0.05))
     )
-    np.testing.assert_allclose([disc.position for disc in env.discs], shown, atol=1e-6)
+    np.testing.assert_allclose([disc.position for disc in env.discs], visible, atol=1e-6)
     np.testing.assert_allclose([disc.position for disc in env.all_discs[1::2]], hidden, atol=1e-6)
     obstacles = [thing for thing in env.things if thing.name.startswith("obstacle")]
     np.testing.assert_allclose([thing.position for thing in obstacles], blocks, atol=1e-6)
@@ -74,17 +74,17 @@ def test_everything_comes_from_the_stream_in_order(seed, difficulty, monkeypatch
 
 
 @pytest.mark.parametrize("difficulty", ["easy", "medium", "hard"])
-def test_routes_go_to_neighbours_and_turn_back_only_where_they_may(stick, monkeypatch, difficulty):
+def test_routes_go_to_neighbours_and_may_return_only_where_they_may(stick, monkeypatch, difficulty):
     for name in ("difficulty", "route", "directions"):
         monkeypatch.setattr(stick, name, difficulty)
-    counts, returns, (moves, turn_back) = set(), 0, MOVES[difficulty]
+    counts, returns, (moves, may_return) = set(), 0, MOVES[difficulty]
     for seed in range(100):
         stick._draw_route(Draws(seed))
         route = [stick.discs.index(disc) for disc in stick.route]
-        assert (route, stick.directions) == read_route(Draws(seed), moves, turn_back)
+        assert (route, stick.directions) == read_route(Draws(seed), moves, may_return)
         returns += sum(a == c and 0 < b < 4 for a, b, c in zip(route, route[1:], route[2:], strict=False))
         counts.add(len(stick.directions))
-    assert counts == set(range(moves[0], moves[1] + 1)) and (returns > 0) == turn_back
+    assert counts == set(range(moves[0], moves[1] + 1)) and (returns > 0) == may_return
 
 
 def test_the_same_route_again_is_success(stick, tip):
@@ -110,12 +110,12 @@ def test_a_target_is_reached_within_three_centimetres_and_below_fifteen(stick, t
 def test_the_wrong_way_around_fails_at_the_target_and_stays_failed(stick, tip, stage, move):
     watch(stick, tip) if stage == "execution" else tip.put(stick.route[0])
     legs = list(zip(pairwise(stick.route), stick.directions, strict=True))
-    for leg, turn in legs[:move]:
-        assert circle(tip, *leg, turn) == (False, False)
-    (start, goal), turn = legs[move]
-    assert [tip.put(point) for point in arc(start.position, goal.position, OTHER[turn])[:30]][-1] == (False, False)
+    for leg, direction in legs[:move]:
+        assert circle(tip, *leg, direction) == (False, False)
+    (start, goal), direction = legs[move]
+    assert [tip.put(point) for point in arc(start.position, goal.position, OTHER[direction])[:30]][-1] == (False, False)
     assert tip.put(goal) == (False, True)
-    assert circle(tip, start, goal, turn) == (False, True)
+    assert circle(tip, start, goal, direction) == (False, True)
 
 
 def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(stick, monkeypatch):
@@ -127,7 +127,7 @@ def test_every_disc_not_due_fails_even_one_hidden_under_an_obstacle(stick, monke
         assert tip.put(place, z=0.099, aside=(0.009, 0)) == tip.put((0.4, 0.4)) == (False, True)
 
 
-def test_a_target_is_marked_for_40_steps_after_the_tip_was_near(stick, tip):
+def test_a_target_is_highlighted_for_40_steps_after_the_tip_was_near(stick, tip):
     disc, mark = stick.route[0], stick._marks[stick.discs.index(stick.route[0])]
     tip.put(disc, aside=(0.029, 0))
     wait(stick)
@@ -139,7 +139,7 @@ def test_a_target_is_marked_for_40_steps_after_the_tip_was_near(stick, tip):
 
 
 def test_texts_goals_and_choices(stick, tip):
-    order = [(side, turn) for turn in ("clockwise", "counterclockwise") for side in ("left", "right")]
+    order = [(side, direction) for direction in ("clockwise", "counterclockwise") for side in ("left", "right")]
     sides = ["left" if b.position[1] > a.position[1] else "right" for a, b in pairwise(stick.route)]
     kinds = list(zip(sides, stick.directions, strict=True))
     moves = [(say(*kind), say(*kind), "abcd"[order.index(kind)]) for kind in kinds]
@@ -152,7 +152,7 @@ def test_texts_goals_and_choices(stick, tip):
     ]
     for here in range(5):
         tip.put(stick.discs[here], aside=(0.02, 0.02))
-        for option, (side, turn) in zip(stick.choices(), order, strict=True):
+        for option, (side, direction) in zip(stick.choices(), order, strict=True):
             ear, there = Ear(), here + (1 if side == "left" else -1)
             option.run(ear, None)
-            assert ear.asked == ([(stick.discs[there], turn)] if 0 <= there < 5 else [])
+            assert ear.calls == ([(stick.discs[there], direction)] if 0 <= there < 5 else [])

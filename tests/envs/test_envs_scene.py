@@ -52,22 +52,22 @@ def play(env, actions: np.ndarray) -> tuple[np.ndarray, list[bool]]:
     return np.array(joints), success
 
 
-def test_every_object_has_pixels_of_its_own(everything):
+def test_every_object_has_separate_pixels(everything):
     ids = [i for thing in everything.things for i in thing.segmentation_ids]
     assert len(ids) == len(set(ids)) == len(everything.things) + 1  # the peg has two parts
 
 
-def test_objects_rest_where_they_were_put(everything):
+def test_objects_stay_where_they_were_put(everything):
     everything.reset()
     play(everything, np.tile(everything.reset_action, (40, 1)))
-    moved = {t.name: np.abs(t.position - t.initial_pose.p) for t in everything.things}
+    distances = {t.name: np.abs(t.position - t.initial_pose.p) for t in everything.things}
     # A peg is put down half sunk in the table, a container a little too low over its cube.
     settles = {"peg": 0.0101, "container": 0.0015, "button": 0.0075}
-    assert {name: d.max() for name, d in moved.items() if d.max() > settles.get(name, 1e-4)} == {}
-    assert moved["peg"][2] == pytest.approx(0.01, abs=1e-4)
+    assert {name: d.max() for name, d in distances.items() if d.max() > settles.get(name, 1e-4)} == {}
+    assert distances["peg"][2] == pytest.approx(0.01, abs=1e-4)
 
 
-def test_a_reset_brings_everything_back(everything):
+def test_a_reset_restores_everything(everything):
     for thing in everything.things:
         thing.move_away()
     everything.things[0].entity.set_linear_velocity(np.ones((1, 3), np.float32))
@@ -115,14 +115,14 @@ def test_scenes_can_be_built_without_a_vulkan_driver(tmp_path):
     assert result.stdout.strip().endswith("built"), result.stderr
 
 
-def test_a_derived_robot_description_is_written_once(tmp_path, monkeypatch):
+def test_a_derived_robot_description_is_saved_once(tmp_path, monkeypatch):
     from mani_skill.agents.robots.panda.panda_stick import PandaStick
 
     monkeypatch.setenv("MME_VLA_CACHE", str(tmp_path))
     first = Path(description.__wrapped__(PandaStick.urdf_path, visible=False))
-    written = first.stat().st_mtime_ns
+    modified = first.stat().st_mtime_ns
     assert description.__wrapped__(PandaStick.urdf_path, visible=False) == str(first)
-    assert first.stat().st_mtime_ns == written
+    assert first.stat().st_mtime_ns == modified
     assert "<visual" not in first.read_text() and len(list(tmp_path.rglob("*.*rdf"))) == 2
 
 
@@ -181,26 +181,26 @@ def test_the_stick_robot_moves_as_recorded(h5_folder):
     env.close()
 
 
-def test_the_first_pictures_are_the_recorded_ones(h5_folder):
+def test_the_first_images_are_the_recorded_ones(h5_folder):
     try:
         backend = render_backend()
     except UserError as error:
         pytest.skip(str(error))
     env = PickXtimes(obs_mode="rgb+depth+segmentation", render_backend=backend, seed=1800, difficulty="easy")
-    seen = env.step(recorded(h5_folder, *PICK, "action/joint_action")[0].astype(np.float32))[0]["sensor_data"]
+    sensors = env.step(recorded(h5_folder, *PICK, "action/joint_action")[0].astype(np.float32))[0]["sensor_data"]
     for camera, name in (("base_camera", "front"), ("hand_camera", "wrist")):
-        picture, depth = (seen[camera][key][0].numpy().astype(int) for key in ("rgb", "depth"))
+        image, depth = (sensors[camera][key][0].numpy().astype(int) for key in ("rgb", "depth"))
         # Equal with the renderer of the recording; drivers differ a little in shading.
-        assert np.abs(picture - recorded(h5_folder, *PICK, f"obs/{name}_rgb")[0]).mean() < 2
+        assert np.abs(image - recorded(h5_folder, *PICK, f"obs/{name}_rgb")[0]).mean() < 2
         assert np.abs(depth - recorded(h5_folder, *PICK, f"obs/{name}_depth")[0]).mean() < 0.5
-    pixels = seen["base_camera"]["segmentation"][0, ..., 0].numpy()
+    pixels = sensors["base_camera"]["segmentation"][0, ..., 0].numpy()
     assert centroid(pixels, env.cube.segmentation_ids) == (53, 144)
     assert centroid(pixels, env.target.segmentation_ids) == (92, 108)
     assert centroid(pixels, env.button.segmentation_ids) == (63, 100)
     env.close()
 
 
-def test_what_waits_under_the_floor_is_left_out_of_the_pictures_until_it_is_shown() -> None:
+def test_what_waits_under_the_floor_is_left_out_of_the_images_until_it_is_displayed() -> None:
     try:
         render_backend()
     except UserError as error:
@@ -216,8 +216,8 @@ def test_what_waits_under_the_floor_is_left_out_of_the_pictures_until_it_is_show
     body = disc.entity._objs[0].find_component_by_type(sapien.render.RenderBodyComponent)
 
     def redness() -> float:
-        picture = env.get_obs()["sensor_data"]["base_camera"]["rgb"][0].cpu().numpy().astype(int)
-        return float(((picture[..., 0] > 200) & (picture[..., 1] < 30)).mean())
+        image = env.get_obs()["sensor_data"]["base_camera"]["rgb"][0].cpu().numpy().astype(int)
+        return float(((image[..., 0] > 200) & (image[..., 1] < 30)).mean())
 
     mark = Mark(disc, target.position, 2)
     assert body.visibility == 0 and redness() == 0

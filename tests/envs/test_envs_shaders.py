@@ -40,7 +40,7 @@ def seen(scene: Scene) -> dict[str, np.ndarray]:
     return {f"{view}.{kind}": value.numpy() for view, kinds in observed.items() for kind, value in kinds.items()}
 
 
-def test_pictures_depth_and_segmentation_are_those_of_the_stock_shaders(
+def test_images_depth_and_segmentation_are_those_of_the_stock_shaders(
     rendering: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     lean = Scene(lambda _: None, **rendering)
@@ -49,10 +49,10 @@ def test_pictures_depth_and_segmentation_are_those_of_the_stock_shaders(
     stock = Scene(lambda _: None, **rendering)
     stock.reset()
     assert pack(lean) != PACK == pack(stock)
-    ours, theirs = seen(lean), seen(stock)
-    assert ours.keys() == theirs.keys() and any(name.endswith("segmentation") for name in ours)
-    for name, values in theirs.items():
-        assert np.array_equal(ours[name], values), name
+    actual, stock_images = seen(lean), seen(stock)
+    assert actual.keys() == stock_images.keys() and any(name.endswith("segmentation") for name in actual)
+    for name, values in stock_images.items():
+        assert np.array_equal(actual[name], values), name
     lean.close()
     stock.close()
 
@@ -70,7 +70,7 @@ def test_a_scene_with_an_environment_map_keeps_the_stock_shaders(rendering: dict
     scene.close()
 
 
-def test_asking_for_other_shaders_is_heard(rendering: dict[str, object]) -> None:
+def test_asking_for_other_shaders_is_noticed(rendering: dict[str, object]) -> None:
     scene = Scene(lambda _: None, sensor_configs={"shader_pack": "default"}, **rendering)
     assert pack(scene) == "default"
     scene.close()

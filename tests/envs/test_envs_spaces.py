@@ -51,17 +51,17 @@ def control(stick: bool = False, reachable: bool = True) -> tuple[Control, list,
     return Control(task, steps.append, hand), steps, hand  # type: ignore[arg-type]
 
 
-def test_joint_angles_are_one_step_as_given() -> None:
-    given, steps, _ = control()
-    action_space("joint_angle").act(given, [*JOINTS, -1.0])
+def test_joint_angles_are_one_step_unchanged() -> None:
+    targets, steps, _ = control()
+    action_space("joint_angle").act(targets, [*JOINTS, -1.0])
     assert len(steps) == 1
     np.testing.assert_array_equal(steps[0], [*JOINTS, -1.0])
 
 
 @pytest.mark.parametrize("extra", [[], [-1.0], [-1.0, 3.0]])
 def test_the_stick_takes_the_first_seven_joint_angles(extra: list[float]) -> None:
-    given, steps, _ = control(stick=True)
-    action_space("joint_angle").act(given, [*JOINTS, *extra])
+    targets, steps, _ = control(stick=True)
+    action_space("joint_angle").act(targets, [*JOINTS, *extra])
     np.testing.assert_array_equal(steps, [JOINTS])
 
 
@@ -88,64 +88,64 @@ def test_the_stick_takes_the_first_seven_joint_angles(extra: list[float]) -> Non
     ],
 )
 def test_malformed_actions_are_refused_without_a_step(name: str, stick: bool, action: Any, words: str) -> None:
-    given, steps, hand = control(stick)
+    targets, steps, hand = control(stick)
     with pytest.raises(UserError, match=words):
-        action_space(name).act(given, action)
+        action_space(name).act(targets, action)
     assert not steps
     assert not hand.done
 
 
 def test_a_pose_becomes_joint_angles_and_keeps_the_gripper() -> None:
-    given, steps, _ = control()
-    action_space("ee_pose").act(given, [*POSE, 1.0])
+    targets, steps, _ = control()
+    action_space("ee_pose").act(targets, [*POSE, 1.0])
     np.testing.assert_array_equal(steps, [[0, 1, 2, 3, 4, 5, 6, 1]])
 
 
 def test_a_stick_needs_no_gripper_number() -> None:
-    given, steps, _ = control(stick=True)
-    action_space("ee_pose").act(given, POSE)
+    targets, steps, _ = control(stick=True)
+    action_space("ee_pose").act(targets, POSE)
     np.testing.assert_array_equal(steps, [[0, 1, 2, 3, 4, 5, 6]])
 
 
 def test_an_unreachable_pose_says_so() -> None:
-    given, steps, _ = control(reachable=False)
+    targets, steps, _ = control(reachable=False)
     with pytest.raises(UnreachableError, match="IK failed"):
-        action_space("ee_pose").act(given, [*POSE, 1.0])
+        action_space("ee_pose").act(targets, [*POSE, 1.0])
     assert not steps
 
 
 @pytest.mark.parametrize(("gripper", "expected"), [(-1.0, ["close"]), (1.0, ["open"]), (0.3, []), (-0.99, [])])
 def test_a_waypoint_moves_the_gripper_only_at_exactly_one(gripper: float, expected: list[str]) -> None:
-    given, _, hand = control()
-    action_space("waypoint").act(given, [*POSE, gripper])
+    targets, _, hand = control()
+    action_space("waypoint").act(targets, [*POSE, gripper])
     assert hand.done == [[0.1, 0.0, 0.2], *expected]
 
 
 def test_the_stick_has_no_gripper_to_move() -> None:
-    given, _, hand = control(stick=True)
-    action_space("waypoint").act(given, [*POSE, -1.0])
+    targets, _, hand = control(stick=True)
+    action_space("waypoint").act(targets, [*POSE, -1.0])
     assert hand.done == [[0.1, 0.0, 0.2]]
 
 
 @pytest.mark.parametrize("index", [0, 1])
 @pytest.mark.parametrize("label", ["A", "a"])
 def test_a_choice_takes_the_object_nearest_to_the_point(index: int, label: str) -> None:
-    given, _, hand = control()
-    wanted = given.task.cubes[index]  # type: ignore[attr-defined]
-    action_space("multi_choice").act(given, {"choice": label, "point": project(wanted.position) + 3})
-    assert hand.done == [wanted]
+    targets, _, hand = control()
+    expected = targets.task.cubes[index]  # type: ignore[attr-defined]
+    action_space("multi_choice").act(targets, {"choice": label, "point": project(expected.position) + 3})
+    assert hand.done == [expected]
 
 
 def test_a_choice_without_an_object_needs_no_point() -> None:
-    given, _, hand = control()
-    action_space("multi_choice").act(given, {"choice": "B", "point": []})
+    targets, _, hand = control()
+    action_space("multi_choice").act(targets, {"choice": "B", "point": []})
     assert hand.done == ["pressed"]
 
 
 def test_an_unknown_choice_takes_no_step_and_warns() -> None:
-    given, steps, hand = control()
+    targets, steps, hand = control()
     with pytest.warns(UserWarning, match="Unknown choice 'Z'.*Known: a, b"):
-        action_space("multi_choice").act(given, {"choice": "Z"})
+        action_space("multi_choice").act(targets, {"choice": "Z"})
     assert not steps
     assert not hand.done
 
@@ -158,6 +158,6 @@ def test_an_unknown_action_space_is_refused() -> None:
 @pytest.mark.parametrize("stick", [False, True])
 @pytest.mark.parametrize("name", ["joint_angle", "ee_pose", "waypoint"])
 def test_sampled_actions_have_the_size_of_the_space(name: str, stick: bool) -> None:
-    given, steps, hand = control(stick)
-    action_space(name).act(given, action_space(name).space(stick).sample())
+    targets, steps, hand = control(stick)
+    action_space(name).act(targets, action_space(name).space(stick).sample())
     assert len(steps) + len(hand.done) >= 1

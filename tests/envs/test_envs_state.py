@@ -22,12 +22,14 @@ def joints(env: RoboMMEEnv, k: int) -> np.ndarray:
 
 def go_on(env: RoboMMEEnv, actions: list[Any]) -> list[Any]:
     """Everything that an environment says and is, after each of these actions."""
-    seen = []
+    observations = []
     for action in actions:
         observation, reward, terminated, truncated, info = env.step(action)
         state = env.task.get_state().cpu().numpy()
-        seen.append((observation, float(reward), bool(terminated), bool(truncated), info, state, env.steps_counted))
-    return seen
+        observations.append(
+            (observation, float(reward), bool(terminated), bool(truncated), info, state, env.steps_counted)
+        )
+    return observations
 
 
 def same(one: Any, other: Any) -> bool:
@@ -71,7 +73,7 @@ def test_a_restored_episode_goes_on_to_the_last_bit(
     fresh.close()
 
 
-def test_the_newest_frame_is_drawn_and_the_drawing_stays_what_it_was() -> None:
+def test_the_newest_frame_is_rendered_and_the_request_stays_what_it_was() -> None:
     pytest.importorskip("sapien")
     from mme_vla.envs.rendering import render_backend
 
@@ -91,7 +93,7 @@ def test_the_newest_frame_is_drawn_and_the_drawing_stays_what_it_was() -> None:
     env.close()
 
 
-def test_a_state_is_kept_when_the_episode_goes_on_and_fits_its_own_scene_only() -> None:
+def test_a_state_survives_later_steps_and_fits_its_scene_only() -> None:
     env = make_env("PickXtimes", "test", 0, render=False)
     assert isinstance(env, RoboMMEEnv)
     with pytest.raises(UserError, match="reset"):
@@ -100,9 +102,9 @@ def test_a_state_is_kept_when_the_episode_goes_on_and_fits_its_own_scene_only() 
     state = env.save_state()
     action = joints(env, 0)
     env.step(action)
-    moved = env.save_state()
+    later_state = env.save_state()
     action[:] = 0  # what was given may be used again
-    assert state.actions == () and len(moved.actions) == 1 and moved.actions[0].any()
+    assert state.actions == () and len(later_state.actions) == 1 and later_state.actions[0].any()
     env.close()
     for split, episode, differs in (
         ("test", 1, r"seed \d+ \(here \d+\)"),
@@ -122,12 +124,12 @@ def test_a_state_is_kept_when_the_episode_goes_on_and_fits_its_own_scene_only() 
 def test_rewards_are_shares_of_the_executions_subtasks() -> None:
     steps = [SubTask("x", done=lambda: True, run=lambda _: None, video=i < 1) for i in range(5)]
     progress = Progress(steps, latch_failure=False)
-    given = []
+    rewards = []
     for _ in range(6):
-        given.append([REWARDS[name](progress, progress.succeeded) for name in ("none", "sparse", "subtask")])
+        rewards.append([REWARDS[name](progress, progress.succeeded) for name in ("none", "sparse", "subtask")])
         progress.update()
-    assert [row[0] for row in given] == [0] * 6 and [row[1] for row in given] == [0] * 5 + [1]
-    assert [row[2] for row in given] == [0, 0, 0.25, 0.5, 0.75, 1]
+    assert [row[0] for row in rewards] == [0] * 6 and [row[1] for row in rewards] == [0] * 5 + [1]
+    assert [row[2] for row in rewards] == [0, 0, 0.25, 0.5, 0.75, 1]
 
 
 def test_an_episode_that_is_done_has_earned_one_and_the_benchmarks_none() -> None:
@@ -142,8 +144,8 @@ def test_an_episode_that_is_done_has_earned_one_and_the_benchmarks_none() -> Non
         env.reset()
         rewards = []
         for letter in ["a", *["b"] * len(env.task.checkpoints()), "c"]:
-            _, given, ended, _, info = env.step({"choice": letter})
-            rewards.append(float(given))
+            _, earned, ended, _, info = env.step({"choice": letter})
+            rewards.append(float(earned))
             if ended:
                 break
         env.close()

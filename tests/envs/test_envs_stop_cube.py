@@ -80,7 +80,7 @@ def test_the_cube_goes_back_and_forth_five_times_and_then_rests(second):
 
 
 @pytest.mark.parametrize("step", [87, 90, 93])
-def test_stopped_near_the_target_on_the_right_visit_is_success(prepared, step):
+def test_stopped_near_the_target_on_the_right_crossing_is_success(prepared, step):
     assert stop_at(prepared, step) == (True, False)
     place = prepared.cube.position
     assert distance_xy(place, prepared.target.position) <= 0.06
@@ -95,12 +95,12 @@ def test_stopped_off_the_target_fails_and_stays_failed(prepared, step):
 
 
 @pytest.mark.parametrize("step", [30, 31])
-def test_stopped_on_an_earlier_visit_fails(prepared, step):
+def test_stopped_on_an_earlier_crossing_fails(prepared, step):
     assert stop_at(prepared, step) == (False, True)
     assert distance_xy(prepared.cube.position, prepared.target.position) <= 0.06
 
 
-def test_not_stopped_before_the_visit_is_over_fails(prepared):
+def test_not_stopped_before_the_stay_is_over_fails(prepared):
     assert wait(prepared, 120) == (False, False)
     assert wait(prepared) == (False, True)
 

@@ -109,7 +109,7 @@ def test_another_cube_in_the_hand_fails(swing, hand, stage):
     assert hand.carry(other) == (False, True)
 
 
-def test_a_target_is_marked_while_the_cube_is_over_it_and_20_steps_longer(swing, hand):
+def test_a_target_is_highlighted_while_the_cube_is_over_it_and_20_steps_longer(swing, hand):
     right, left = swing._marks
     hand.carry(swing.cube, over=swing.right, z=LOW)
     assert right.position == pytest.approx(swing.right.position - [0, 0, 0.01]) and left.position[2] < -5
@@ -121,15 +121,15 @@ def test_a_target_is_marked_while_the_cube_is_over_it_and_20_steps_longer(swing,
 
 
 def test_texts(swing):
-    colour, shown = swing.cube.colour, texts(swing)
-    assert shown[:3] + shown[-2:] == [
+    colour, text = swing.cube.colour, texts(swing)
+    assert text[:3] + text[-2:] == [
         (f"pick up the {colour} cube", f"pick up the {colour} cube at <>", "a"),
         *((f"move to the top of the {side}-side target for the first time",
            f"move to the top of the {side}-side target at <> for the first time", "b") for side in ("right", "left")),
         (f"put the {colour} cube on the table", f"put the {colour} cube on the table", "c"),
         ("press the button", "press the button at <>", "d"),
     ]  # fmt: skip
-    assert len(shown) == 3 + 2 * swing.repetitions
+    assert len(text) == 3 + 2 * swing.repetitions
     assert [option.needs_point for option in swing.choices()] == [True, True, False, False]
 
 

@@ -45,26 +45,26 @@ def tallied(env: Any) -> list[np.ndarray]:
 
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_in_a_twin_the_fact_is_in_view_and_nothing_else_is_changed(task: str) -> None:
-    plain, twin = built(task, in_view=False), built(task)
-    for env in (plain, twin):
+    original, twin = built(task, in_view=False), built(task)
+    for env in (original, twin):
         wait(env, 40)
-    for one, other in zip(plain.things, twin.things, strict=True):
+    for one, other in zip(original.things, twin.things, strict=True):
         assert one.name == other.name and np.array_equal([*one.pose.p, *one.pose.q], [*other.pose.p, *other.pose.q])
-    assert [step.text for step in plain.progress.subtasks] == [step.text for step in twin.progress.subtasks]
-    assert np.array_equal(plain.qpos, twin.qpos) and not plain._cues
+    assert [step.text for step in original.progress.subtasks] == [step.text for step in twin.progress.subtasks]
+    assert np.array_equal(original.qpos, twin.qpos) and not original._cues
     in_words = task in ("MoveCube", "PatternLock", "InsertPeg")
-    assert (plain.goals() != twin.goals()) == in_words and (twin._cues or in_words)
+    assert (original.goals() != twin.goals()) == in_words and (twin._cues or in_words)
     for disc, cue in twin._cues:
         body = disc.entity._objs[0].find_component_by_type(physx.PhysxRigidDynamicComponent)
         assert not body.collision_shapes, "a disc can be touched"
         place = cue.place()
         assert disc.position[2] < 0 if place is None else np.allclose(disc.position, place, atol=1e-3)
-    plain.close()
+    original.close()
     twin.close()
 
 
 @pytest.mark.parametrize("task", TALLIED)
-def test_a_tally_lies_in_the_picture_below_all_that_the_task_is_about(task: str) -> None:
+def test_a_tally_lies_in_the_image_below_all_that_the_task_is_about(task: str) -> None:
     env = built(task)
     rows, columns = np.array([project(place) for place in tallied(env)]).T
     assert rows.max() < SIDE - 20 and columns.min() > 20 and columns.max() < SIDE - 20
@@ -78,13 +78,13 @@ def test_a_tally_is_what_the_pointer_has_still_to_come_to(task: str) -> None:
     env = built(task)
     words = {"PickXtimes": "place ", "SwingXtimes": "move to the top", "VideoRepick": "put it down"}[task]
     texts = [step.text for step in env.progress.subtasks]
-    seen = []
+    tallies = []
     for env.progress.index in range(len(texts) + 1):
         assert len(tallied(env)) == sum(text.startswith(words) for text in texts[env.progress.index :])
-        seen.append([round(float(place[1] / 0.045), 1) for place in tallied(env)])
-    assert len(seen[0]) == env.repetitions * (2 if task == "SwingXtimes" else 1) and seen[-1] == []
+        tallies.append([round(float(place[1] / 0.045), 1) for place in tallied(env)])
+    assert len(tallies[0]) == env.repetitions * (2 if task == "SwingXtimes" else 1) and tallies[-1] == []
     if task == "SwingXtimes":  # where the right one has fewer, the left target is next
-        sides = [(sum(y < 0 for y in ys), sum(y > 0 for y in ys)) for ys in seen[1:4]]
+        sides = [(sum(y < 0 for y in ys), sum(y > 0 for y in ys)) for ys in tallies[1:4]]
         assert sides == [(env.repetitions, env.repetitions), (env.repetitions - 1, env.repetitions),
                          (env.repetitions - 1, env.repetitions - 1)]  # fmt: skip
     env.close()
@@ -128,7 +128,7 @@ def test_the_last_disc_lies_there_during_the_pass_in_which_to_stop_the_cube() ->
     env.close()
 
 
-def test_the_next_move_of_the_route_is_marked_and_none_during_the_video() -> None:
+def test_the_next_move_of_the_route_is_highlighted_and_none_during_the_video() -> None:
     env = built("RouteStick", episode=3)
     moves, steps = len(env.directions), len(env.progress.subtasks)
     for env.progress.index in range(steps + 1):

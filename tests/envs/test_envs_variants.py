@@ -36,14 +36,14 @@ def built(task: str, episode: int = 1, **settings: Any) -> Any:
 @pytest.mark.parametrize(("dial", "task"), PAIRS)
 def test_at_zero_a_dial_changes_nothing_and_beyond_it_the_scene_stays(dial: str, task: str) -> None:
     assert metadata.episodes(task, f"stress:{dial}=0")[7].seed == metadata.episodes(task, "test")[7].seed
-    found = {}
+    scenes = {}
     for turned in (None, 0, 2):
         env = built(task, stress=None if turned is None else {dial: turned})
         wait(env, STEPS)
         homes = {thing.name: np.concatenate([thing.initial_pose.p, thing.initial_pose.q]) for thing in env.things}
-        found[turned] = scene(env), homes, len(env.progress.subtasks)
+        scenes[turned] = scene(env), homes, len(env.progress.subtasks)
         env.close()
-    (official, places, steps), (at_zero, _, _), (_, more, more_steps) = found.values()
+    (official, places, steps), (at_zero, _, _), (_, more, more_steps) = scenes.values()
     assert official.keys() == at_zero.keys()
     assert all(np.array_equal(official[name], at_zero[name]) for name in official)
     assert [name for name in places if not np.array_equal(places[name], more[name])] == []
@@ -53,19 +53,19 @@ def test_at_zero_a_dial_changes_nothing_and_beyond_it_the_scene_stays(dial: str,
         assert more_steps > steps
 
 
-def test_what_a_dial_turns_is_there_as_often_as_it_says() -> None:
+def test_what_a_dial_changes_is_present_in_the_stated_number() -> None:
     for task, attribute in (("PickXtimes", "repetitions"), ("SwingXtimes", "repetitions"), ("StopCube", "visit"),
                             ("VideoUnmaskSwap", "swap_count")):  # fmt: skip
         dial = "swaps" if "Swap" in task else "count"
-        found = [built(task, stress={dial: turned}) for turned in (0, 12)]
-        plain, more = (getattr(env, attribute) for env in found)
-        assert more == plain + 12
-        for env in found:
+        scenes = [built(task, stress={dial: turned}) for turned in (0, 12)]
+        original, more = (getattr(env, attribute) for env in scenes)
+        assert more == original + 12
+        for env in scenes:
             env.close()
     assert (ordinal(9), ordinal(11), ordinal(20), number(10), number(12)) == ("tenth", "12th", "21st", "ten", "12")
-    plain, late = built("VideoUnmask"), built("VideoUnmask", stress={"delay": 40})
-    static = [env.progress.subtasks[0].done for env in (plain, late)]
-    for env, done, steps in zip((plain, late), static, (64, 104), strict=True):
+    original, late = built("VideoUnmask"), built("VideoUnmask", stress={"delay": 40})
+    static = [env.progress.subtasks[0].done for env in (original, late)]
+    for env, done, steps in zip((original, late), static, (64, 104), strict=True):
         while not done() and env.steps_done < 200:
             wait(env)
         assert env.steps_done == pytest.approx(steps, abs=4)
@@ -96,10 +96,10 @@ def test_an_environment_of_a_variant_is_made_by_its_split() -> None:
         ("BinFill", "tset", "Unknown split 'tset'. Did you mean 'test'?"),
     ],
 )
-def test_variants_that_there_are_not_are_told(task: str, split: str, words: str) -> None:
-    with pytest.raises(UserError) as told:
+def test_variants_that_there_are_not_are_reported(task: str, split: str, words: str) -> None:
+    with pytest.raises(UserError) as caught:
         metadata.episodes(task, split)
-    assert words in str(told.value)
+    assert words in str(caught.value)
     with pytest.raises(UserError, match="cannot turn 'swaps'"):
         built("PickXtimes", stress={"swaps": 1})
     assert read_variant("test") is None

@@ -69,7 +69,7 @@ def test_every_episode_is_run_once_by_whoever_is_free(envs: VecEnv) -> None:
     assert envs.recv() == []
 
 
-def test_a_long_video_arrives_whole_and_in_order(envs: VecEnv) -> None:
+def test_a_long_video_arrives_completely_and_in_order(envs: VecEnv) -> None:
     envs.start(0, Job("StopCube", "test", 7))
     reply = only(envs.recv())
     frames = reply.observation["front_rgb_list"]
@@ -91,7 +91,7 @@ def test_whoever_is_ready_comes_first(envs: VecEnv) -> None:
 
 
 @pytest.mark.parametrize(("action", "words"), [("die", "exit code 3"), ("hang", "gave no result within 4 s")])
-def test_a_lost_worker_is_reported_and_replaced_while_others_go_on(envs: VecEnv, action: str, words: str) -> None:
+def test_a_lost_worker_is_reported_and_replaced_while_others_continue(envs: VecEnv, action: str, words: str) -> None:
     envs.send(1, "go")
     envs.timeout = 4.0
     envs.send(0, action)

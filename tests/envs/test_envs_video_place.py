@@ -79,8 +79,8 @@ def test_button_everything_comes_from_the_stream_in_order(seed, difficulty, targ
     assert env.spot.radius == 0.06 and env.spot.position[2] == pytest.approx(-0.05)
     assert keeps_apart(env)
     (first, second), steps = env.targets[:2], env.progress.subtasks
-    shown = [PICK, "drop the cube onto target", "press the button", PICK, "drop the cube onto target"]
-    assert [step.text for step in steps] == shown + AFTER
+    video = [PICK, "drop the cube onto target", "press the button", PICK, "drop the cube onto target"]
+    assert [step.text for step in steps] == video + AFTER
     assert (steps[1].targets, steps[4].targets) == ([first], [second])
     assert env.goal_target is (first if env.before else second) and steps[-1].targets == [env.goal_target]
     start = f"watch the video carefully, then place the {env.cube.colour} cube on the target"
@@ -101,9 +101,9 @@ def test_order_everything_comes_from_the_stream_in_order(seed, difficulty):
     assert env.spot.radius == 0.1 and env.spot.position == pytest.approx([-0.1, 0, -0.05])
     assert keeps_apart(env)
     steps = env.progress.subtasks
-    shown = [PICK, "drop the cube onto target"] * visits
-    shown.insert(2 * stream.integer(0, visits) + 2, "press the button")
-    assert [step.text for step in steps] == shown + AFTER
+    video = [PICK, "drop the cube onto target"] * visits
+    video.insert(2 * stream.integer(0, visits) + 2, "press the button")
+    assert [step.text for step in steps] == video + AFTER
     assert [step.targets[0] for step in steps if step.text == "drop the cube onto target"] == env.visited
     assert env.goal_target is env.visited[env.rank - 1] and steps[-1].targets == [env.goal_target]
     which = f"the {env.cube.colour} cube on the {('first', 'second', 'third', 'fourth')[env.rank - 1]} target"

@@ -94,8 +94,8 @@ def test_texts_and_goals_of_two_repetitions_without_swaps(twice):
 def test_the_video_ends_with_the_swaps_one_after_another():
     env = make(VideoRepick, ONCE, "medium")
     assert env.repetitions == 1 and env.swap_count == 3
-    shown = [*SHOWN, *["static"] * 4, "NO RECORD"]
-    assert [step.text for step in env.progress.subtasks] == [*shown, FIRST, PUT, PRESS]
+    video = [*SHOWN, *["static"] * 4, "NO RECORD"]
+    assert [step.text for step in env.progress.subtasks] == [*video, FIRST, PUT, PRESS]
     assert env.goals() == [
         "watch the video carefully, then pick up the same block that was previously picked up again, "
         "finally put it down and press the button to stop"
@@ -104,8 +104,8 @@ def test_the_video_ends_with_the_swaps_one_after_another():
     wait(env)  # the swaps begin in the step after the one in which the stage was seen
     for initiator in env.initiators:
         start = {cube: cube.position for cube in env.cubes}
-        rest = [cube for cube in env.cubes if cube is not initiator]
-        partner, third = sorted(rest, key=lambda cube: distance_xy(start[cube], start[initiator]))
+        remaining = [cube for cube in env.cubes if cube is not initiator]
+        partner, third = sorted(remaining, key=lambda cube: distance_xy(start[cube], start[initiator]))
         wait(env, 26)
         middle = (start[initiator] + start[partner]) / 2
         assert distance_xy(initiator.position, middle) == pytest.approx(0.07, abs=5e-3)
@@ -117,7 +117,7 @@ def test_the_video_ends_with_the_swaps_one_after_another():
     env.close()
 
 
-def test_as_many_picks_as_asked_for_and_the_button_are_success(twice, hand):
+def test_as_many_picks_as_requested_and_the_button_are_success(twice, hand):
     at(twice, FIRST)
     for _ in range(2):
         assert hand.carry(twice.cube) == (False, False)

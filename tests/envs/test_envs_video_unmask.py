@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
 from helpers.env_scenes import replay, setup
-from helpers.env_unmask import lift, make, names, skip_place, texts, turn, under, wait
+from helpers.env_unmask import lift, make, names, skip_place, texts, under, wait, yaw_of
 from mme_vla.envs.scene.motions import COVER_STEPS
 from mme_vla.envs.scene.placement import CONTAINER_HALF, TRIALS, Draws, Region
 from mme_vla.envs.tasks.video_unmask import VideoUnmask
@@ -33,7 +33,7 @@ def test_containers_stand_apart_where_the_stream_puts_them(seed, difficulty, cou
     env = make(VideoUnmask, seed, difficulty)
     stream = Draws(seed)
     for container in env.containers:
-        assert skip_place(stream, Region((0, 0), 0.2), container) == pytest.approx(turn(container), abs=1e-6)
+        assert skip_place(stream, Region((0, 0), 0.2), container) == pytest.approx(yaw_of(container), abs=1e-6)
     if difficulty == "hard":  # one more found no place
         for _ in range(TRIALS):
             Region((0, 0), 0.2).place(stream, CONTAINER_HALF)
@@ -80,7 +80,7 @@ def test_the_first_container_then_the_second_one_is_success(hard):
     assert wait(hard) == (True, False)
 
 
-def test_a_container_is_not_put_down_while_it_is_held(hard, monkeypatch):
+def test_a_container_is_not_put_down_while_it_is_grasped(hard, monkeypatch):
     hard.reset()
     wait(hard, COVER_STEPS)
     lift(hard, hard.containers[0])

@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("mani_skill", reason="the simulation needs the extra 'sim'")
 
-from helpers.env_unmask import lift, make, names, skip_place, texts, turn, under, wait
+from helpers.env_unmask import lift, make, names, skip_place, texts, under, wait, yaw_of
 from mme_vla.envs.scene.placement import Draws, Region
 from mme_vla.envs.tasks.video_unmask_swap import VideoUnmaskSwap
 
@@ -42,13 +42,13 @@ def test_everything_comes_from_the_streams_in_order(seed, difficulty):
     assert len(env.containers) == count
     for (x, y), container in zip(anchors, env.containers, strict=True):
         region = Region((cos * x - sin * y, sin * x + cos * y), 0.07)
-        assert skip_place(stream, region, container) == pytest.approx(turn(container), abs=1e-6)
+        assert skip_place(stream, region, container) == pytest.approx(yaw_of(container), abs=1e-6)
     assert env.colours == names(stream)
     assert env.over_cubes == [env.containers[i] for i in stream.permutation(3)]
     stream.integer(0, 3)
     first = stream.permutation(3)[:2]
-    rest = [i for i in range(count) if i not in first]
-    initiators = [*first, rest[stream.integer(0, len(rest))]][: env.swap_count]
+    remaining = [i for i in range(count) if i not in first]
+    initiators = [*first, remaining[stream.integer(0, len(remaining))]][: env.swap_count]
     assert env.initiators == [env.containers[i] for i in initiators]
     assert env.failed_pick == stream.integer(0, env.pick_count)
     env.close()

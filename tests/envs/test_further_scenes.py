@@ -14,7 +14,7 @@ from mme_vla.evaluation.results.scopes import Protocol
 from mme_vla.evaluation.store import RecordLog
 
 
-def test_they_go_on_where_the_rule_of_the_test_split_ends() -> None:
+def test_they_continue_where_the_rule_of_the_test_split_ends() -> None:
     seeds, difficulties = zip(*(metadata.formula("MoveCube", "test", n) for n in range(50, 150)), strict=True)
     further = metadata.episodes("MoveCube", FURTHER)
     assert [spec.seed for spec in further] == list(seeds) and [spec.difficulty for spec in further] == [*difficulties]
@@ -24,9 +24,9 @@ def test_they_go_on_where_the_rule_of_the_test_split_ends() -> None:
 @pytest.mark.parametrize("level", ["easy", "medium", "hard"])
 def test_those_of_one_difficulty_are_picked_from_the_same_rule_in_its_order(level: str) -> None:
     rule = [metadata.formula("MoveCube", "test", n) for n in range(50, 1650)]
-    wanted = [seed for seed, difficulty in rule if difficulty == level][:400]
-    found = metadata.episodes("MoveCube", f"further_{level}")
-    assert [spec.seed for spec in found] == wanted and {spec.difficulty for spec in found} == {level}
+    expected = [seed for seed, difficulty in rule if difficulty == level][:400]
+    specs = metadata.episodes("MoveCube", f"further_{level}")
+    assert [spec.seed for spec in specs] == expected and {spec.difficulty for spec in specs} == {level}
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
@@ -56,7 +56,7 @@ def test_results_counts_a_hundred_of_them_and_sets_no_figure_of_the_paper_beside
         for record in records(FURTHER, 100):
             log.append(record)
     main([str(tmp_path), "--tasks", "StopCube"])
-    shown = capsys.readouterr().out
-    assert "100" in shown and "Incomplete" not in shown and "none of the benchmark's" in shown
+    table = capsys.readouterr().out
+    assert "100" in table and "Incomplete" not in table and "none of the benchmark's" in table
     methods = aggregate(records(FURTHER, 100), Protocol(("StopCube",), 100)).methods
     assert methods[0].paper is None and aggregate(records("test", 50), Protocol(("StopCube",))).methods[0].paper

@@ -30,7 +30,7 @@ def test_the_page_shows_the_file_that_is_tested() -> None:
     assert (EXAMPLE / "two_buttons.py").read_text().strip() in page
 
 
-def test_it_keeps_a_tasks_promises_and_draws_its_order() -> None:
+def test_it_meets_the_task_contract_and_samples_its_order() -> None:
     check_task("TwoButtons")
 
 
@@ -65,12 +65,12 @@ def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    drawn = "frames=[0]"  # an image takes its time
+    selection = "frames=[0]"  # an image takes its time
     words = [
         "tasks=TwoButtons",
         "episodes=1",
         "lerobot=false",
-        drawn,
+        selection,
         f"hdf5={tmp_path / 'h5'}",
         f"output={tmp_path / 'x'}",
     ]
@@ -78,7 +78,7 @@ def test_its_demonstrations_are_recorded(tmp_path: Path) -> None:
     (file,) = (tmp_path / "h5").glob("*TwoButtons*.h5")
     with h5py.File(file) as recorded:
         (episode,) = recorded.values()
-        said = {step["info/simple_subgoal"][()].decode() for step in episode.values() if "info" in step}
+        subgoals = {step["info/simple_subgoal"][()].decode() for step in episode.values() if "info" in step}
         first = episode["timestep_0/obs/front_rgb"][()]
-    assert said >= {"press the left button", "press the right button"}
+    assert subgoals >= {"press the left button", "press the right button"}
     assert first.std() > 10, "the scene is not drawn"

@@ -127,8 +127,8 @@ def test_a_rollout_of_motions_remembers_every_frame_and_asks_after_each_motion()
     assert record.outcome == "timeout" and record.steps % 3 == 0 and record.action_space == "waypoint"
     assert record.extra["chunks"] == record.steps // 3, "one motion of a chunk is executed, then the policy is asked"
     assert {action[6] for action in envs.made[job].actions} <= {-1.0, 1.0}, "the gripper is opened or closed, no less"
-    (drawn,) = roll(policy, [job], MotionEnvs(robot=policy.embodiment), max_steps=FACTS.max_steps, draw="all")
-    assert drawn.extra["actions_sha256"] == record.extra["actions_sha256"]
+    (result,) = roll(policy, [job], MotionEnvs(robot=policy.embodiment), max_steps=FACTS.max_steps, draw="all")
+    assert result.extra["actions_sha256"] == record.extra["actions_sha256"]
 
 
 def test_a_pose_out_of_reach_is_the_policys_failure() -> None:
@@ -149,11 +149,11 @@ def test_a_policy_of_motions_is_served_a_motion_at_a_time() -> None:
     with Served(policy) as served, served.client() as client:
         about = client.metadata
         assert (about["action_space"], about["action_dim"], about["horizon"], about["execute"]) == ("waypoint", 7, 4, 1)
-        asked = challenge(frames, frames, states, True)
-        answer = client.infer({**asked, "action_space": "waypoint"})["actions"]
-        assert answer.shape == (1, 7) and abs(answer[0, 6]) == 1
+        request = challenge(frames, frames, states, True)
+        reply = client.infer({**request, "action_space": "waypoint"})["actions"]
+        assert reply.shape == (1, 7) and abs(reply[0, 6]) == 1
         with pytest.raises(UserError, match="returns waypoint only"):
-            client.infer({**asked, "action_space": "joint_angle"})
+            client.infer({**request, "action_space": "joint_angle"})
     with pytest.raises(UserError, match="returns waypoint, 7 numbers"):
         PolicyServer(policy, ServeSettings(action_space="joint_angle"))
     reading = quick_policy("pi05_past_actions", embodiment="robomme_waypoint")

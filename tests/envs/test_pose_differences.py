@@ -46,11 +46,11 @@ def expected(number: int) -> np.ndarray:
     return np.array([*lag, pose_at(number)[6]])
 
 
-def test_differences_are_to_each_steps_own_pose_by_the_shorter_way(folder: Path) -> None:
+def test_differences_are_to_each_steps_pose_by_the_shorter_way(folder: Path) -> None:
     source = EpisodeSource(folder, robot=robot())
-    found = source.actions(0)
-    np.testing.assert_allclose(found, [expected(t) for t in range(24)], atol=1e-5)
-    assert source.actions(0, 5, 7).tolist() == found[5:7].tolist()
+    actions = source.actions(0)
+    np.testing.assert_allclose(actions, [expected(t) for t in range(24)], atol=1e-5)
+    assert source.actions(0, 5, 7).tolist() == actions[5:7].tolist()
     assert abs(pose_at(3)[3] - tool_at(3)[3]) > np.pi, "or there is no turn to be left out"
 
 
@@ -115,17 +115,17 @@ def test_an_environment_that_does_not_tell_poses_is_refused_by_name() -> None:
 def test_a_client_must_say_that_it_adds_the_pose() -> None:
     policy = quick_policy("pi05", embodiment=NAME)
     frames, states = [np.zeros((32, 32, 3), np.uint8)] * 2, np.zeros((2, 8), np.float32)
-    asked = challenge(frames, frames, states, True)
+    request = challenge(frames, frames, states, True)
     with Served(policy) as served:
         with served.client() as client:
             assert client.metadata["action_space"] == "ee_delta"
-            assert client.infer({**asked, "action_space": "ee_delta"})["actions"].shape == (16, 7)
-        for given, reason in (
-            (asked, "say action_space='ee_delta'"),
-            (asked | {"action_space": "ee_pose"}, "ee_delta only"),
+            assert client.infer({**request, "action_space": "ee_delta"})["actions"].shape == (16, 7)
+        for state, reason in (
+            (request, "say action_space='ee_delta'"),
+            (request | {"action_space": "ee_pose"}, "ee_delta only"),
         ):
             with served.client() as client, pytest.raises(UserError, match=reason):
-                client.infer(given)
+                client.infer(state)
 
 
 def test_statistics_are_of_the_differences(folder: Path) -> None:

@@ -27,20 +27,20 @@ def test_more_episodes_have_seeds_that_no_split_has() -> None:
     assert more[0].recovery is None and [spec.difficulty for spec in more[:4]] == ["easy", "easy", "medium", "hard"]
 
 
-def test_the_goals_that_were_never_shown_are_named_with_their_episodes() -> None:
+def test_goals_without_a_demonstration_are_named_with_their_episodes() -> None:
     specs = [EpisodeSpec("StopCube", "test", i, i, "easy") for i in range(4)]
-    asked = list(zip(specs, ["third", "second", "third", "fifth"], strict=True))
-    found = coverage.compare({"StopCube": {"second"}, "BinFill": {"third"}}, asked)["StopCube"]
-    assert found.to_dict() == {
+    requests = list(zip(specs, ["third", "second", "third", "fifth"], strict=True))
+    result = coverage.compare({"StopCube": {"second"}, "BinFill": {"third"}}, requests)["StopCube"]
+    assert result.to_dict() == {
         "goals": 3, "goals_covered": 1, "episodes": 4, "episodes_covered": 1,
         "missing": {"third": [0, 2], "fifth": [3]},
     }  # fmt: skip
-    assert coverage.in_words({"StopCube": found}, "test").splitlines() == [
+    assert coverage.in_words({"StopCube": result}, "test").splitlines() == [
         "StopCube: 1 of 3 goals of 'test', 1 of 4 episodes",
         "  never shown: third (episode 0, 2)",
         "  never shown: fifth (episode 3)",
     ]
-    assert coverage.compare({"StopCube": {"second", "third", "fifth"}}, asked)["StopCube"].missing == {}
+    assert coverage.compare({"StopCube": {"second", "third", "fifth"}}, requests)["StopCube"].missing == {}
 
 
 def test_a_goal_is_what_the_scene_says() -> None:
@@ -60,16 +60,16 @@ def test_a_recording_is_compared_with_the_test_split(
     dataset = tmp_path / "data" if lerobot else None
     if dataset is not None:
         convert(refs, dataset, ConvertOptions(images="png"))
-    wanted = RecordingPlan(jobs, dataset, None if lerobot else tmp_path)
+    request = RecordingPlan(jobs, dataset, None if lerobot else tmp_path)
     monkeypatch.setattr(coverage, "goal_of", lambda spec: f"do task {spec.episode % 3}")
-    record.report_coverage("StopCube", wanted, tmp_path / "coverage.json", workers=1)
-    found = json.loads((tmp_path / "coverage.json").read_text())["StopCube"]
-    assert (found["goals"], found["goals_covered"], found["episodes"], found["episodes_covered"]) == (3, 2, 50, 34)
-    assert list(found["missing"]) == ["do task 2"] and found["missing"]["do task 2"][:2] == [2, 5]
+    record.report_coverage("StopCube", request, tmp_path / "coverage.json", workers=1)
+    result = json.loads((tmp_path / "coverage.json").read_text())["StopCube"]
+    assert (result["goals"], result["goals_covered"], result["episodes"], result["episodes_covered"]) == (3, 2, 50, 34)
+    assert list(result["missing"]) == ["do task 2"] and result["missing"]["do task 2"][:2] == [2, 5]
     assert "StopCube: 2 of 3 goals of 'test', 34 of 50 episodes" in capsys.readouterr().out
 
 
-def test_throughput_is_told_in_words() -> None:
+def test_throughput_is_reported_in_words() -> None:
     assert record._throughput(90, 27_000, 1800, 4) == (
         "90 episodes in 1800 s with 4 workers: 180 episodes and 54,000 steps an hour."
     )

@@ -61,10 +61,10 @@ STEPS = [
 )  # fmt: skip
 def test_a_choice_says_what_each_camera_shows(choice: FrameChoice, front: list[int], wrist: list[int]) -> None:
     render_request = choice.render_request(STEPS)
-    shown = {
+    selection = {
         name: [k for k in range(len(STEPS)) if name in render_request.cameras(k, False)] for name in ("front", "wrist")
     }
-    assert shown == {"front": front, "wrist": wrist}
+    assert selection == {"front": front, "wrist": wrist}
     known = choice.beforehand()
     assert (known is None) == (choice.memory is not None or not isinstance(choice.at, list))
     for k in range(len(STEPS) if known is not None else 0):
@@ -93,38 +93,38 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> EpisodeRef:
     return EpisodeRef(folder / f"{job.name}.h5", 0, "PatternLock")
 
 
-def test_what_is_drawn_is_what_a_whole_recording_shows(recorded: EpisodeRef) -> None:
+def test_what_is_rendered_is_what_a_full_recording_shows(recorded: EpisodeRef) -> None:
     with open_episode(recorded) as episode:
-        frames, drawn, seed, choice = list(episode), episode.rendered, episode.seed, episode.frames
+        frames, rendered, seed, choice = list(episode), episode.rendered, episode.seed, episode.frames
         with pytest.raises(UserError, match=r"front was not drawn at step 1; .* frames=decisions"):
             episode.front(1)
     assert choice == {"at": "decisions", "memory": {"name": "framesamp", "budget": 64}}
     # What of a whole recording is compared, and the steps before, whose images these would be if any were stale.
-    more = {int(k) + d for steps in drawn.values() for k in np.flatnonzero(steps) for d in (-1, 0)}
+    more = {int(k) + d for steps in rendered.values() for k in np.flatnonzero(steps) for d in (-1, 0)}
     task = make_task("PatternLock", render=True, seed=seed, difficulty="easy")
-    whole = Recorder(task, render_request=RenderRequest({"front": more, "wrist": more})).record().frames
+    reference = Recorder(task, render_request=RenderRequest({"front": more, "wrist": more})).record().frames
     task.close()
-    assert len(frames) == len(whole)
-    assert 0 < drawn["wrist"].sum() < drawn["front"].sum() < len(frames)
-    for frame, full, k in zip(frames, whole, range(len(whole)), strict=True):
+    assert len(frames) == len(reference)
+    assert 0 < rendered["wrist"].sum() < rendered["front"].sum() < len(frames)
+    for frame, full, k in zip(frames, reference, range(len(reference)), strict=True):
         assert np.array_equal(frame.state[:7], full.obs["joint_state"])
         assert np.array_equal(frame.action[:7], full.action["joint_action"][:7])
         assert frame.subgoals["grounded_subgoal_online"] == full.info["grounded_subgoal_online"].lower()
         for camera in ("front", "wrist"):
-            assert drawn[camera][k] == (camera in frame.rendered)
-            if drawn[camera][k]:
+            assert rendered[camera][k] == (camera in frame.rendered)
+            if rendered[camera][k]:
                 assert np.array_equal(getattr(frame, camera), full.obs[f"{camera}_rgb"])
 
 
-def test_a_dataset_of_it_is_read_where_it_was_drawn_and_nowhere_else(recorded: EpisodeRef, tmp_path: Path) -> None:
+def test_a_dataset_of_it_is_read_where_it_was_rendered_and_nowhere_else(recorded: EpisodeRef, tmp_path: Path) -> None:
     convert([recorded], tmp_path / "data", ConvertOptions())
     section: Any = OmegaConf.to_container(compose("policy", ["embodiment=robomme_waypoint"]).embodiment, resolve=True)
     waypoints = EpisodeSource(tmp_path / "data", robot=Embodiment.from_dict(section))
     joints = EpisodeSource(tmp_path / "data")
-    drawn = joints.rendered(0, "wrist")
-    assert list(waypoints.decisions(0)) == list(joints.decisions(0)) == np.flatnonzero(drawn).tolist()
+    rendered = joints.rendered(0, "wrist")
+    assert list(waypoints.decisions(0)) == list(joints.decisions(0)) == np.flatnonzero(rendered).tolist()
     with open_episode(recorded) as episode:
-        first = int(np.flatnonzero(drawn)[0])
+        first = int(np.flatnonzero(rendered)[0])
         assert np.abs(joints.frames(0, [first])[0].astype(int) - episode.front(first)).max() <= 3
     unseen = int(np.flatnonzero(~joints.rendered(0))[0])
     with pytest.raises(UserError, match=rf"front was not drawn at frames \[{unseen}\]"):

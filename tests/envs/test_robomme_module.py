@@ -47,7 +47,7 @@ def test_what_cannot_be_is_refused_in_words(wrapper: ModuleType, options: dict, 
         wrapper.BenchmarkEnvBuilder(**options)
 
 
-def test_episodes_of_ones_own_come_from_a_folder(wrapper: ModuleType, tmp_path: Path) -> None:
+def test_episodes_of_the_user_come_from_a_folder(wrapper: ModuleType, tmp_path: Path) -> None:
     records = [{"task": "StopCube", "episode": i, "seed": 900 + i, "difficulty": "hard"} for i in (1, 0)]
     (tmp_path / "record_dataset_StopCube_metadata.json").write_text(json.dumps({"records": records}))
     builder = wrapper.BenchmarkEnvBuilder("StopCube", override_metadata_path=tmp_path)
@@ -58,24 +58,26 @@ def test_episodes_of_ones_own_come_from_a_folder(wrapper: ModuleType, tmp_path: 
 def test_its_environment_is_make_envs(wrapper: ModuleType) -> None:
     importlib.import_module("robomme.robomme_env")
     builder = wrapper.BenchmarkEnvBuilder("StopCube", dataset="val", max_steps=5)
-    theirs = builder.make_env_for_episode(3, include_front_depth=True)
-    ours = make_env("StopCube", "val", 3, max_steps=5, include_front_depth=True)
+    benchmark_env = builder.make_env_for_episode(3, include_front_depth=True)
+    local_env = make_env("StopCube", "val", 3, max_steps=5, include_front_depth=True)
     try:
-        assert theirs.unwrapped.difficulty == metadata.episode("StopCube", "val", 3).difficulty
-        seen, info = theirs.reset()
-        expected, told = ours.reset()
-        assert info["task_goal"] == told["task_goal"]
-        assert set(seen) == set(expected) and "front_depth_list" in seen
+        assert benchmark_env.unwrapped.difficulty == metadata.episode("StopCube", "val", 3).difficulty
+        observation, info = benchmark_env.reset()
+        expected, info_ = local_env.reset()
+        assert info["task_goal"] == info_["task_goal"]
+        assert set(observation) == set(expected) and "front_depth_list" in observation
         for key, values in expected.items():
-            np.testing.assert_array_equal(np.stack(seen[key]), np.stack(values), err_msg=key)
-        action = np.array([*seen["joint_state_list"][-1][:7], 1.0], np.float32)
-        moved, *_ = theirs.step(action + 0.01)
-        np.testing.assert_array_equal(moved["front_rgb_list"][-1], ours.step(action + 0.01)[0]["front_rgb_list"][-1])
-        statuses = [theirs.step(action)[4]["status"] for _ in range(8)]
+            np.testing.assert_array_equal(np.stack(observation[key]), np.stack(values), err_msg=key)
+        action = np.array([*observation["joint_state_list"][-1][:7], 1.0], np.float32)
+        after_step, *_ = benchmark_env.step(action + 0.01)
+        np.testing.assert_array_equal(
+            after_step["front_rgb_list"][-1], local_env.step(action + 0.01)[0]["front_rgb_list"][-1]
+        )
+        statuses = [benchmark_env.step(action)[4]["status"] for _ in range(8)]
         assert statuses[0] == "ongoing" and statuses[-1] == "timeout"
     finally:
-        theirs.close()
-        ours.close()
+        benchmark_env.close()
+        local_env.close()
 
 
 def test_it_is_not_taken_for_the_official_package(wrapper: ModuleType) -> None:

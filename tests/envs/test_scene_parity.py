@@ -60,12 +60,12 @@ class Episode:
     def at(self, step: int, key: str) -> Any:
         return self._group[f"timestep_{step}/{key}"][()]
 
-    def picture_steps(self, view: str, most: int) -> list[int]:
+    def image_steps(self, view: str, most: int) -> list[int]:
         """Steps with an image of their own, spread over the episode; small files link others to the one before."""
         paths = [f"timestep_{k}/obs/{view}" for k in range(self.length)]
         places = [h5py.h5o.get_info(self._group[path].id).addr for path in paths]
-        own = [k for k in range(self.length) if k == 0 or places[k] != places[k - 1]]
-        return [own[i] for i in np.linspace(0, len(own) - 1, min(most, len(own))).astype(int)]
+        changes = [k for k in range(self.length) if k == 0 or places[k] != places[k - 1]]
+        return [changes[i] for i in np.linspace(0, len(changes) - 1, min(most, len(changes))).astype(int)]
 
     def texts(self, key: str) -> list[str]:
         """The different texts in the order they appear, each once in a row."""
@@ -76,8 +76,10 @@ class Episode:
         """What to do in an action space from the first execution frame on."""
         steps = range(self.execution, self.length)
         if space == "multi_choice":
-            chosen = [text(self.at(k, "action/choice_action")) for k in steps if self.at(k, "info/is_subgoal_boundary")]
-            return [choice for choice in map(json.loads, chosen) if choice["choice"]]
+            choices = [
+                text(self.at(k, "action/choice_action")) for k in steps if self.at(k, "info/is_subgoal_boundary")
+            ]
+            return [choice for choice in map(json.loads, choices) if choice["choice"]]
         key = {"joint_angle": "joint_action", "ee_pose": "eef_action", "waypoint": "waypoint_action"}[space]
         actions = [self.at(k, f"action/{key}") for k in steps]
         if space != "waypoint":
@@ -113,14 +115,14 @@ def test_replaying_the_execution_succeeds(episode: Episode, space: str) -> None:
     assert info["status"] == "success", info.get("error_message")
 
 
-def test_pictures_along_the_replay_are_the_recorded_ones(episode: Episode) -> None:
+def test_images_along_the_replay_are_the_recorded_ones(episode: Episode) -> None:
     try:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
-    wanted = {view: episode.picture_steps(view, MOST_PICTURES) for view in ("front_rgb", "wrist_rgb")}
+    steps_of = {view: episode.image_steps(view, MOST_PICTURES) for view in ("front_rgb", "wrist_rgb")}
     # The list that an episode begins with ends with a frame that no step was stored for.
-    numbers = {view: frozenset(k + (k >= episode.execution) for k in steps) for view, steps in wanted.items()}
+    numbers = {view: frozenset(k + (k >= episode.execution) for k in steps) for view, steps in steps_of.items()}
     env = make_env(episode.ref.task, max_steps=5000, **episode.scene)
     # An image takes as long as dozens of steps.
     env.render_request = RenderRequest(
@@ -128,23 +130,23 @@ def test_pictures_along_the_replay_are_the_recorded_ones(episode: Episode) -> No
     )
     observation, _ = env.reset()
     assert len(observation["front_rgb_list"]) == episode.execution + 1
-    views = {view: observation[f"{view}_list"][:-1] for view in wanted}
+    views = {view: observation[f"{view}_list"][:-1] for view in steps_of}
     for action in episode.actions("joint_angle"):
         observation, _, terminated, _, _ = env.step(action)
-        for view, pictures in views.items():
-            pictures += observation[f"{view}_list"]
+        for view, images in views.items():
+            images += observation[f"{view}_list"]
         if bool(terminated):
             break
     env.close()
-    for view, pictures in views.items():
-        steps = [k for k in wanted[view] if k < len(pictures)]
-        assert len(steps) >= 0.8 * len(wanted[view]), "the replay ends long before the recording does"
+    for view, images in views.items():
+        steps = [k for k in steps_of[view] if k < len(images)]
+        assert len(steps) >= 0.8 * len(steps_of[view]), "the replay ends long before the recording does"
         for k in steps:
-            difference = np.abs(pictures[k].astype(int) - episode.at(k, f"obs/{view}").astype(int)).mean()
+            difference = np.abs(images[k].astype(int) - episode.at(k, f"obs/{view}").astype(int)).mean()
             assert difference < PIXELS_ALONG, f"{view} of step {k} differs by {difference:.2f} of 255 on average"
 
 
-def test_a_demonstration_of_ours_is_stored_as_the_official_one(episode: Episode) -> None:
+def test_a_local_demonstration_is_stored_as_the_official_one(episode: Episode) -> None:
     env = make_task(episode.ref.task, render=False, **episode.scene)
     recorded = Recorder(env, render=False).record()
     env.close()
@@ -159,35 +161,35 @@ def test_a_demonstration_of_ours_is_stored_as_the_official_one(episode: Episode)
         json.loads(text(episode.at(k, "action/choice_action"))) for k, _ in steps
     ]
     for name in ("joint_action", "eef_action", "waypoint_action"):
-        ours = np.stack([s.action[name] for _, s in steps])
-        theirs = np.stack([episode.at(k, f"action/{name}") for k, _ in steps])
+        actual = np.stack([s.action[name] for _, s in steps])
+        official = np.stack([episode.at(k, f"action/{name}") for k, _ in steps])
         # After a press the arm rests a little differently.
-        np.testing.assert_allclose(ours, theirs, atol=5e-3, err_msg=name)
+        np.testing.assert_allclose(actual, official, atol=5e-3, err_msg=name)
     for name in ("joint_state", "eef_state", "gripper_state"):
-        ours = np.stack([s.obs[name] for _, s in steps])
-        theirs = np.stack([episode.at(k, f"obs/{name}") for k, _ in steps])
-        np.testing.assert_allclose(ours, theirs, atol=5e-3, err_msg=name)
+        actual = np.stack([s.obs[name] for _, s in steps])
+        official = np.stack([episode.at(k, f"obs/{name}") for k, _ in steps])
+        np.testing.assert_allclose(actual, official, atol=5e-3, err_msg=name)
 
 
 class FirstStepError(Exception):
     """The first stored step has been seen."""
 
 
-def test_the_first_picture_is_the_recorded_one(episode: Episode) -> None:
+def test_the_first_image_is_the_recorded_one(episode: Episode) -> None:
     try:
         render_backend()
     except UserError as error:
         pytest.skip(str(error))
     env = make_task(episode.ref.task, render=True, **episode.scene)
-    seen: list[RecordedStep] = []
+    steps: list[RecordedStep] = []
 
     def stop(step: RecordedStep) -> None:
-        seen.append(step)
+        steps.append(step)
         raise FirstStepError
 
     with pytest.raises(FirstStepError):
         Recorder(env, on_step=stop).record()
     env.close()
     for view in ("front_rgb", "wrist_rgb"):
-        difference = np.abs(seen[0].obs[view].astype(int) - episode.at(0, f"obs/{view}").astype(int)).mean()
+        difference = np.abs(steps[0].obs[view].astype(int) - episode.at(0, f"obs/{view}").astype(int)).mean()
         assert difference < PIXELS, f"{view} differs by {difference:.2f} of 255 on average"

@@ -22,20 +22,20 @@ from mme_vla.play import run as play
     ],
 )
 def test_the_same_words_choose_the_same_episodes_in_every_command(episodes: str, numbers: list[int]) -> None:
-    given = ["tasks=[StopCube,BinFill]", f"episodes={episodes}"]
+    overrides = ["tasks=[StopCube,BinFill]", f"episodes={episodes}"]
     expected = [(task, number) for task in ("StopCube", "BinFill") for number in numbers]
-    chosen = {}
+    episodes_by_command = {}
     for command in ("evaluate", "play", "record", "show"):
         more = ["output=x", "split=test"] if command == "record" else []
-        cfg = compose(command, [*given, *more])
+        cfg = compose(command, [*overrides, *more])
         named = (named_tasks(cfg), cfg.episodes, cfg.split)
-        chosen[command] = {
+        episodes_by_command[command] = {
             "evaluate": lambda: rollout_plan.choose_episodes(*named),  # noqa: B023 (called at once)
             "play": lambda: play.choose_episodes(*named),  # noqa: B023
             "record": lambda: record.plan(cfg),  # noqa: B023
             "show": lambda: choose_episodes(*named),  # noqa: B023
         }[command]()
-    assert {name: [(e.task, e.episode) for e in found] for name, found in chosen.items()} == dict.fromkeys(
+    assert {name: [(e.task, e.episode) for e in specs] for name, specs in episodes_by_command.items()} == dict.fromkeys(
         ("evaluate", "play", "record", "show"), expected
     )
 

@@ -38,14 +38,14 @@ def fixed_noise() -> Tensor:
 
 
 @pytest.mark.parametrize("model", ["framesamp_context", "tokendrop_expert", "pi05"])
-def test_attention_mass_is_that_of_the_networks_own_logits(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_attention_mass_is_that_of_the_networks_logits(model: str, monkeypatch: pytest.MonkeyPatch) -> None:
     policy = small_policy(model)
     batch = random_batch(policy, 2)
-    seen: list[tuple[Tensor, ...]] = []
+    masks: list[tuple[Tensor, ...]] = []
     original = gemma.attend
 
     def spy(q: Tensor, k: Tensor, v: Tensor, mask: Tensor) -> Tensor:
-        seen.append((q, k.clone(), mask))  # the next step writes its keys into the same place
+        masks.append((q, k.clone(), mask))  # the next step writes its keys into the same place
         return original(q, k, v, mask)
 
     monkeypatch.setattr(gemma, "attend", spy)
@@ -54,7 +54,7 @@ def test_attention_mass_is_that_of_the_networks_own_logits(model: str, monkeypat
     mass = watch.result()
     assert mass.layers.sum(1) == pytest.approx(torch.ones(3))
     depth, actions = len(policy.backbone.transformer.layers), 20
-    first = [(q, k, m) for q, k, m in seen if q.shape[1] == actions and k.shape[1] > actions][::depth]  # layer 0
+    first = [(q, k, m) for q, k, m in masks if q.shape[1] == actions and k.shape[1] > actions][::depth]  # layer 0
     assert len(first) == 2
     expected = []
     for q, k, m in first:
@@ -116,10 +116,10 @@ def test_wrong_policies_are_named() -> None:
 
 def test_a_replay_shows_every_frame_once(sample: EpisodeSource) -> None:
     policy = small_policy("framesamp_modul", backbone=FEW_TOKENS)
-    seen = [(step, running.n_observed_frames) for step, running in replay(policy, sample, 0, stride=32)]
+    observed = [(step, running.n_observed_frames) for step, running in replay(policy, sample, 0, stride=32)]
     start = int(sample.exec_starts[0])
-    assert seen == [(step, step + 1) for step in range(start, int(sample.lengths[0]), 32)]
-    assert [step for step, _ in replay(policy, sample, 0, stride=32, most=2)] == [seen[0][0], seen[-1][0]]
+    assert observed == [(step, step + 1) for step in range(start, int(sample.lengths[0]), 32)]
+    assert [step for step, _ in replay(policy, sample, 0, stride=32, most=2)] == [observed[0][0], observed[-1][0]]
     with pytest.raises(UserError, match="has episodes 0 … 3"):
         next(replay(policy, sample, 4))
 
@@ -140,7 +140,7 @@ def test_ttt_learns_from_each_frame_and_rmt_reports_its_change(sample: EpisodeSo
         recurrence_curves(small_policy("pi05"), sample, 1)
 
 
-def test_pictures_of_any_size_become_a_video(tmp_path: Path) -> None:
+def test_images_of_any_size_become_a_video(tmp_path: Path) -> None:
     path = tmp_path / "a" / "b.mp4"
     write_video(of_one_size([Image.new("RGB", size, (200, 30, 30)) for size in ((64, 40), (101, 57))]), path)
     with av.open(str(path)) as container:
@@ -151,13 +151,13 @@ def test_pictures_of_any_size_become_a_video(tmp_path: Path) -> None:
     assert frames[1][50:56, :90, 1].mean() < 70
 
 
-def test_the_selection_command_writes_a_video_and_a_sheet(tmp_path: Path) -> None:
+def test_the_selection_command_saves_a_video_and_a_sheet(tmp_path: Path) -> None:
     path = tmp_path / "out.mp4"
     main(["selection", "--memory", "framesamp", "--set", "memory.budget=64", "--every", "60", "--output", str(path)])
     with av.open(str(path)) as container:
         assert len(list(container.decode(video=0))) == 2
-    with Image.open(path.with_suffix(".png")) as picture:
-        assert picture.width > 800
+    with Image.open(path.with_suffix(".png")) as image:
+        assert image.width > 800
 
 
 def test_the_attention_command_works_on_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -202,7 +202,7 @@ def test_mistakes_end_with_a_sentence(arguments: list[str], message: str, capsys
     ids=["attention", "modulation", "recurrence", "selection"],
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore:load_recording:DeprecationWarning")
-def test_rerun_gets_pictures_words_and_numbers(arguments: list[str], logged: str, tmp_path: Path) -> None:
+def test_rerun_gets_images_words_and_numbers(arguments: list[str], logged: str, tmp_path: Path) -> None:
     rerun = pytest.importorskip("rerun", reason="needs the extra viz")
     path = tmp_path / "log.rrd"
     episode = [] if arguments[0] == "selection" else ["--episodes", "0"]
@@ -219,7 +219,7 @@ def test_rerun_files_have_the_viewers_suffix(tmp_path: Path) -> None:
         RerunLog(tmp_path / "log.txt")
 
 
-def test_laps_of_a_watch_add_up_to_the_whole() -> None:
+def test_laps_of_a_watch_add_up_to_the_total() -> None:
     policy = small_policy("framesamp_modul")
     batch = random_batch(policy, 2)
     with AttentionWatch(policy) as attention, ModulationWatch(policy) as modulation:

@@ -29,26 +29,26 @@ MEMORIES: dict[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("name", MEMORIES)
-def test_drawing_what_is_needed_changes_no_action(name: str) -> None:
+def test_rendering_what_is_needed_changes_no_action(name: str) -> None:
     policy = quick_policy(name, patch_size=8 if name != "pi05" else 16, **MEMORIES[name])
-    *everything, video, plain = both_ways(policy)
+    *everything, video, full = both_ways(policy)
     assert everything == [{"front": n, "wrist": n} for n in FRAMES]
     chunks = -(-STEPS // 16)
     last = STEPS % 16 > 0  # the step limit cuts the last chunk short: nobody acts on its end
-    assert video["wrist"] == plain["wrist"] == 1 + chunks - last
+    assert video["wrist"] == full["wrist"] == 1 + chunks - last
     memory = policy.memory
     if memory is None:
-        assert video["front"] == plain["front"] == plain["wrist"]
+        assert video["front"] == full["front"] == full["wrist"]
     else:
-        assert plain["front"] < FRAMES[1] and video["front"] < FRAMES[0]
+        assert full["front"] < FRAMES[1] and video["front"] < FRAMES[0]
 
 
 @pytest.mark.parametrize("name", ["simplesg", "groundsg"])
-def test_the_environments_own_subgoals_need_no_pictures(name: str) -> None:
+def test_the_environments_subgoals_need_no_images(name: str) -> None:
     policy = quick_policy(name)
     kind = "simple" if name == "simplesg" else "grounded"
-    *_, video, plain = both_ways(policy, Oracle(kind))
-    assert video == plain == {"front": 5, "wrist": 5}
+    *_, video, full = both_ways(policy, Oracle(kind))
+    assert video == full == {"front": 5, "wrist": 5}
 
 
 class Watcher(SubgoalPredictor):
@@ -71,12 +71,12 @@ class Watching(SubgoalEpisode):
         self.total += int(frames.astype(np.int64).sum())
 
 
-def test_a_predictor_that_watches_is_shown_every_frame_of_its_camera() -> None:
+def test_a_predictor_that_watches_gets_every_frame_of_its_camera() -> None:
     policy = quick_policy("simplesg")
-    *_, video, plain = both_ways(policy, Watcher("simple"))
+    *_, video, full = both_ways(policy, Watcher("simple"))
     # Of the last chunk, which the step limit cuts short, nothing more is asked than of others.
-    assert (video["front"], plain["front"]) == tuple(FRAMES)
-    assert video["wrist"] == plain["wrist"] == 5
+    assert (video["front"], full["front"]) == tuple(FRAMES)
+    assert video["wrist"] == full["wrist"] == 5
 
 
 class Glancer(Watcher):
@@ -93,25 +93,25 @@ class Glancer(Watcher):
 
 
 @pytest.mark.parametrize("background", [False, True])
-def test_a_predictor_that_looks_at_the_present_counts_the_frames_that_passed(background: bool) -> None:
+def test_a_predictor_that_reads_the_present_counts_the_frames_that_passed(background: bool) -> None:
     predictor = Glancer("simple")
     both_ways(quick_policy("simplesg"), BackgroundPredictor(predictor) if background else predictor)
 
 
 @pytest.mark.parametrize("name", ["pi05", "rmt_modul"])
-def test_a_film_shows_everything_and_changes_nothing(name: str, tmp_path: Path) -> None:
+def test_a_video_shows_everything_and_changes_nothing(name: str, tmp_path: Path) -> None:
     policy = quick_policy(name, patch_size=8 if name != "pi05" else 16)
     bare = roll(policy, JOBS, InlineEnvs(base=make_watched_env, max_steps=STEPS - 1), max_steps=STEPS - 1)
     envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1, videos=(str(tmp_path), "all"))
-    filmed = roll(policy, JOBS, envs, max_steps=STEPS - 1)
-    assert outcomes(filmed) == outcomes(bare)
+    recorded = roll(policy, JOBS, envs, max_steps=STEPS - 1)
+    assert outcomes(recorded) == outcomes(bare)
     assert {job: env.drawn for job, env in envs.made.items()} == {
         job: {"front": n, "wrist": n} for job, n in zip(JOBS, FRAMES, strict=True)
     }
-    assert all((tmp_path / record.extra["video"]).stat().st_size for record in filmed)
+    assert all((tmp_path / record.extra["video"]).stat().st_size for record in recorded)
 
 
-def test_a_policy_that_does_not_say_what_it_looks_at_is_shown_everything() -> None:
+def test_a_policy_that_does_not_say_what_it_reads_gets_all_frames() -> None:
     policy = quick_policy("pi05")
     policy.frames_read = lambda steps, exec_start: Policy.frames_read(policy, steps, exec_start)
     envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1)
@@ -131,17 +131,17 @@ def test_an_environment_that_does_not_repeat_its_video_is_refused() -> None:
         roll(quick_policy("framesamp_modul", patch_size=8, memory={"budget": 64}), JOBS[:1], envs)
 
 
-def test_what_is_drawn_is_a_choice_of_two() -> None:
+def test_what_is_rendered_is_a_choice_of_two() -> None:
     with pytest.raises(UserError, match=r"draw='need'.*needed"):
         RolloutSettings(draw="need")
 
 
-def test_acting_on_a_frame_that_was_not_drawn_is_refused() -> None:
+def test_acting_on_a_frame_that_was_not_rendered_is_refused() -> None:
     policy = quick_policy("pi05")
     episode = policy.start_episode("pick up the cube")
-    pictures = np.zeros((1, 64, 64, 3), np.uint8)
-    drawn = {"front": np.array([0]), "wrist": np.array([0])}
-    episode.observe({"front": pictures, "wrist": pictures}, np.zeros((3, 8), np.float32), rendered=drawn)
+    images = np.zeros((1, 64, 64, 3), np.uint8)
+    rendered = {"front": np.array([0]), "wrist": np.array([0])}
+    episode.observe({"front": images, "wrist": images}, np.zeros((3, 8), np.float32), rendered=rendered)
     assert episode.n_observed_frames == 3
     with pytest.raises(UserError, match="current frame was not rendered"):
         policy.act(episode)

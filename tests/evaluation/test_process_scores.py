@@ -67,9 +67,9 @@ def test_every_task_says_what_its_sub_tasks_ask_of_memory(task: str) -> None:
     load_tasks(task)
     spec = metadata.episode(task)
     env: Any = make(TASKS[task], spec.seed, spec.difficulty)
-    asked = [subtask.operation for subtask in env.progress.subtasks if not subtask.video and subtask.operation]
-    assert asked and all(callable(operation) or operation in OPERATIONS for operation in asked)
-    assert {operation() for operation in asked if callable(operation)} <= {"", *OPERATIONS}
+    operations = [subtask.operation for subtask in env.progress.subtasks if not subtask.video and subtask.operation]
+    assert operations and all(callable(operation) or operation in OPERATIONS for operation in operations)
+    assert {operation() for operation in operations if callable(operation)} <= {"", *OPERATIONS}
     env.close()
 
 
@@ -103,11 +103,11 @@ def test_records_tables_and_the_report_tell_it() -> None:
     assert process_of(silent) is None
     scores = [ProcessScore(1, 4, "wrong", "how many", "x"), ProcessScore(3, 4, "stuck", "", "y"), ProcessScore(4, 4)]
     outcomes = ["fail", "timeout", "success"]
-    told = [
+    rows = [
         EpisodeRecord("m", 1, 7, "PickXtimes", i, i, "easy", outcome, 9, extra={"process": score.to_dict()})
         for i, (outcome, score) in enumerate(zip(outcomes, scores, strict=True))
     ]
-    results = aggregate([EpisodeRecord.from_json(r.to_json()) for r in told], Protocol(("PickXtimes",), 3), "test")
+    results = aggregate([EpisodeRecord.from_json(r.to_json()) for r in rows], Protocol(("PickXtimes",), 3), "test")
     (table,) = process_tables(results)
     row = dict(zip(table.columns, table.rows[-1], strict=True))
     assert (row["episodes"], row["progress (%)"], row["how many"], row["stuck"]) == ("3", "66.7", "1", "1")

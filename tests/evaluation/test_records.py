@@ -50,7 +50,7 @@ def test_every_record_is_on_disk_when_append_returns(tmp_path: Path) -> None:
             assert read_records(path)[-1].episode == episode
 
 
-def test_a_half_written_last_line_is_ignored_and_then_repaired(tmp_path: Path) -> None:
+def test_a_half_saved_last_line_is_ignored_and_then_repaired(tmp_path: Path) -> None:
     path = tmp_path / "episodes.jsonl"
     with RecordLog(path) as log:
         log.append(record(episode=0))
@@ -66,7 +66,7 @@ def test_a_half_written_last_line_is_ignored_and_then_repaired(tmp_path: Path) -
         path.write_text(record(episode=0).to_json() + "\n")
 
 
-def test_a_last_line_that_lacks_only_its_end_is_kept(tmp_path: Path) -> None:
+def test_a_last_line_that_lacks_only_its_end_is_valid(tmp_path: Path) -> None:
     path = tmp_path / "episodes.jsonl"
     path.write_text(record(episode=0).to_json())
     with warnings.catch_warnings():
@@ -76,7 +76,7 @@ def test_a_last_line_that_lacks_only_its_end_is_kept(tmp_path: Path) -> None:
         assert [r.episode for r in read_records(path)] == [0, 1]
 
 
-def test_damage_elsewhere_is_an_error_with_its_line(tmp_path: Path) -> None:
+def test_damage_in_other_lines_is_an_error_with_its_line(tmp_path: Path) -> None:
     path = tmp_path / "episodes.jsonl"
     path.write_text(f"{record().to_json()}\n{{broken\n{record(episode=1).to_json()}\n")
     with pytest.raises(UserError, match="line 2"):
@@ -90,12 +90,12 @@ def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
     RecordLog(path).close()
 
 
-def test_shards_of_a_folder_are_found_once(tmp_path: Path) -> None:
+def test_shards_of_a_folder_are_detected_once(tmp_path: Path) -> None:
     for name in ("a/episodes-0.jsonl", "a/episodes-1.jsonl", "b/episodes.jsonl", "b/other.jsonl"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text("")
-    found = find_records([tmp_path, tmp_path / "b" / "episodes.jsonl"])
-    assert [str(f.relative_to(tmp_path)) for f in found] == [
+    files = find_records([tmp_path, tmp_path / "b" / "episodes.jsonl"])
+    assert [str(f.relative_to(tmp_path)) for f in files] == [
         "a/episodes-0.jsonl",
         "a/episodes-1.jsonl",
         "b/episodes.jsonl",
@@ -113,7 +113,7 @@ def test_a_result_supersedes_an_error_in_whatever_order(turned: bool) -> None:
     assert [r.outcome for r in merge(both[::-1] if turned else both)] == ["fail"]
 
 
-def test_conflicting_outcomes_are_refused_or_chosen_by_time() -> None:
+def test_conflicting_outcomes_are_refused_or_selected_by_time() -> None:
     early, late = record(when="2026-01-01T00:00:00+00:00"), record(outcome="fail", when="2026-01-02T00:00:00+00:00")
     with pytest.raises(UserError, match="evaluated twice"):
         merge([early, late])
@@ -142,13 +142,13 @@ def test_a_run_of_two_step_limits_is_refused() -> None:
         by_run([record(), record(episode=1, max_steps=300)])
 
 
-def test_errors_are_retried_unless_told_otherwise() -> None:
+def test_errors_are_retried_by_default() -> None:
     records = [record(), record(episode=1, outcome="error"), record(episode=2, outcome="timeout")]
     assert finished(records) == {EpisodeKey("BinFill", 0), EpisodeKey("BinFill", 2)}
     assert finished(records, retry_errors=False) == {EpisodeKey("BinFill", e) for e in range(3)}
 
 
-def test_a_run_resumes_only_with_its_own_settings(tmp_path: Path) -> None:
+def test_a_run_resumes_only_with_its_settings(tmp_path: Path) -> None:
     settings = {"checkpoint": 100, "seeds": (7, 42), "env": {"split": "test", "max_steps": 1300}}
     first = claim_run(tmp_path, settings, notes={"device": "cpu"})
     assert claim_run(tmp_path, settings, notes={"device": "cuda"}) == first == read_run(tmp_path)
@@ -187,7 +187,7 @@ def test_a_run_begins_and_resumes_where_there_are_no_hard_links(
     assert sorted(f.name for f in tmp_path.iterdir()) == ["run.json"]
 
 
-def test_processes_of_one_number_on_two_hosts_do_not_share_a_file(
+def test_processes_of_one_number_on_two_machines_do_not_share_a_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     linked = []

@@ -73,7 +73,7 @@ def made_up() -> list[EpisodeRecord]:
 
 
 @pytest.fixture
-def drawn_once(monkeypatch: pytest.MonkeyPatch, made_up: list[EpisodeRecord]) -> None:
+def sampled_once(monkeypatch: pytest.MonkeyPatch, made_up: list[EpisodeRecord]) -> None:
     """The command's synthetic records are drawn for all tests at once."""
     monkeypatch.setattr(results_command, "demo_records", lambda methods: list(made_up))
 
@@ -83,12 +83,12 @@ def drawn_once(monkeypatch: pytest.MonkeyPatch, made_up: list[EpisodeRecord]) ->
 
 @pytest.mark.parametrize(("method", "average"), [("FrameSamp+Modul", 44.51), ("pi_0.5", 17.93)])
 def test_records_with_the_papers_rates_give_the_papers_average_suites_and_groups(method: str, average: float) -> None:
-    (found,) = aggregate(as_published(method), Protocol(samples=100)).methods
-    assert found.average.mean == pytest.approx(average, abs=0.006)
-    assert found.average.complete == 9
+    (method_result,) = aggregate(as_published(method), Protocol(samples=100)).methods
+    assert method_result.average.mean == pytest.approx(average, abs=0.006)
+    assert method_result.average.complete == 9
     for kind, table in (("suite", "suites"), ("group", "groups")):
         printed = next(row for row in paper.paper_table(table) if row["method"] == method)
-        for name, figure in found.figures[kind].items():
+        for name, figure in method_result.figures[kind].items():
             if (method, name) not in MISPRINTS:
                 assert figure.mean == pytest.approx(float(printed[name]), abs=0.0101), name
 
@@ -96,9 +96,11 @@ def test_records_with_the_papers_rates_give_the_papers_average_suites_and_groups
 def test_the_papers_tasks_give_its_averages_suites_and_groups() -> None:
     differing = set()
     for row in paper.paper_table("suites"):
-        found = {suite: paper.suite_mean(row["method"], suite).mean for suite in SUITES}
-        found["average"] = paper.average(row["method"]).mean
-        differing |= {(row["method"], name) for name, mean in found.items() if abs(mean - float(row[name])) > 0.0101}
+        suite_means = {suite: paper.suite_mean(row["method"], suite).mean for suite in SUITES}
+        suite_means["average"] = paper.average(row["method"]).mean
+        differing |= {
+            (row["method"], name) for name, mean in suite_means.items() if abs(mean - float(row[name])) > 0.0101
+        }
     for row in paper.paper_table("groups"):
         means = {group: paper.group_mean(row["method"], group).mean for group in GROUPS}
         differing |= {(row["method"], name) for name, mean in means.items() if abs(mean - float(row[name])) > 0.0101}
@@ -106,8 +108,8 @@ def test_the_papers_tasks_give_its_averages_suites_and_groups() -> None:
 
 
 def test_the_shipped_numbers_are_the_papers(shared: Path) -> None:
-    for name, theirs in {"per_task": "results_per_task", "memory_budget": "memory_budget"}.items():
-        assert paper.paper_table(name) == list(csv.DictReader((shared / "paper" / f"{theirs}.csv").open()))
+    for name, published in {"per_task": "results_per_task", "memory_budget": "memory_budget"}.items():
+        assert paper.paper_table(name) == list(csv.DictReader((shared / "paper" / f"{published}.csv").open()))
     for row in csv.DictReader((shared / "paper" / "task_groups.csv").open()):
         task = TASK_FACTS[row["task"]]
         facts = (task.suite, "+".join(task.memory), task.group, str(task.steps))
@@ -117,8 +119,8 @@ def test_the_shipped_numbers_are_the_papers(shared: Path) -> None:
 def test_every_task_stands_in_both_orders_and_every_model_has_its_paper_numbers() -> None:
     assert sorted(TASK_NAMES) == sorted(PAPER_ORDER)
     assert len(TASK_NAMES) == 16
-    ours = {method.model for method in paper.paper_methods().values()} - {None}
-    assert ours | set(ALL_MODELS) | set(ALL_BEYOND) <= set(chunk_flops())
+    models = {method.model for method in paper.paper_methods().values()} - {None}
+    assert models | set(ALL_MODELS) | set(ALL_BEYOND) <= set(chunk_flops())
 
 
 # Statistics
@@ -138,7 +140,7 @@ def test_repeats_of_the_same_episodes_are_worth_less_than_new_ones() -> None:
     assert effective_trials(np.ones((50, 9))) == 50  # no difference seen: nothing known of agreement
 
 
-def test_the_bootstrap_covers_the_truth_as_often_as_it_says() -> None:
+def test_the_bootstrap_covers_the_truth_as_frequently_as_it_says() -> None:
     rng, covered = np.random.default_rng(1), 0
     for trial in range(200):
         interval = bootstrap(
@@ -176,10 +178,10 @@ def test_runs_are_averaged_after_their_tasks() -> None:
     assert set(method.figures["group"]) == {"Event-Salient"}
 
 
-def test_an_incomplete_run_is_shown_as_incomplete_and_never_averaged() -> None:
-    whole = records("a", {"BinFill": [1, 1, 0, 0], "MoveCube": [1, 0, 0, 0]}, seed=0)
+def test_an_incomplete_run_is_reported_as_incomplete_and_never_averaged() -> None:
+    complete = records("a", {"BinFill": [1, 1, 0, 0], "MoveCube": [1, 0, 0, 0]}, seed=0)
     part = records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1]}, seed=1)
-    results = aggregate(whole + part, SMALL)
+    results = aggregate(complete + part, SMALL)
     average = results.methods[0].average
     assert (average.mean, average.std, average.complete, average.runs) == (37.5, None, 1, 2)
     assert "(1 of 2 runs)" in overview(results).rows[0][-3]
@@ -193,7 +195,7 @@ def test_an_incomplete_run_is_shown_as_incomplete_and_never_averaged() -> None:
     assert board.rows[-1][1:] == ["incomplete", "incomplete"]
 
 
-def test_errors_are_failures_or_missing_as_asked() -> None:
+def test_errors_are_failures_or_missing_as_requested() -> None:
     made = records("a", {"BinFill": [1, 1, 1, 1], "MoveCube": [1, 1, 1, 1]})
     made[0] = replace(made[0], outcome="error")
     results = aggregate(made, SMALL)
@@ -261,11 +263,11 @@ def test_a_comparison_pairs_the_episodes() -> None:
     protocol = Protocol(("BinFill",), episodes=50, samples=500)
     a, b = [1] * 30 + [0] * 20, [1] * 20 + [0] * 30
     results = aggregate(records("a", {"BinFill": a}) + records("b", {"BinFill": b}), protocol)
-    found = compare(*results.methods, protocol)
-    assert (found.wins, found.losses, found.difference) == (10, 0, pytest.approx(20))
-    assert found.p == pytest.approx(2 / 2**10)
-    assert found.interval.low > 0
-    assert "a is significantly better than b" in found.verdict
+    result = compare(*results.methods, protocol)
+    assert (result.wins, result.losses, result.difference) == (10, 0, pytest.approx(20))
+    assert result.p == pytest.approx(2 / 2**10)
+    assert result.interval.low > 0
+    assert "a is significantly better than b" in result.verdict
     # The same two rates on other episodes: 30 against 20 differing pairs are no longer significant.
     shifted = aggregate(records("a", {"BinFill": a}) + records("b", {"BinFill": b[::-1]}), protocol)
     other = compare(*shifted.methods, protocol)
@@ -319,7 +321,7 @@ def test_csv_holds_the_figures_and_latex_escapes(demo: Results) -> None:
     assert r"$\pm$" in latex
 
 
-def test_the_command_reads_shards_and_writes_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_reads_shards_and_saves_every_format(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = tmp_path / "run"
     for shard in range(2):
         with RecordLog(run / f"episodes-{shard}.jsonl") as log:
@@ -371,13 +373,13 @@ def test_a_submission_tells_how_the_policy_was_trained(tmp_path: Path) -> None:
     assert unknown.count("state it manually") == 2
 
 
-@pytest.mark.usefixtures("drawn_once")
+@pytest.mark.usefixtures("sampled_once")
 def test_the_demo_says_that_it_is_made_up(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--demo", "--brief", "--samples", "20"])
     assert "Made-up records" in capsys.readouterr().out
 
 
-@pytest.mark.usefixtures("drawn_once")
+@pytest.mark.usefixtures("sampled_once")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [([], "Name files or folders"), (["nowhere"], "does not exist"),
@@ -397,7 +399,7 @@ def test_the_demo_draws_around_the_papers_rates(demo: Results) -> None:
     assert json.loads(demo_records([("pi05", None)], episodes=1)[0].to_json())["extra"] == {"made_up": True}
 
 
-def test_two_methods_without_a_common_episode_are_shown_and_refused_only_when_asked_to_be_compared(
+def test_two_methods_without_a_common_episode_are_listed_but_not_compared(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with RecordLog(tmp_path / "episodes.jsonl") as log:

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from helpers import commands
-from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, whole_run
-from helpers.scripted_env import make_far_env, make_mortal_env
+from helpers.rollout_fakes import FACTS, JOBS, InlineEnvs, quick_policy, roll, run_evaluation
+from helpers.scripted_env import make_mortal_env, make_moving_env
 from mme_vla import UserError
 from mme_vla.cli.evaluate import choose_device
 from mme_vla.envs.vector.pool import Job
@@ -58,9 +58,9 @@ def outcomes(folder: Path) -> dict:
 @pytest.mark.slow
 def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp_path: Path) -> None:
     policy = MMEPolicy.from_pretrained(str(checkpoint))
-    whole = whole_run(policy, tmp_path / "whole")
-    assert len(whole.records) == len(JOBS) == 6
-    assert len({record.outcome for record in whole.records}) > 1, "the episodes should differ"
+    straight = run_evaluation(policy, tmp_path / "whole")
+    assert len(straight.records) == len(JOBS) == 6
+    assert len({record.outcome for record in straight.records}) > 1, "the episodes should differ"
 
     folder, records = tmp_path / "killed", tmp_path / "killed" / "episodes.jsonl"
     run = commands.start("helpers.rollout_fakes", str(folder), str(checkpoint), "0.05")
@@ -79,28 +79,28 @@ def test_a_killed_run_goes_on_and_ends_as_one_that_was_not(checkpoint: Path, tmp
     assert 2 <= len(before) < 6
 
     with pytest.warns(UserWarning, match="half-written"):
-        resumed = whole_run(policy, folder)
+        resumed = run_evaluation(policy, folder)
     after = read_records(records)
     assert [(r.key, r.when) for r in after[: len(before)]] == before, "what was finished was run again"
     assert len(after) == len(resumed.records) == 6
     assert outcomes(folder) == outcomes(tmp_path / "whole")
-    assert whole_run(policy, folder).workload.batches == 0, "nothing was left to do"
+    assert run_evaluation(policy, folder).workload.batches == 0, "nothing was left to do"
 
 
 def test_a_dying_worker_is_an_error_that_is_tried_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     policy = quick_policy("pi05")
     (tmp_path / "graves").mkdir()
     monkeypatch.setenv("GRAVES", str(tmp_path / "graves"))
-    at_once = whole_run(policy, tmp_path / "a", make_mortal_env, jobs=JOBS[1:3])
-    written = read_records(tmp_path / "a" / "episodes.jsonl")
-    (error,) = [record for record in written if record.outcome == "error"]
+    at_once = run_evaluation(policy, tmp_path / "a", make_mortal_env, jobs=JOBS[1:3])
+    records = read_records(tmp_path / "a" / "episodes.jsonl")
+    (error,) = [record for record in records if record.outcome == "error"]
     assert error.key == ("PickXtimes", 1) and "exit code 3" in error.error and error.steps == 16
-    assert len(written) == 3 and {record.outcome for record in at_once.records} == {"timeout"}
+    assert len(records) == 3 and {record.outcome for record in at_once.records} == {"timeout"}
 
     (tmp_path / "graves" / "PickXtimes-1").unlink()
-    later = whole_run(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
+    later = run_evaluation(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
     assert [r.key for r in later.records if r.outcome == "error"] == [("PickXtimes", 1)]
-    resumed = whole_run(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
+    resumed = run_evaluation(policy, tmp_path / "b", make_mortal_env, jobs=JOBS[1:2], retries=0)
     assert {record.outcome for record in resumed.records} == {"timeout"}
     assert outcomes(tmp_path / "b").items() <= outcomes(tmp_path / "a").items()
 
@@ -109,11 +109,11 @@ def test_a_folder_is_gone_on_with_only_as_the_run_it_holds(tmp_path: Path, monke
     import mme_vla.evaluation.rollout.evaluation as module
 
     monkeypatch.setattr(module, "VecEnv", inline)
-    whole_run(quick_policy("pi05"), tmp_path, jobs=JOBS[:1])
+    run_evaluation(quick_policy("pi05"), tmp_path, jobs=JOBS[:1])
     with pytest.raises(UserError, match=r"execute was 16, is 8"):
-        whole_run(quick_policy("pi05"), tmp_path, execute=8)
+        run_evaluation(quick_policy("pi05"), tmp_path, execute=8)
     with pytest.raises(UserError, match=r"policy was"):
-        whole_run(quick_policy("framesamp_modul"), tmp_path)
+        run_evaluation(quick_policy("framesamp_modul"), tmp_path)
 
 
 def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,19 +123,21 @@ def test_episodes_of_other_runs_are_not_taken_for_this_ones(tmp_path: Path, monk
     policy = quick_policy("pi05")
     settings = RolloutSettings(max_steps=24, flow_steps=2, max_batch=1)
     for folder in (tmp_path / "runs" / "seed7", tmp_path / "runs"):  # the second lies above the first
-        done = module.evaluate(policy, JOBS[:1], folder, FACTS, settings, base=make_far_env, show_progress=False)
+        done = module.evaluate(policy, JOBS[:1], folder, FACTS, settings, base=make_moving_env, show_progress=False)
         assert done.workload.batches > 0 and len(done.records) == 1
     foreign = tmp_path / "runs" / "episodes-foreign.jsonl"
     other = EpisodeRecord("tiny", "untrained", 7, "PickXtimes", 1, 1, "easy", "success", 5)
     foreign.write_text(other.to_json() + "\n")
-    done = module.evaluate(policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_far_env, show_progress=False)
+    done = module.evaluate(
+        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_moving_env, show_progress=False
+    )
     assert done.workload.batches > 0 and {record.model_seed for record in done.records} == {42}
     assert module.evaluate(
-        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_far_env, show_progress=False
+        policy, JOBS[:2], tmp_path / "runs", FACTS, settings, base=make_moving_env, show_progress=False
     ).workload.batches == 0  # fmt: skip
 
 
-def test_shards_side_by_side_make_the_whole_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shards_side_by_side_make_the_full_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import mme_vla.evaluation.rollout.evaluation as module
 
     monkeypatch.setattr(module, "VecEnv", inline)
@@ -152,12 +154,12 @@ def test_shards_side_by_side_make_the_whole_run(tmp_path: Path, monkeypatch: pyt
     for index in range(2):
         shard = Shard(index, 2)
         mine = module.evaluate(
-            policy, JOBS[:4], tmp_path, FACTS, settings, shard=shard, base=make_far_env, show_progress=False
+            policy, JOBS[:4], tmp_path, FACTS, settings, shard=shard, base=make_moving_env, show_progress=False
         )
         assert len(mine.records) == 2
     assert sorted(path.name for path in find_records([tmp_path])) == ["episodes-0of2.jsonl", "episodes-1of2.jsonl"]
     both = outcomes(tmp_path)
-    whole_run(policy, tmp_path / "alone", make_far_env, jobs=JOBS[:4])
+    run_evaluation(policy, tmp_path / "alone", make_moving_env, jobs=JOBS[:4])
     assert both == outcomes(tmp_path / "alone")
 
 
@@ -181,7 +183,7 @@ def test_a_shard_comes_from_the_word_or_from_torchrun() -> None:
             choose_shard(wrong, {})
 
 
-def test_a_process_of_torchrun_takes_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_of_torchrun_takes_its_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 4)
     monkeypatch.setenv("LOCAL_RANK", "3")
@@ -190,15 +192,15 @@ def test_a_process_of_torchrun_takes_its_own_gpu(monkeypatch: pytest.MonkeyPatch
     assert choose_device("cpu") == torch.device("cpu")
 
 
-def test_episodes_are_chosen_by_name_number_or_list() -> None:
+def test_episodes_are_selected_by_name_number_or_list() -> None:
     assert choose_episodes("StopCube", 2) == [Job("StopCube", "test", 0), Job("StopCube", "test", 1)]
     assert [job.episode for job in choose_episodes(["StopCube"], [4, 1])] == [4, 1]
-    for tasks, episodes, said in (
+    for tasks, episodes, message in (
         ("StopCubes", None, "StopCube"), ([], None, "at least one"), (["BinFill", "BinFill"], None, "once"),
         ("BinFill", 51, "has 50"), ("BinFill", [50], "0 to 49"), ("BinFill", [1, 1], "once"),
         ("BinFill", "x", "not understood"),
     ):  # fmt: skip
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=message):
             choose_episodes(tasks, episodes)
 
 
@@ -229,7 +231,7 @@ def test_environments_that_cannot_begin_stop_the_run() -> None:
 def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp_path: Path) -> None:
     import av
 
-    options = {"base": make_far_env, "videos": (str(tmp_path), "all")}
+    options = {"base": make_moving_env, "videos": (str(tmp_path), "all")}
     records = roll(quick_policy("pi05"), [Job("VideoUnmask", "test", 0)], InlineEnvs(**options))
     (path,) = tmp_path.iterdir()
     assert path.name == "VideoUnmask_ep0_success_pick_up_the_red_cube.mp4" == records[0].extra["video"]
@@ -246,11 +248,11 @@ def test_videos_show_the_conditioning_part_in_red_and_are_named_by_their_end(tmp
     assert list(failed.iterdir()) == []
 
 
-def test_a_caption_stands_below_the_pictures() -> None:
+def test_a_caption_stands_below_the_images() -> None:
     front, wrist = np.zeros((64, 64, 3), np.uint8), np.full((64, 64, 3), 9, np.uint8)
-    bare, told = (video_frame([front, wrist], text) for text in (None, "press the button"))
-    assert bare.shape == (88, 128, 3) and np.array_equal(bare[:64], told[:64])
-    assert told[64:].max() > 200 and bare[64:].max() == 0
+    bare, captioned = (video_frame([front, wrist], text) for text in (None, "press the button"))
+    assert bare.shape == (88, 128, 3) and np.array_equal(bare[:64], captioned[:64])
+    assert captioned[64:].max() > 200 and bare[64:].max() == 0
     demo = video_frame([front, wrist], video=True)
     assert (demo[:BORDER, :128] == RED).all() and (demo[BORDER : 64 - BORDER, BORDER : 128 - BORDER].max() <= 9)
 

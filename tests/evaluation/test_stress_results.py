@@ -26,7 +26,7 @@ def test_the_test_split_is_the_zero_of_every_dial_of_its_run() -> None:
     assert mine[0].interval.low < 100 == mine[0].interval.high and len(stress_figures(curves)) == 1
 
 
-def test_the_command_writes_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_saves_the_curve(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, made in (("a", records("test", [1, 0])), ("b", records("stress:count=3", [0, 0]))):
         with RecordLog(tmp_path / name / "episodes.jsonl") as log:
             for record in made:

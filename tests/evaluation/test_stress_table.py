@@ -20,12 +20,12 @@ def test_the_table_of_dials_is_the_measured_one_and_has_every_dial_of_every_task
     assert set(measured) == {(actor, *pair) for actor in ACTORS for pair in dials}
     page = (REPOSITORY / "docs" / "evidence" / "benchmark.md").read_text()
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if "| +0: " in line]
-    shown, dial = {}, ""
+    table, dial = {}, ""
     for name, _, task, *solved in rows:
         dial = name.strip("`") or dial
-        for actor, told in zip(ACTORS, solved, strict=True):
-            cells = re.findall(r"\+(\d+): (\d+)/(\d+)", told)
-            shown[actor, dial, task] = {int(value): (int(won), int(of)) for value, won, of in cells}
-    found = {key: {at: (sum(won), len(won)) for at, won in values.items()} for key, values in measured.items()}
-    assert shown == found
+        for actor, rate in zip(ACTORS, solved, strict=True):
+            cells = re.findall(r"\+(\d+): (\d+)/(\d+)", rate)
+            table[actor, dial, task] = {int(value): (int(won), int(of)) for value, won, of in cells}
+    rates = {key: {at: (sum(won), len(won)) for at, won in values.items()} for key, values in measured.items()}
+    assert table == rates
     assert f"| `{SESSIONS}` |" in page

@@ -44,8 +44,8 @@ class Browser:
         """What the page's console says is wrong."""
         try:
             port = self._port()
-            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
-                page = next(target for target in json.load(answer) if target["type"] == "page")
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as response:
+                page = next(target for target in json.load(response) if target["type"] == "page")
             self._socket = sync.connect(page["webSocketDebuggerUrl"], max_size=None, proxy=None)
             for domain in ("Page", "Runtime", "Log"):
                 self.call(f"{domain}.enable")
@@ -59,8 +59,8 @@ class Browser:
     def _port(self) -> int:
         assert self._process.stderr is not None
         for line in self._process.stderr:
-            if found := re.search(r"DevTools listening on ws://[^:]+:(\d+)/", line):
-                return int(found[1])
+            if match := re.search(r"DevTools listening on ws://[^:]+:(\d+)/", line):
+                return int(match[1])
         raise RuntimeError("Chromium ended without saying where it listens")
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
@@ -85,10 +85,10 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """The value of a JavaScript expression."""
-        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
-        if "exceptionDetails" in answer:
-            raise RuntimeError(f"{script}: {answer['exceptionDetails']}")
-        return answer["result"].get("value")
+        reply = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        if "exceptionDetails" in reply:
+            raise RuntimeError(f"{script}: {reply['exceptionDetails']}")
+        return reply["result"].get("value")
 
     def wait(self, script: str, seconds: float = 60) -> None:
         """Wait until an expression is true."""
@@ -121,7 +121,7 @@ class Browser:
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, **at)
 
-    def picture(self) -> bytes:
+    def screenshot(self) -> bytes:
         """The visible part of the page as PNG."""
         return base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
 

@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
-Answer = tuple[int, dict[str, Any]]
+Reply = tuple[int, dict[str, Any]]
 
 
-def says(text: str | None, finish: str = "stop", refusal: str | None = None) -> Answer:
+def says(text: str | None, finish: str = "stop", refusal: str | None = None) -> Reply:
     message = {"role": "assistant", "content": text, "refusal": refusal}
     return 200, {
         "id": "1", "object": "chat.completion", "created": 0, "model": "m",
@@ -19,7 +19,7 @@ def says(text: str | None, finish: str = "stop", refusal: str | None = None) -> 
     }  # fmt: skip
 
 
-def failure(code: int, message: str) -> Answer:
+def failure(code: int, message: str) -> Reply:
     return code, {"error": {"message": message, "type": "error", "code": None}}
 
 
@@ -27,8 +27,8 @@ class ChatServer:
     """Answers in turn, or as `answer` says for each request; keeps every request and its key."""
 
     def __init__(self) -> None:
-        self.answers: list[Answer] = []
-        self.answer: Callable[[dict[str, Any]], Answer] = lambda request: self.answers.pop(0)
+        self.answers: list[Reply] = []
+        self.respond: Callable[[dict[str, Any]], Reply] = lambda request: self.answers.pop(0)
         self.requests: list[dict[str, Any]] = []
         self.keys: list[str] = []
         self.url = ""
@@ -43,7 +43,7 @@ def chat_server() -> Iterator[ChatServer]:
             request = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
             state.requests.append(request)
             state.keys.append(self.headers.get("Authorization", ""))
-            code, body = state.answer(request) if self.path == "/v1/chat/completions" else failure(404, self.path)
+            code, body = state.respond(request) if self.path == "/v1/chat/completions" else failure(404, self.path)
             data = json.dumps(body).encode()
             self.send_response(code)
             self.send_header("Content-Type", "application/json")

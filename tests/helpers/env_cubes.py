@@ -24,19 +24,19 @@ class Hand:
     """Counts as grasping whatever it was told to carry, and puts it where it is told."""
 
     def __init__(self, env: Task, monkeypatch: pytest.MonkeyPatch) -> None:
-        self._env, self._held = env, None
-        monkeypatch.setattr(env, "is_grasping", lambda thing: thing is self._held)
+        self._env, self._grasped = env, None
+        monkeypatch.setattr(env, "is_grasping", lambda thing: thing is self._grasped)
 
     def carry(self, thing: Thing, over: Thing | None = None, z: float = 0.2) -> Flags:
         """Hold a thing in the air, by default above its place, for a step."""
-        self._held = thing
+        self._grasped = thing
         place = thing.position if over is None else over.position
         thing.move_to(sapien.Pose([*place[:2], z], thing.initial_pose.q))
         return wait(self._env)
 
     def release(self, place: Sequence[float] | None = None) -> Flags:
         """Let go of the thing on the table, by default where it stood at first."""
-        thing, self._held = self._held, None
+        thing, self._grasped = self._grasped, None
         assert thing is not None
         xy = thing.initial_pose.p[:2] if place is None else place[:2]
         thing.move_to(sapien.Pose([*xy, H], thing.initial_pose.q))

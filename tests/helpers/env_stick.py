@@ -44,23 +44,23 @@ class Ear:
     """A demonstrator that only notes where it was asked to go."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple] = []
+        self.calls: list[tuple] = []
 
     def stick_to(self, target: Thing) -> None:
-        self.asked.append((target,))
+        self.calls.append((target,))
 
     def stick_arc(self, target: Thing, direction: str) -> None:
-        self.asked.append((target, direction))
+        self.calls.append((target, direction))
 
 
-def circle(tip: Tip, start: Thing, goal: Thing, turn: str) -> Flags:
+def circle(tip: Tip, start: Thing, goal: Thing, direction: str) -> Flags:
     """Follow the demonstrator's arc; the flags at its end."""
-    return [tip.put(point) for point in arc(start.position, goal.position, turn)][-1]
+    return [tip.put(point) for point in arc(start.position, goal.position, direction)][-1]
 
 
-def say(side: str, turn: str) -> str:
+def say(side: str, direction: str) -> str:
     """The text of a move."""
-    return f"move to the nearest {side} target by circling around the stick {turn}"
+    return f"move to the nearest {side} target by circling around the stick {direction}"
 
 
 def recorded_moves(folder: Path, task: str, episode: int) -> tuple[int, str, list[str]]:
@@ -84,25 +84,25 @@ def read_path(seed: int, n: int, lengths: set[int]) -> list[int]:
 
     while True:
         start, goal = torch.randperm(n * n, generator=generator)[:2].tolist()
-        path, seen, untried = [start], {start}, [around(start)]
+        path, visited, untried = [start], {start}, [around(start)]
         while path[-1] != goal:
-            following = next((node for node in untried[-1] if node not in seen), None)
+            following = next((node for node in untried[-1] if node not in visited), None)
             if following is None:
                 path.pop(), untried.pop()
                 continue
-            path.append(following), seen.add(following)
+            path.append(following), visited.add(following)
             if following != goal:
                 untried.append(around(following))
         if len(path) in lengths:
             return path
 
 
-def read_route(stream: Draws, moves: tuple[int, int], turn_back: bool) -> tuple[list[int], list[str]]:
+def read_route(stream: Draws, moves: tuple[int, int], may_return: bool) -> tuple[list[int], list[str]]:
     """Read the indices of a route and the sense of each turn from a stream."""
     count = stream.integer(moves[0], moves[1] + 1)
     route = [stream.integer(0, 5)]
     for _ in range(count):
-        came_from = route[-2] if len(route) > 1 and 0 < route[-1] < 4 and not turn_back else None
+        came_from = route[-2] if len(route) > 1 and 0 < route[-1] < 4 and not may_return else None
         ways = [i for i in (route[-1] - 1, route[-1] + 1) if 0 <= i < 5 and i != came_from]
         route.append(ways[stream.integer(0, len(ways))])
     return route, ["clockwise" if stream.uniform() < 0.5 else "counterclockwise" for _ in range(count)]

@@ -56,7 +56,7 @@ def skip_place(draws: Draws, region: Region, container: Container) -> float:
     raise AssertionError(f"{container.name} does not stand where one of {TRIALS} trials would put it")
 
 
-def turn(thing: Thing) -> float:
+def yaw_of(thing: Thing) -> float:
     """By how much an upside-down thing was turned about its own vertical, radians."""
     _, x, y, _ = thing.initial_pose.q
     return float(2 * np.arctan2(-y, x))

@@ -30,7 +30,7 @@ def params(tensors: dict[str, Tensor], prefix: str = "") -> dict[str, Tensor]:
 
 def vision_config(sizes: dict[str, Any], resolution: int) -> VisionConfig:
     keys = {"width": "width", "depth": "depth", "mlp_dim": "mlp_dim", "num_heads": "num_heads", "patch_size": "patch"}
-    return VisionConfig(image_size=resolution, **{ours: sizes[theirs] for ours, theirs in keys.items()})
+    return VisionConfig(image_size=resolution, **{target: sizes[source] for target, source in keys.items()})
 
 
 def config(about: dict[str, Any]) -> dict[str, Any]:
@@ -85,7 +85,7 @@ def recurrence(about: dict[str, Any]) -> dict[str, Any]:
             "max_grad_norm": "max_grad_norm",
         },
     }[about["type"]]
-    return options | {ours: about[f"{about['type']}_config"][theirs] for ours, theirs in names.items()}
+    return options | {target: about[f"{about['type']}_config"][source] for target, source in names.items()}
 
 
 def policy(tensors: dict[str, Tensor], about: dict[str, Any]) -> MMEPolicy:
@@ -134,10 +134,10 @@ ERRORS: dict[str, float] = {}
 """Largest error seen per test, for the table in docs/evidence/parity.md (`MME_VLA_PARITY_TABLE=1`, see conftest.py)."""
 
 
-def error(ours: Tensor, golden: Tensor) -> float:
+def error(actual: Tensor, golden: Tensor) -> float:
     """Largest absolute difference; also kept under the running test's name."""
-    assert ours.shape == golden.shape, (ours.shape, golden.shape)
-    worst = float((ours.double() - golden.double()).abs().max())
+    assert actual.shape == golden.shape, (actual.shape, golden.shape)
+    worst = float((actual.double() - golden.double()).abs().max())
     test = os.environ.get("PYTEST_CURRENT_TEST", "").rsplit(" ", 1)[0].rsplit("::", 1)[-1]
     ERRORS[test] = max(worst, ERRORS.get(test, 0.0))
     return worst

@@ -10,14 +10,17 @@ from mme_vla.backbone.config import BackboneConfig
 def reduce_sizes(monkeypatch: pytest.MonkeyPatch, sizes: BackboneConfig) -> Any:
     """Make LeRobot's module build at our sizes, and return it; skips where it or transformers is absent."""
     pytest.importorskip("transformers", reason="LeRobot's PI05 needs the extra 'vlm'")
-    theirs = pytest.importorskip("lerobot.policies.pi05.modeling_pi05")
+    lerobot_module = pytest.importorskip("lerobot.policies.pi05.modeling_pi05")
 
     def sizes_of(variant: str) -> Any:
         expert = sizes.vlm if variant == "gemma_2b" else sizes.action
         shared = {key: getattr(sizes, key) for key in ("depth", "num_heads", "num_kv_heads", "head_dim")}
-        return theirs.GemmaConfig(width=expert.width, mlp_dim=expert.mlp_dim, **shared)
+        return lerobot_module.GemmaConfig(width=expert.width, mlp_dim=expert.mlp_dim, **shared)
 
-    vlm_class, expert_class = theirs.PaliGemmaForConditionalGenerationWithPiGemma, theirs.PiGemmaForCausalLM
+    vlm_class, expert_class = (
+        lerobot_module.PaliGemmaForConditionalGenerationWithPiGemma,
+        lerobot_module.PiGemmaForCausalLM,
+    )
 
     def vlm(config: Any) -> Any:
         vision = config.vision_config
@@ -32,7 +35,7 @@ def reduce_sizes(monkeypatch: pytest.MonkeyPatch, sizes: BackboneConfig) -> Any:
         config.vocab_size = sizes.vocab_size
         return expert_class(config=config)
 
-    monkeypatch.setattr(theirs, "get_gemma_config", sizes_of)
-    monkeypatch.setattr(theirs, "PaliGemmaForConditionalGenerationWithPiGemma", vlm)
-    monkeypatch.setattr(theirs, "PiGemmaForCausalLM", expert)
-    return theirs
+    monkeypatch.setattr(lerobot_module, "get_gemma_config", sizes_of)
+    monkeypatch.setattr(lerobot_module, "PaliGemmaForConditionalGenerationWithPiGemma", vlm)
+    monkeypatch.setattr(lerobot_module, "PiGemmaForCausalLM", expert)
+    return lerobot_module

@@ -38,8 +38,8 @@ def main(folder: Path) -> None:
 
         samples = Samples(policy, config, SimpleNamespace(root=SAMPLE, repo_id="local/sample"))  # type: ignore[arg-type]
         batch = samples.batch(torch.tensor([900]))
-    told = {"built": built, "sum": float(batch.history.features.float().sum())}
-    (folder / f"{distributed.get_rank()}.json").write_text(json.dumps(told))
+    report = {"built": built, "sum": float(batch.history.features.float().sum())}
+    (folder / f"{distributed.get_rank()}.json").write_text(json.dumps(report))
     distributed.destroy_process_group()
 
 

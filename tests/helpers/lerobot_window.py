@@ -38,48 +38,48 @@ def window_policy(views: bool, states: bool, **changed: Any) -> MMEPolicy:
 
 def weights(policy: MMEPolicy) -> dict[str, Tensor]:
     """Tensors in LeRobot's names, each drawn from its name."""
-    found = {}
+    values = {}
     for name, shape in port_adapter(policy).shapes(policy.state_dict()).items():
-        drawn = np.random.default_rng(zlib.crc32(name.encode())).normal(size=shape) * 0.1
+        sampled = np.random.default_rng(zlib.crc32(name.encode())).normal(size=shape) * 0.1
         if "vision_tower" in name and name.endswith(("layer_norm1.weight", "layer_norm2.weight", "layernorm.weight")):
-            drawn = drawn + 1
-        found[LEROBOT_PREFIX + name] = torch.from_numpy(drawn.astype(np.float32))
-    return found
+            sampled = sampled + 1
+        values[LEROBOT_PREFIX + name] = torch.from_numpy(sampled.astype(np.float32))
+    return values
 
 
 def inputs() -> dict[str, Tensor]:
     """Clips [b, v, t, 3, s, s] uint8 of which one frame is not there, their states, words and noise."""
     rng, size = np.random.default_rng(0), VISION["image_size"]
-    seen = torch.ones(2, FRAMES, dtype=torch.bool)
-    seen[0, 0] = False
-    said = torch.ones(2, 7, dtype=torch.bool)
-    said[1, 5:] = False
+    frame_mask = torch.ones(2, FRAMES, dtype=torch.bool)
+    frame_mask[0, 0] = False
+    prompt_mask = torch.ones(2, 7, dtype=torch.bool)
+    prompt_mask[1, 5:] = False
     return {
         "clips": torch.from_numpy(rng.integers(0, 256, (2, 2, FRAMES, 3, size, size), dtype=np.uint8)),
-        "seen": seen,
+        "seen": frame_mask,
         "states": torch.from_numpy(rng.normal(size=(2, FRAMES, STATE)).astype(np.float32)),
         "words": torch.from_numpy(rng.integers(4, 64, (2, 7))),
-        "said": said,
+        "said": prompt_mask,
         "noise": torch.from_numpy(rng.normal(size=(2, 20, 32)).astype(np.float32)),
     }
 
 
 def as_batch(policy: MMEPolicy) -> Batch:
     """The inputs as our policy reads them."""
-    given = inputs()
-    clips = given["clips"].transpose(1, 2)  # b t v 3 s s
+    tensors = inputs()
+    clips = tensors["clips"].transpose(1, 2)  # b t v 3 s s
     memory = policy.require_memory()
     features = torch.zeros(2, memory.capacity, policy.backbone.vision_width)
     if memory.capacity:
-        features[..., :STATE] = given["states"]
-    mask = given["seen"][:, : memory.capacity]
+        features[..., :STATE] = tensors["states"]
+    mask = tensors["seen"][:, : memory.capacity]
     places = torch.zeros(*mask.shape, 3)
-    past = PastViews(clips[:, :-1], given["seen"][:, :-1], EVERY) if memory.past_view_spec is not None else None
+    past = PastViews(clips[:, :-1], tensors["seen"][:, :-1], EVERY) if memory.past_view_spec is not None else None
     return Batch(
         images=clips[:, -1],
         image_mask=torch.ones(2, 2, dtype=torch.bool),
-        prompt=given["words"] * given["said"],
-        prompt_mask=given["said"],
+        prompt=tensors["words"] * tensors["said"],
+        prompt_mask=tensors["said"],
         history=HistoryTokens(features, places, mask, torch.full((2,), 20)),
         past=past,
     )
@@ -91,32 +91,37 @@ def their_chunk(views: bool, states: bool) -> Tensor:
 
     from helpers.lerobot_pi05 import reduce_sizes
 
-    policy, given = window_policy(views, states), inputs()
+    policy, arguments = window_policy(views, states), inputs()
     with pytest.MonkeyPatch.context() as patch:
-        theirs = reduce_sizes(patch, policy.backbone.config)
-        config = theirs.PI05Config(
+        lerobot_module = reduce_sizes(patch, policy.backbone.config)
+        config = lerobot_module.PI05Config(
             use_visual_memory=views, use_proprioceptive_memory=states, chunk_size=policy.horizon, n_action_steps=1,
             device="cpu", image_resolution=(VISION["image_size"],) * 2, **SETTINGS,
         )  # fmt: skip
-        model = theirs.PI05Pytorch(config).eval()
+        model = lerobot_module.PI05Pytorch(config).eval()
         tensors = {name.removeprefix(LEROBOT_PREFIX): tensor for name, tensor in weights(policy).items()}
         missing, unexpected = model.load_state_dict(tensors, strict=False)
         assert not unexpected and all("embed_tokens" in name or "lm_head" in name for name in missing), missing
-        clips = given["clips"].float() / 127.5 - 1
-        pictures = [clips[:, view] if views else clips[:, view, -1] for view in range(2)]
-        masks = [given["seen"] if views else torch.ones(2, dtype=torch.bool)] * 2
-        felt = torch.nn.functional.pad(given["states"], (0, 32 - STATE))
-        of_states = {"states": felt, "state_masks": given["seen"]} if states else {}
+        clips = arguments["clips"].float() / 127.5 - 1
+        images = [clips[:, view] if views else clips[:, view, -1] for view in range(2)]
+        masks = [arguments["seen"] if views else torch.ones(2, dtype=torch.bool)] * 2
+        proprio = torch.nn.functional.pad(arguments["states"], (0, 32 - STATE))
+        of_states = {"states": proprio, "state_masks": arguments["seen"]} if states else {}
         with torch.no_grad():
             chunk: Tensor = model.sample_actions(
-                pictures, masks, given["words"] * given["said"], given["said"], noise=given["noise"], **of_states
+                images,
+                masks,
+                arguments["words"] * arguments["said"],
+                arguments["said"],
+                noise=arguments["noise"],
+                **of_states,
             )
     return chunk
 
 
 def main() -> None:
-    found = {only: their_chunk(*on).double().numpy().round(6).tolist() for only, on in ONLY.items()}
-    RECORDED.write_text(json.dumps(found) + "\n")
+    chunks = {only: their_chunk(*on).double().numpy().round(6).tolist() for only, on in ONLY.items()}
+    RECORDED.write_text(json.dumps(chunks) + "\n")
 
 
 if __name__ == "__main__":

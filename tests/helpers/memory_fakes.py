@@ -43,12 +43,12 @@ class LastFrames(MemoryModule, ScoringMemory):
         return MeanBrightness() if self.storage.scorer else None
 
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        kept = self.storage.stored_frames(step + 1)
+        candidates = self.storage.stored_frames(step + 1)
         if self.storage.scorer:
             scores = history.scores.until(step)
             bright = scores.frames[np.argsort(-scores.values.mean(1), kind="stable")]
-            kept = np.sort(np.intersect1d(kept, bright)[: self.frames])
-        frames = kept[-self.frames :] if rng is None else np.sort(rng.permutation(kept)[: self.frames])
+            candidates = np.sort(np.intersect1d(candidates, bright)[: self.frames])
+        frames = candidates[-self.frames :] if rng is None else np.sort(rng.permutation(candidates)[: self.frames])
         return np.stack([np.repeat(frames, 4), np.tile(np.arange(4), len(frames))], axis=1)
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:

@@ -23,8 +23,8 @@ RENAMED = OPTIONS | {"use_timestep_pe": "time_code", "retrieval_layers": "retrie
 
 
 def arrays(folder: Path, name: str) -> dict[str, Tensor]:
-    with np.load(folder / f"{name}.npz") as found:
-        return {key: torch.from_numpy(found[key]) for key in found.files}
+    with np.load(folder / f"{name}.npz") as archive:
+        return {key: torch.from_numpy(archive[key]) for key in archive.files}
 
 
 def about(folder: Path) -> dict[str, Any]:

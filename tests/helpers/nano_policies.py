@@ -22,6 +22,6 @@ def demonstration(frames: tuple[int, ...] = (0, 15, 39, 47, 63, 66, 79, 95, 119,
     targets = rng.uniform(-0.2, 0.2, (3, 7)).astype(np.float32)
     motions = Motions(np.array([66, 120, 155]), targets)
     states = rng.uniform(-1, 1, (180, 8)).astype(np.float32)
-    said = {"simple": ["pick it up"] * 3, "grounded": ["pick it up at <1, 2>"] * 3}
+    subgoals = {"simple": ["pick it up"] * 3, "grounded": ["pick it up at <1, 2>"] * 3}
     goal = "watch the video carefully, then pick up the container hiding the green cube"
-    return Demonstration("VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": pictures}, said)
+    return Demonstration("VideoUnmask", 3, "easy", goal, 180, 66, states, motions, {"front": pictures}, subgoals)

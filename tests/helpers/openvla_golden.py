@@ -40,9 +40,9 @@ def golden_name(ours: str) -> str:
     """The golden name of one of a policy's parameters: peft's wrapper stands before the model's own."""
     if ours.startswith("memory.encoder."):
         return ours.replace("memory.encoder.", "memory/")
-    theirs = openvla_name(ours)
-    assert theirs is not None, f"{ours} has no name"
-    return theirs.replace(VLA, VLA + WRAPPER, 1)
+    source = openvla_name(ours)
+    assert source is not None, f"{ours} has no name"
+    return source.replace(VLA, VLA + WRAPPER, 1)
 
 
 def sections(about: dict[str, Any], values: dict[str, Tensor]) -> dict[str, Any]:
@@ -50,9 +50,9 @@ def sections(about: dict[str, Any], values: dict[str, Tensor]) -> dict[str, Any]
     sizes = about["sizes"]
     shapes = {name.replace(".base_layer", ""): tuple(value.shape) for name, value in values.items()}
 
-    def tower(theirs: str, ours: str) -> dict[str, int]:
-        mlp = shapes[f"{VLA}{WRAPPER}vision_backbone.{theirs}.blocks.0.mlp.fc1.weight"][0]
-        of = sizes[ours]
+    def tower(source: str, target: str) -> dict[str, int]:
+        mlp = shapes[f"{VLA}{WRAPPER}vision_backbone.{source}.blocks.0.mlp.fc1.weight"][0]
+        of = sizes[target]
         return {"width": of["embed_dim"], "depth": of["depth"], "num_heads": of["num_heads"], "mlp_dim": mlp}
 
     llm = sizes["llm"]

@@ -26,23 +26,23 @@ class BlocksEnv:
     """
 
     def __init__(self, order: Sequence[str] = ("blue", "red"), video: bool = True) -> None:
-        self.order, self.video, self.closed, self.asked = list(order), video, False, []
+        self.order, self.video, self.closed, self.received_actions = list(order), video, False, []
         self.pressed: list[str] = []
 
     def reset(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        return self._seen(VIDEO + 1 if self.video else 1), self._info("ongoing")
+        return self._observation(VIDEO + 1 if self.video else 1), self._info("ongoing")
 
     def step(self, action: dict[str, Any]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        self.asked.append(action)
+        self.received_actions.append(action)
         if action["choice"] == "c":
             return None, 0.0, True, False, {"status": "error", "error_message": "no path", "exception_type": "E"}
         if action["choice"] == "b":
-            return self._seen(0), 0.0, False, False, self._info("ongoing")
+            return self._observation(0), 0.0, False, False, self._info("ongoing")
         near = min(BLOCKS, key=lambda name: np.hypot(*np.subtract(BLOCKS[name], action["point"])))
         self.pressed.append(near)
         right = self.pressed == self.order[: len(self.pressed)]
         status = "fail" if not right else "success" if self.pressed == self.order else "ongoing"
-        return self._seen(MOTION), 0.0, status != "ongoing", False, self._info(status)
+        return self._observation(MOTION), 0.0, status != "ongoing", False, self._info(status)
 
     def close(self) -> None:
         self.closed = True
@@ -51,7 +51,7 @@ class BlocksEnv:
         goal = "press the blocks in the order of the video"
         return {"status": status, "task_goal": [goal], "available_multi_choices": OPTIONS}
 
-    def _seen(self, count: int) -> dict[str, list[np.ndarray]]:
+    def _observation(self, count: int) -> dict[str, list[np.ndarray]]:
         frames = []
         for k in range(count):
             frame = np.full((256, 256, 3), 90 + 4 * k, np.uint8)

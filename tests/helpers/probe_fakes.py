@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from helpers.rollout_fakes import InlineEnvs, quick_policy, roll
-from helpers.scripted_env import make_far_env
+from helpers.scripted_env import make_moving_env
 from mme_vla.embodiment import ROBOMME_JOINT, Embodiment
 from mme_vla.envs import Job
 from mme_vla.evaluation.recordings import Recording
@@ -28,7 +28,7 @@ class MadeUpSource:
 
     def __init__(self, lengths: tuple[int, ...] = (60, 70, 80), video: int = 20, robot: Embodiment = ROBOMME_JOINT):
         self.lengths, self.exec_starts = np.array(lengths), np.full(len(lengths), video)
-        self.robot, self.shown = robot, []
+        self.robot, self.frames_read = robot, []
 
     def __len__(self) -> int:
         return len(self.lengths)
@@ -57,11 +57,11 @@ class MadeUpSource:
         return np.zeros((self.lengths[episode], self.robot.action.width), np.float32)
 
     def frames(self, episode: int, indices: Any, camera: str | None = None) -> np.ndarray:
-        self.shown += [(episode, int(i)) for i in indices]
+        self.frames_read += [(episode, int(i)) for i in indices]
         values = (97 * episode + 3 * np.asarray(indices)) % 256
-        pictures = np.broadcast_to(values[:, None, None, None], (len(values), SIDE, SIDE, 3)).astype(np.uint8).copy()
-        pictures[:, : 8 + 8 * episode, :8] = 255  # not of one colour, so that a normed tower sees it
-        return pictures
+        images = np.broadcast_to(values[:, None, None, None], (len(values), SIDE, SIDE, 3)).astype(np.uint8).copy()
+        images[:, : 8 + 8 * episode, :8] = 255  # not of one colour, so that a normed tower sees it
+        return images
 
 
 def made_up(count: int = 3, **options: Any) -> list[Recording]:
@@ -84,8 +84,8 @@ class ReadsOneSlot(MMEPolicy):
 
 def reader(slot: int | None, budget: int = 5) -> ReadsOneSlot:
     """One token a frame, five frames; `slot` None reads nothing."""
-    whole = quick_policy("framesamp_modul", memory={"budget": budget, "grid": 1})
-    policy = ReadsOneSlot(whole.backbone, whole.memory, whole.integration, whole.processor, whole.config)
+    full = quick_policy("framesamp_modul", memory={"budget": budget, "grid": 1})
+    policy = ReadsOneSlot(full.backbone, full.memory, full.integration, full.processor, full.config)
     policy.slot = slot
     return policy.eval()
 
@@ -94,9 +94,9 @@ def probed(policy: Any, words: list[Any], folder: Any, count: int = 1, **setting
     """A probe of the first synthetic episodes, each of which may take from the others."""
     recordings = made_up(robot=policy.embodiment)
     arms: list[Arm] = read_arms(words) if words else []
-    chosen = OfflineSettings(**{"draws": 3, "moments": 2, "flow_steps": 2, **settings})
+    settings_ = OfflineSettings(**{"draws": 3, "moments": 2, "flow_steps": 2, **settings})
     torch.manual_seed(0)
-    return probe_offline(policy, arms, recordings[:count], recordings, folder / "offline.jsonl", chosen)
+    return probe_offline(policy, arms, recordings[:count], recordings, folder / "offline.jsonl", settings_)
 
 
 JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
@@ -104,6 +104,6 @@ JOBS = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
 
 def actions(policy: MMEPolicy, word: str, **settings: object) -> list[np.ndarray]:
     probe = ProbedPolicy(policy, read_arm(word), made_up(), None).eval()
-    envs = InlineEnvs(base=make_far_env)
+    envs = InlineEnvs(base=make_moving_env)
     roll(probe, JOBS, envs, **settings)
     return [np.stack(envs.made[job].actions) for job in JOBS]

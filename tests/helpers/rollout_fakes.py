@@ -67,17 +67,17 @@ def roll(
 ) -> list[EpisodeRecord]:
     """Records of a rollout in this process."""
     records: list[EpisodeRecord] = []
-    chosen = RolloutSettings(**{"flow_steps": 2, **settings})
-    Rollout(policy, envs, FACTS, chosen, records.append, subgoals, subgoal_folder).run(jobs)
+    options = RolloutSettings(**{"flow_steps": 2, **settings})
+    Rollout(policy, envs, FACTS, options, records.append, subgoals, subgoal_folder).run(jobs)
     return records
 
 
-def whole_run(
+def run_evaluation(
     policy: MMEPolicy, folder: Path, base: Any = make_slow_env, jobs: Sequence[Job] = JOBS, **settings: Any
 ) -> Evaluation:
     """These episodes in two worker processes."""
-    chosen = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
-    return evaluate(policy, jobs, folder, FACTS, chosen, base=base, show_progress=False)
+    options = RolloutSettings(**{"max_steps": 24, "flow_steps": 2, "workers": 2, "max_batch": 1, **settings})
+    return evaluate(policy, jobs, folder, FACTS, options, base=base, show_progress=False)
 
 
 def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list[EpisodeRecord]:
@@ -89,4 +89,4 @@ def records(split: str, won: list[int], model: str = "m", seed: int = 7) -> list
 
 if __name__ == "__main__":
     os.environ["STEP_S"] = sys.argv[3]
-    whole_run(MMEPolicy.from_pretrained(sys.argv[2]), Path(sys.argv[1]))
+    run_evaluation(MMEPolicy.from_pretrained(sys.argv[2]), Path(sys.argv[1]))

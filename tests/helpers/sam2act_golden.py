@@ -23,14 +23,14 @@ def meta() -> dict[str, Any]:
     return described
 
 
-def drawn(name: str, shape: tuple[int, ...] | list[int], seed: int) -> np.ndarray:
+def sample_array(name: str, shape: tuple[int, ...] | list[int], seed: int) -> np.ndarray:
     """The standard normal numbers that belong to a name."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())]).standard_normal(tuple(shape))
 
 
-def drawn_weight(name: str, shape: list[int], seed: int) -> Tensor:
+def sample_weight(name: str, shape: list[int], seed: int) -> Tensor:
     """A weight by the rule of the golden cases' README."""
-    x = drawn(f"net.{name}", shape, seed)
+    x = sample_array(f"net.{name}", shape, seed)
     last = name.rsplit(".", 1)[-1]
     if last == "gamma":
         value = 0.3 + 0.1 * x
@@ -47,6 +47,6 @@ def drawn_weight(name: str, shape: list[int], seed: int) -> Tensor:
 
 def relative_error(found: Any, expected: np.ndarray) -> float:
     """The largest difference, relative to the largest expected entry."""
-    given = found.detach().numpy() if isinstance(found, Tensor) else np.asarray(found)
-    assert given.shape == expected.shape, (given.shape, expected.shape)
-    return float(np.abs(given - expected).max() / max(np.abs(expected).max(), 1e-30))
+    array = found.detach().numpy() if isinstance(found, Tensor) else np.asarray(found)
+    assert array.shape == expected.shape, (array.shape, expected.shape)
+    return float(np.abs(array - expected).max() / max(np.abs(expected).max(), 1e-30))

@@ -81,13 +81,13 @@ def make_scripted_env(
     return ScriptedEnv(task, episode, max_steps, travel, step_s, dies)
 
 
-def make_far_env(**options: Any) -> ScriptedEnv:
+def make_moving_env(**options: Any) -> ScriptedEnv:
     """Episodes that end by success somewhere on the way, or time out."""
     return make_scripted_env(**options, travel=11.09 * options["max_steps"])
 
 
 def make_slow_env(**options: Any) -> ScriptedEnv:
-    return make_far_env(**options, step_s=float(os.environ.get("STEP_S", "0")))
+    return make_moving_env(**options, step_s=float(os.environ.get("STEP_S", "0")))
 
 
 def make_mortal_env(**options: Any) -> ScriptedEnv:

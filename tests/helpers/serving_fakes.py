@@ -155,7 +155,7 @@ def acted_directly(policy: MMEPolicy, parts: list, steps: int = 2, seed: int = 4
 def ask(served: Served, method: str, path: str, body: bytes | None = None, **headers: str) -> tuple[int, str, bytes]:
     connection = http.client.HTTPConnection(*served.address, timeout=60)
     connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-    answer = connection.getresponse()
-    found = answer.status, answer.headers["Content-Type"], answer.read()
+    response = connection.getresponse()
+    result = response.status, response.headers["Content-Type"], response.read()
     connection.close()
-    return found
+    return result

@@ -59,8 +59,8 @@ def trainer(folder: Path, steps: int, resumed: bool = False, **changes: Any) -> 
 def finish_run(job: Trainer, line: ProgressLine | None = None) -> bool:
     first, run = job.accelerator.is_main_process, job.run_info
     loggers = open_loggers(run.folder, {}, run.step) if first else Loggers()
-    with line or ProgressLine(job.settings.steps, 0, visible=False) as shown:
-        finished = job.run(shown, loggers)
+    with line or ProgressLine(job.settings.steps, 0, visible=False) as progress:
+        finished = job.run(progress, loggers)
         job.close()
     return finished
 
@@ -78,9 +78,9 @@ def train(folder: Path) -> dict[str, Any]:
     """Train sharded to step 4, with a checkpoint at 2 and 4 that is written while it continues."""
     job = trainer(folder / "run", 4, **SHARDED)
     assert finish_run(job) and isinstance(job.policy, FSDPModule)
-    held = sum(p.to_local().numel() for p in trainable(job.policy).values())
-    whole = sum(p.numel() for p in trainable(job.policy).values())
-    return {"held": held / whole, **validation_losses(job)}
+    n_local = sum(p.to_local().numel() for p in trainable(job.policy).values())
+    n_total = sum(p.numel() for p in trainable(job.policy).values())
+    return {"held": n_local / n_total, **validation_losses(job)}
 
 
 class Interrupted(ProgressLine):
@@ -137,14 +137,14 @@ def compare(name: str, dtype: str) -> dict[str, Any]:
     batch = alone.full_batch()
     draws = alone.training_noise(1, torch.Generator().manual_seed(1))
     start = alone.sampling_noise(torch.Generator().manual_seed(2))
-    asked = {key: value[None] for key, value in start.items()}
+    draws_ = {key: value[None] for key, value in start.items()}
     results: dict[str, Any] = {}
     for which, model in (("alone", alone), ("shared", shared)):
         if model is alone and distributed.get_rank():
             continue  # the first process's is enough
         results[which] = update_of(model, batch, draws)
         with gathered(model.eval()):
-            chunk = model.sample_actions(batch, asked, steps=2)
+            chunk = model.sample_actions(batch, draws_, steps=2)
         results[f"{which} chunk"] = chunk.float().abs().mean().item()
     with torch.no_grad():  # sampling left it as it was
         torch.manual_seed(3)
@@ -188,9 +188,9 @@ def rank(number: int, processes: int, port: int, what: str, folder: Path) -> Non
         os.environ.update({key: str(value) for key, value in shared.items()})
         Accelerator(cpu=True)  # joins the others
     for name in what.split(","):
-        answer = DONE[name](folder)
+        result = DONE[name](folder)
         if number == 0:
-            (folder / f"{name}.json").write_text(json.dumps(answer))
+            (folder / f"{name}.json").write_text(json.dumps(result))
     if processes > 1:
         distributed.destroy_process_group()
 

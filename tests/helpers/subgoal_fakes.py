@@ -32,11 +32,11 @@ class Client:
     """Has google-genai's interface; answers with these outcomes in turn (exceptions are raised, functions called)."""
 
     def __init__(self, *outcomes):
-        self.outcomes, self.asked = list(outcomes), []
+        self.outcomes, self.requests = list(outcomes), []
         self.models = self
 
     def generate_content(self, *, model, contents, config):
-        self.asked.append((contents, config))
+        self.requests.append((contents, config))
         outcome = self.outcomes.pop(0)
         if callable(outcome):
             outcome = outcome()
@@ -62,13 +62,13 @@ def started(predictor, task="StopCube", video=0):
 
 def play(predictor, episode, chunks):
     """Predict, then execute 16 actions; returns the subgoals and the steps at which the model was asked."""
-    said, asked = [], []
+    texts, queries = [], []
     for _ in range(chunks):
         subgoal = predictor.predict([episode])[0]
-        said.append(subgoal)
-        asked += [episode.step] if subgoal.queried else []
+        texts.append(subgoal)
+        queries += [episode.step] if subgoal.queried else []
         episode.observe(frames(16, episode.n_observed_frames))
-    return said, asked
+    return texts, queries
 
 
 def kinds(parts):

@@ -25,10 +25,10 @@ class WatchedEnv(ScriptedEnv):
         first = len(self.frames) - len(frames)
         for number, frame in enumerate(frames, first):
             newest = number == len(self.frames) - 1
-            shown = ("front", "wrist") if self.render_request is None else self.render_request.cameras(number, newest)
+            cameras = ("front", "wrist") if self.render_request is None else self.render_request.cameras(number, newest)
             for camera in self.drawn:
-                self.drawn[camera] += camera in shown
-                frame[f"{camera}_rgb"] = frame[f"{camera}_rgb"] if camera in shown else None
+                self.drawn[camera] += camera in cameras
+                frame[f"{camera}_rgb"] = frame[f"{camera}_rgb"] if camera in cameras else None
         return super()._lists(frames)
 
 
@@ -44,13 +44,13 @@ def outcomes(records: list[EpisodeRecord]) -> list[tuple[Any, ...]]:
 def both_ways(policy: Any, subgoals: Any = None, base: Any = make_watched_env) -> list[dict[str, int]]:
     """Roll with everything drawn and with what is needed; check that they agree; what was drawn, each way."""
     counts = []
-    found = []
+    results = []
     for draw in ("all", "needed"):
         envs = InlineEnvs(base=base, max_steps=STEPS - 1)
         records = roll(policy, JOBS, envs, subgoals, draw=draw, max_steps=STEPS - 1, max_batch=1)
         assert [record.steps for record in records] == [STEPS, STEPS], "an episode should take several chunks"
-        found.append(outcomes(records))
+        results.append(outcomes(records))
         if base is make_watched_env:
             counts += [env.drawn for env in envs.made.values()]
-    assert found[0] == found[1]
+    assert results[0] == results[1]
     return counts

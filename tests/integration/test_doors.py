@@ -117,8 +117,8 @@ class Weighted(FrameSamp):
         self.weight = nn.Parameter(torch.ones(self.encoder.project.out_features))
 
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        found = super().forward(history)
-        return MemoryTokens(found.tokens * self.weight, found.mask)
+        tokens = super().forward(history)
+        return MemoryTokens(tokens.tokens * self.weight, tokens.mask)
 
 
 class Another(FrameSamp):
@@ -137,8 +137,8 @@ EXTENSION_POINTS = [Conditioned, Beside, BesideInTheVLM, BesideInAnExpertOfItsOw
 
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    for own in EXTENSION_POINTS:
-        monkeypatch.setitem(INTEGRATIONS._entries, own.__name__, own)
+    for custom in EXTENSION_POINTS:
+        monkeypatch.setitem(INTEGRATIONS._entries, custom.__name__, custom)
     for memory in (Weighted, Another):
         monkeypatch.setitem(MEMORIES._entries, memory.__name__, memory)
 
@@ -154,12 +154,14 @@ def own_policy(integration: type[Integration], memory: type = FrameSamp, seed: i
 
 
 @pytest.mark.parametrize("own", EXTENSION_POINTS)
-def test_a_door_leads_to_the_action_in_training_and_in_every_step_of_sampling(own: type[Integration]) -> None:
+def test_an_extension_point_leads_to_the_action_in_training_and_in_every_step_of_sampling(
+    own: type[Integration],
+) -> None:
     check_integration(own.__name__)
 
 
 @pytest.mark.parametrize("own", EXTENSION_POINTS)
-def test_a_policy_learns_and_acts_through_a_door(own: type[Integration]) -> None:
+def test_a_policy_learns_and_acts_through_an_extension_point(own: type[Integration]) -> None:
     policy = own_policy(own)
     batch = random_batch(policy, valid=64)
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
@@ -169,8 +171,8 @@ def test_a_policy_learns_and_acts_through_a_door(own: type[Integration]) -> None
     assert policy(batch, draws)[0] < before
     frames = np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8)
     episodes = [policy.start_episode("press the button", seed) for seed in (0, 1)]
-    for episode, shown in zip(episodes, (frames, frames[::-1][:2]), strict=True):
-        episode.observe({"front": shown, "wrist": shown}, np.zeros((len(shown), 8), np.float32))
+    for episode, frame in zip(episodes, (frames, frames[::-1][:2]), strict=True):
+        episode.observe({"front": frame, "wrist": frame}, np.zeros((len(frame), 8), np.float32))
     noise = [episode.noise_state for episode in episodes]
     together = policy.act(episodes)
     for episode, state in zip(episodes, noise, strict=True):
@@ -195,27 +197,27 @@ def released(tmp_path_factory: pytest.TempPathFactory) -> tuple[MMEPolicy, Path]
 @pytest.mark.parametrize(
     ("own", "memory"), [*[(o, FrameSamp) for o in EXTENSION_POINTS], (Beside, Weighted), (Beside, Another)]
 )
-def test_only_the_own_part_is_new_when_starting_from_a_released_checkpoint(
+def test_only_the_custom_component_is_new_when_starting_from_a_released_checkpoint(
     own: type[Integration], memory: type, released: tuple[MMEPolicy, Path]
 ) -> None:
     source, folder = released
-    policy, theirs = own_policy(own, memory), source.state_dict()
+    policy, released_state = own_policy(own, memory), source.state_dict()
     before = {name: tensor.clone() for name, tensor in policy.state_dict().items()}
     start = transfer(policy, folder)
-    assert set(start.new) == set(before) - set(theirs)
+    assert set(start.new) == set(before) - set(released_state)
     assert any(name.startswith("integration.") for name in start.new)
     assert all("mem_attn" in name or "mem_" in name for name in start.left)
     assert start.left
     for name, tensor in policy.state_dict().items():
-        assert torch.equal(tensor, before[name] if name in start.new else theirs[name]), name
+        assert torch.equal(tensor, before[name] if name in start.new else released_state[name]), name
 
 
-def test_loading_one_whole_says_which_tensors_have_no_released_names(released: tuple[MMEPolicy, Path]) -> None:
+def test_loading_all_of_one_says_which_tensors_have_no_released_names(released: tuple[MMEPolicy, Path]) -> None:
     with pytest.raises(UserError, match=r"(?s)experts\.recall\.attention_norm.*and 4 more.*start_from\(\)"):
         load_weights(own_policy(BesideInAnExpertOfItsOwn), released[1])
 
 
-def test_the_memoryless_ports_start_an_own_integration_too(tmp_path: Path) -> None:
+def test_the_memoryless_ports_start_a_custom_integration_too(tmp_path: Path) -> None:
     from mme_vla.cli.weights import convert
 
     small_policy("pi05", seed=5).save_pretrained(tmp_path / "ours")

@@ -27,7 +27,7 @@ def test_the_page_shows_the_files_that_are_tested() -> None:
         assert (EXAMPLE / file).read_text().strip() in page, file
 
 
-def test_it_keeps_an_integrations_promises(policy: MMEPolicy) -> None:
+def test_it_keeps_an_integrations_contract(policy: MMEPolicy) -> None:
     check_integration("gist")
     check_integration("gist", memory="ttt")
 

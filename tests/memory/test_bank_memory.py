@@ -10,12 +10,12 @@ from mme_vla.testing.small import random_batch, small_policy
 
 
 @pytest.mark.parametrize("options", [{}, {"consolidation": "fifo", "fusion": "add", "time_code": False, "length": 2}])
-def test_it_keeps_the_promises_of_memories(options: dict) -> None:
+def test_it_keeps_the_contract_of_memories(options: dict) -> None:
     check_memory("bank", grid=4, moments=8, video=4, **{"length": 3, **options})
 
 
 @pytest.mark.parametrize("consolidation", CONSOLIDATIONS)
-def test_moments_written_at_once_are_those_written_one_by_one(consolidation: str) -> None:
+def test_entries_stored_at_once_equal_those_stored_one_by_one(consolidation: str) -> None:
     torch.manual_seed(0)
     bank = MemoryBank(8, length=4, consolidation=consolidation)
     moments, times, counts = torch.randn(3, 9, 2, 8), torch.arange(9).repeat(3, 1) * 3, [9, 6, 2]
@@ -29,8 +29,8 @@ def test_moments_written_at_once_are_those_written_one_by_one(consolidation: str
         torch.testing.assert_close(entries[row, there[row]], state.entries)
         assert torch.equal(at[row, there[row]], state.times) and int(there[row].sum()) == min(count, 4)
         query = torch.randn(1, 2, 8)
-        whole = bank.ask(query, entries[row : row + 1], at[row : row + 1], there[row : row + 1])
-        torch.testing.assert_close(whole, bank.retrieve([state], query))
+        together = bank.ask(query, entries[row : row + 1], at[row : row + 1], there[row : row + 1])
+        torch.testing.assert_close(together, bank.retrieve([state], query))
 
 
 def test_bank_modul_answers_by_what_it_remembers() -> None:

@@ -38,8 +38,8 @@ FEW_TOKENS: dict[str, Any] = {"vision": {**SMALL_VISION, "patch_size": 8}}
 
 def stored(memory: Any, tokens: torch.Tensor, exec_start: int = 0) -> CachedHistory:
     """The history of an episode of which every frame is told by tokens [t, p, D]."""
-    kept = memory.storage.stored_frames(len(tokens))
-    return CachedHistory(memory.storage, tokens[kept].numpy(), kept, len(tokens), None, exec_start)
+    frames = memory.storage.stored_frames(len(tokens))
+    return CachedHistory(memory.storage, tokens[frames].numpy(), frames, len(tokens), None, exec_start)
 
 
 def noise(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -49,8 +49,10 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
 def encoded(memory: Any, tokens: torch.Tensor, step: int | None = None, exec_start: int = 0) -> MemoryTokens:
     step = len(tokens) - 1 if step is None else step
     with torch.no_grad():
-        found: MemoryTokens = memory(stack_history([memory.gather_selection(stored(memory, tokens, exec_start), step)]))
-    return found
+        memory_tokens: MemoryTokens = memory(
+            stack_history([memory.gather_selection(stored(memory, tokens, exec_start), step)])
+        )
+    return memory_tokens
 
 
 # Retrieval
@@ -59,17 +61,17 @@ def encoded(memory: Any, tokens: torch.Tensor, step: int | None = None, exec_sta
 def rooms(order: str, stay: int) -> torch.Tensor:
     """An episode that stays `stay` frames in each of several places, whose tokens differ but for a little noise."""
     places = {name: noise(4, D, seed=ord(name)) for name in sorted(set(order))}
-    seen = torch.stack([places[name] for name in order for _ in range(stay)])
-    return seen + 0.05 * noise(*seen.shape)
+    features = torch.stack([places[name] for name in order for _ in range(stay)])
+    return features + 0.05 * noise(*features.shape)
 
 
-def test_retrieval_remembers_where_it_was_before_and_forgets_the_rest() -> None:
+def test_retrieval_stores_where_it_was_before_and_drops_all_else() -> None:
     memory = Retrieval(D, 16, budget=4 * 10, grid=2, every=1, cut=0.8, longest=6)
     frames = sorted(set(memory.select(stored(memory, rooms("ABCDEB", 6)), 35)[:, 0].tolist()))
     assert frames[-1] == 35 and len(frames) == 10
     assert set(range(6, 12)) <= set(frames), "the six frames in B"
-    moved_on = sorted(set(memory.select(stored(memory, rooms("ABCDEC", 6)), 35)[:, 0].tolist()))
-    assert set(range(12, 18)) <= set(moved_on) and not set(range(6, 12)) <= set(moved_on)
+    after_move = sorted(set(memory.select(stored(memory, rooms("ABCDEC", 6)), 35)[:, 0].tolist()))
+    assert set(range(12, 18)) <= set(after_move) and not set(range(6, 12)) <= set(after_move)
 
 
 def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_chunk_is_long() -> None:
@@ -79,17 +81,17 @@ def test_retrieval_cuts_where_the_view_changes_where_the_video_ends_and_where_a_
     assert lengths == [[0, 1, 2], [3, 4, 5, 6], [7, 8, 9, 10], [11]]
 
 
-def test_retrieval_looks_at_tokens_as_they_are_stored() -> None:
+def test_retrieval_reads_tokens_as_they_are_stored() -> None:
     """What a prompt does to tokens (`mark`) is not known when a dataset is read, so it must not decide."""
     policy = small_policy("retrieval_modul", memory={"budget": 64, "every": 2}, backbone=FEW_TOKENS)
     policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens * torch.arange(tokens.shape[-1])  # type: ignore[method-assign]
-    frames, seen = moving_frames(40), []
+    frames, histories = moving_frames(40), []
     select = policy.require_memory().select
-    policy.require_memory().select = lambda *given: seen.append(select(*given)) or seen[-1]  # type: ignore[method-assign]
+    policy.require_memory().select = lambda *arguments: histories.append(select(*arguments)) or histories[-1]  # type: ignore[method-assign]
     episode = policy.start_episode("press the button")
     episode.observe({"front": frames, "wrist": frames}, np.zeros((40, 8), np.float32))
     policy.act([episode])
-    assert np.array_equal(seen[-1], select(cached_history(policy, frames), 39))
+    assert np.array_equal(histories[-1], select(cached_history(policy, frames), 39))
 
 
 # Moment
@@ -108,11 +110,11 @@ def test_a_moment_knows_what_was_before_it_and_nothing_that_came_later() -> None
 # Gist
 
 
-def test_gist_keeps_the_beginning_and_the_end_whole_and_a_few_tokens_of_all_between() -> None:
+def test_gist_keeps_all_of_the_beginning_and_the_end_and_a_few_tokens_of_all_between() -> None:
     memory = Gist(D, 16, budget=(1 + 2) * 4 + 3 * 5, anchors=1, recent=2, gists=3, grid=2, stride=1)
-    found = encoded(memory, noise(8, 4, D))
-    assert found.ages is not None and found.mask.all()
-    assert found.ages[0].tolist() == [7.0] * 4 + [6.0] * 3 + [5.0] * 3 + [4.0] * 3 + [3.0] * 3 + [2.0] * 3 + [
+    tokens = encoded(memory, noise(8, 4, D))
+    assert tokens.ages is not None and tokens.mask.all()
+    assert tokens.ages[0].tolist() == [7.0] * 4 + [6.0] * 3 + [5.0] * 3 + [4.0] * 3 + [3.0] * 3 + [2.0] * 3 + [
         1.0] * 4 + [0.0] * 4  # fmt: skip
     long = memory.chosen(500, 200)
     assert len(long) == 8 and (long[0], long[-2], long[-1]) == (0, 499, 500)
@@ -120,13 +122,13 @@ def test_gist_keeps_the_beginning_and_the_end_whole_and_a_few_tokens_of_all_betw
     assert encoded(memory, noise(2, 4, D)).mask.sum() == 8, "a short episode is whole"
 
 
-def test_an_older_frame_is_seen_through_its_gist_alone_which_tells_it_also_to_later_ones() -> None:
+def test_an_older_frame_is_read_through_its_gist_alone_also_by_later_ones() -> None:
     memory = Gist(D, 16, budget=(1 + 1) * 4 + 3 * 3, anchors=1, recent=1, gists=3, grid=2, stride=1)
     tokens = noise(5, 4, D)
     changed = tokens.clone()
     changed[2] += 2  # anchors: 0; gists of 1, 2 and 3; recent: 4
-    moved = (encoded(memory, tokens).tokens - encoded(memory, changed).tokens).abs().amax(-1)[0] > 1e-6
-    assert moved.tolist() == [False] * 4 + [False] * 3 + [True] * 6 + [False] * 4
+    changed_rows = (encoded(memory, tokens).tokens - encoded(memory, changed).tokens).abs().amax(-1)[0] > 1e-6
+    assert changed_rows.tolist() == [False] * 4 + [False] * 3 + [True] * 6 + [False] * 4
 
 
 # Learned top-k
@@ -140,47 +142,47 @@ def test_learned_topk_finds_the_tokens_that_matter_from_the_loss_alone() -> None
 
     def batch() -> tuple[HistoryTokens, torch.Tensor, torch.Tensor]:
         features = torch.randn(16, 32, D, generator=generator)
-        marked = torch.rand(16, 32, generator=generator).argsort(1) < 4
-        answer = torch.randn(16, generator=generator)
-        features[..., 0] = 4.0 * marked
-        features[..., 1] = torch.where(marked, answer[:, None], features[..., 1])
+        targets = torch.rand(16, 32, generator=generator).argsort(1) < 4
+        values = torch.randn(16, generator=generator)
+        features[..., 0] = 4.0 * targets
+        features[..., 1] = torch.where(targets, values[:, None], features[..., 1])
         positions = torch.zeros(16, 32, 3)
         mask = torch.ones(16, 32, dtype=torch.bool)
-        return HistoryTokens(features, positions, mask, torch.zeros(16)), answer, marked
+        return HistoryTokens(features, positions, mask, torch.zeros(16)), values, targets
 
-    def kept_marks() -> float:
-        history, _, marked = batch()
+    def hit_rate() -> float:
+        history, _, targets = batch()
         with torch.no_grad():
-            kept, _ = memory.keep(memory.scores(history), history.mask)
-        return float(marked.gather(1, kept).float().mean())
+            indices, _ = memory.keep(memory.scores(history), history.mask)
+        return float(targets.gather(1, indices).float().mean())
 
-    before = kept_marks()
+    before = hit_rate()
     for _ in range(220):
-        history, answer, _ = batch()
-        loss = (memory(history).tokens[:, :3, 0].mean(1) - answer).square().mean()
+        history, values, _ = batch()
+        loss = (memory(history).tokens[:, :3, 0].mean(1) - values).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    assert before < 0.5 and kept_marks() > 0.9
+    assert before < 0.5 and hit_rate() > 0.9
 
 
 def test_learned_topk_keeps_time_and_tells_the_age_of_what_it_keeps() -> None:
     memory = LearnedTopK(D, 16, budget=9, pool=6, grid=2)
-    found = encoded(memory, noise(6, 4, D))
-    assert found.ages is not None
-    kept = found.ages[0, :8].tolist()
-    assert kept == sorted(kept, reverse=True) and found.mask.all()
+    tokens = encoded(memory, noise(6, 4, D))
+    assert tokens.ages is not None
+    ages = tokens.ages[0, :8].tolist()
+    assert ages == sorted(ages, reverse=True) and tokens.mask.all()
     few = encoded(memory, noise(1, 4, D))
     assert few.mask[0].tolist() == [True] * 4 + [False] * 5, "all that there is; nothing is left over"
 
 
-def test_what_is_not_kept_still_reaches_the_loss() -> None:
+def test_what_is_not_stored_still_reaches_the_loss() -> None:
     memory = LearnedTopK(D, 16, budget=5, pool=6, grid=2)
     history = stack_history([memory.gather_selection(stored(memory, noise(6, 4, D)), 5)])
     history = replace(history, features=history.features.requires_grad_())
-    kept, _ = memory.keep(memory.scores(history), history.mask)
+    indices, _ = memory.keep(memory.scores(history), history.mask)
     memory(history).tokens[:, -1].sum().backward()
-    left = torch.ones(24, dtype=torch.bool).scatter(0, kept[0], False)
+    left = torch.ones(24, dtype=torch.bool).scatter(0, indices[0], False)
     assert history.features.grad is not None and (history.features.grad[0, left].abs().sum(-1) > 0).all()
 
 
@@ -192,7 +194,7 @@ def mover(integration: str = "modul") -> MMEPolicy:
     return small_policy(f"actions_{integration}", memory={"max_steps": 12, "max_video": 6}, backbone=FEW_TOKENS)
 
 
-def test_own_actions_read_what_was_done_and_no_picture() -> None:
+def test_action_memory_reads_actions_and_no_image() -> None:
     policy = mover()
     rng = np.random.default_rng(0)
     states, actions = rng.normal(size=(2, 33, 8)).astype(np.float32) * 0.3
@@ -200,10 +202,10 @@ def test_own_actions_read_what_was_done_and_no_picture() -> None:
 
     def remembered(frames: np.ndarray, states: np.ndarray, actions: np.ndarray) -> torch.Tensor:
         episode = policy.start_episode("press the button")
-        pictures = {"front": frames, "wrist": frames}
-        episode.observe(pictures, states, demo, actions[9:])
-        found = policy.require_memory().encode([episode.required_history()], [episode.stream])
-        return found.tokens.detach()
+        images = {"front": frames, "wrist": frames}
+        episode.observe(images, states, demo, actions[9:])
+        tokens = policy.require_memory().encode([episode.required_history()], [episode.stream])
+        return tokens.tokens.detach()
 
     frames = moving_frames(33)
     base = remembered(frames, states, actions)
@@ -263,8 +265,8 @@ def test_an_episode_that_grows_acts_as_one_that_is_read_at_once(policy: MMEPolic
         episode = policy.start_episode("press the button", seed=3)
         for start in range(0, 60, piece):
             part = slice(start, min(start + piece, 60))
-            view, own = {"front": frames[part], "wrist": frames[part]}, actions[part][~demo[part]]
-            episode.observe(view, states[part], demo[part], own)
+            view, executed = {"front": frames[part], "wrist": frames[part]}, actions[part][~demo[part]]
+            episode.observe(view, states[part], demo[part], executed)
             if not demo[part].any():  # what the memory carries along is asked on the way, and again at the end
                 policy._memory_tokens([episode], policy.observation([episode]))
         chunks.append(policy.act([episode]))
@@ -297,7 +299,7 @@ def test_in_bfloat16_it_computes_what_it_computes_in_float32(policy: MMEPolicy) 
     assert rounded != exact and abs(rounded - exact) < 0.02 * exact
 
 
-def test_at_its_own_size_a_memory_keeps_the_budget_of_512(policy: MMEPolicy) -> None:
+def test_at_its_released_size_a_memory_keeps_the_budget_of_512(policy: MMEPolicy) -> None:
     name = policy.config["memory"]["name"]
     memory = MEMORIES.build({"name": name}, d_vision=96, width=8)
     assert memory.budget <= 512
@@ -315,7 +317,7 @@ def test_at_its_own_size_a_memory_keeps_the_budget_of_512(policy: MMEPolicy) -> 
         ("actions", {"max_steps": 0}, r"memory\.max_steps"),
     ],
 )  # fmt: skip
-def test_sizes_that_do_not_fit_are_said(name: str, options: dict[str, Any], words: str) -> None:
+def test_sizes_that_do_not_fit_are_reported(name: str, options: dict[str, Any], words: str) -> None:
     with pytest.raises(UserError, match=words):
         MEMORIES.build({"name": name, **options}, d_vision=D, width=8)
 
@@ -328,26 +330,28 @@ def test_an_episode_feels_and_does_what_a_dataset_says_it_did() -> None:
     episode = policy.start_episode("press the button")
     states, actions = source.states(0, 0, length), source.actions(0, 0, length)
     for part in (slice(0, start + 1), slice(start + 1, start + 8), slice(start + 8, length)):
-        pictures = np.zeros((len(frames[part]), 64, 64, 3), np.uint8)
-        own = actions[part.start - 1 : part.stop - 1] if part.start else None
-        episode.observe({"front": pictures, "wrist": pictures}, states[part], frames[part] < start, own)
+        images = np.zeros((len(frames[part]), 64, 64, 3), np.uint8)
+        executed = actions[part.start - 1 : part.stop - 1] if part.start else None
+        episode.observe({"front": images, "wrist": images}, states[part], frames[part] < start, executed)
     assert torch.equal(torch.stack(episode._motion_of_frames), recorded)
     assert recorded[:, -1].tolist() == [0.0] * (start + 1) + [1.0] * (length - start - 1)
 
 
-def test_what_the_robot_did_is_no_vision_token_and_is_not_marked_beside_a_prompt() -> None:
+def test_what_the_robot_did_is_no_vision_token_and_is_not_highlighted_beside_a_prompt() -> None:
     """An episode's is not either: the memory has to be told the same in training."""
     members: list[Any] = [{"name": "framesamp", "budget": 64}, {"name": "actions", **SMALLER["actions"]}]
     for name, memory in (("actions_modul", SMALLER["actions"]), ("framesamp_ttt_modul", {"members": members})):
         policy = small_policy(name, memory=memory, backbone=FEW_TOKENS)
         policy.backbone.condition_on_prompt = lambda tokens, prompt, prompt_mask: -tokens  # type: ignore[method-assign]
         batch = random_batch(policy, valid=96)
-        found = policy.conditioned_history(batch)
-        assert batch.history is not None and found is not None
+        history = policy.conditioned_history(batch)
+        assert batch.history is not None and history is not None
         # The actions' rows come first, for they are padded on the left.
-        given, own = batch.history.features, batch.history.mask.shape[1] - (64 if "members" in memory else 0)
-        assert given[:, :own].abs().sum() > 0 and torch.equal(found.features[:, :own], given[:, :own])
-        assert torch.equal(found.features[:, own:], -given[:, own:])
+        features, n_local = batch.history.features, batch.history.mask.shape[1] - (64 if "members" in memory else 0)
+        assert features[:, :n_local].abs().sum() > 0 and torch.equal(
+            history.features[:, :n_local], features[:, :n_local]
+        )
+        assert torch.equal(history.features[:, n_local:], -features[:, n_local:])
 
 
 @torch.no_grad()

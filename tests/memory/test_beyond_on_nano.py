@@ -28,9 +28,9 @@ def nano(model: str) -> MMEPolicy:
 def test_it_trains_for_twenty_steps_on_what_a_demonstration_shows(name: str) -> None:
     policy = nano(f"{name}_modul")
     decisions = np.array([66, 120, 155])
-    shown = demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
-    policy.require_processor().stats = statistics([shown], policy)
-    batch, generator, losses = Decisions.of(policy, [shown]).batch, torch.Generator().manual_seed(0), []
+    demo_frames = demonstration(tuple(np.union1d(decisions, policy.frames_read(decisions, 66)).tolist()))
+    policy.require_processor().stats = statistics([demo_frames], policy)
+    batch, generator, losses = Decisions.of(policy, [demo_frames]).batch, torch.Generator().manual_seed(0), []
     draws = policy.training_noise(len(batch.prompt), generator)
     optimizer = torch.optim.AdamW([p for p in policy.parameters() if p.requires_grad], lr=3e-3, fused=True)
     for _ in range(20):

@@ -39,37 +39,37 @@ def joined(members: list[Any], budget: int = 512) -> JoinedMemory:
 def alone(memory: JoinedMemory, i: int, episode: Episode) -> Episode:
     """The episode as member `i` would have stored it by itself: pooled once, to its own grid."""
     member = memory.memories[i]
-    own = Episode(member, episode.length)
+    recordings = Episode(member, episode.length)
     times = memory.storage.grid // member.storage.grid
     cells = finer(np.array([[0, p] for p in range(member.storage.grid**2)]), member.storage.grid, memory.storage.grid)
-    own.tokens = episode.tokens[:, cells[:, 1]].unflatten(1, (-1, times**2)).mean(2)
-    return own
+    recordings.tokens = episode.tokens[:, cells[:, 1]].unflatten(1, (-1, times**2)).mean(2)
+    return recordings
 
 
 @pytest.mark.parametrize("members", COMPOSITIONS.values(), ids=COMPOSITIONS)
-def test_a_joined_memory_keeps_a_memorys_promises(members: list[Any]) -> None:
+def test_a_joined_memory_keeps_a_memorys_contract(members: list[Any]) -> None:
     check_memory("joined", members=members)
 
 
 @pytest.mark.parametrize("members", COMPOSITIONS.values(), ids=COMPOSITIONS)
 @torch.no_grad()
-def test_every_member_answers_as_if_it_were_alone(members: list[Any]) -> None:
+def test_every_member_replies_as_when_alone(members: list[Any]) -> None:
     memory = joined(members).eval()
     episode, steps = Episode(memory, 48), (3, 20, 47)
-    found = memory(stack_history([memory.gather_selection(episode.cached(), step) for step in steps]))
+    tokens = memory(stack_history([memory.gather_selection(episode.cached(), step) for step in steps]))
     start = 0
     for i, member in enumerate(memory.memories):
         history = alone(memory, i, episode).cached()
         expected = member(stack_history([member.gather_selection(history, step) for step in steps]))
         part = slice(start, start + member.budget)
-        assert torch.equal(found.mask[:, part], expected.mask)
-        error = (found.tokens[:, part] - expected.tokens)[expected.mask].abs().max()
+        assert torch.equal(tokens.mask[:, part], expected.mask)
+        error = (tokens.tokens[:, part] - expected.tokens)[expected.mask].abs().max()
         assert error < 1e-5
         start += member.budget
-    assert start == memory.budget == found.tokens.shape[1] <= 512
+    assert start == memory.budget == tokens.tokens.shape[1] <= 512
 
 
-def test_budgets_are_shared_evenly_or_as_said() -> None:
+def test_budgets_are_shared_evenly_or_as_configured() -> None:
     assert [m.budget for m in joined(["framesamp", "ttt"]).memories] == [256, 256]
     assert [m.budget for m in joined(["framesamp", "ttt", "rmt"]).memories] == [160, 160, 160]
     assert [m.budget for m in joined([{**FRAMES, "budget": 128}, "ttt"], 256).memories] == [128, 128]
@@ -87,12 +87,12 @@ def test_budgets_are_shared_evenly_or_as_said() -> None:
         (["framesamp", "tttt"], "ttt"),
     ],
 )
-def test_what_cannot_be_joined_is_said(members: list[Any], words: str) -> None:
+def test_what_cannot_be_joined_is_reported(members: list[Any], words: str) -> None:
     with pytest.raises(UserError, match=words):
         joined(members)
 
 
-def test_equal_names_are_told_apart_in_what_is_reported() -> None:
+def test_equal_names_are_distinguished_in_what_is_reported() -> None:
     memory = joined([TTT, {**TTT, "stride": 4}])
     memory.reporting = True
     episode = Episode(memory, 40)
@@ -121,7 +121,7 @@ def test_it_trains_through_every_integration(integration: str) -> None:
 
 
 @torch.no_grad()
-def test_a_running_episode_acts_as_a_fresh_look_and_a_saved_policy_as_the_first(tmp_path: Path) -> None:
+def test_a_running_episode_acts_as_a_fresh_start_and_a_saved_policy_as_the_first(tmp_path: Path) -> None:
     policy = small_policy("framesamp_ttt_modul", memory={"members": [FRAMES, TTT]})
     policy.save_pretrained(tmp_path)
     again = MMEPolicy.from_pretrained(tmp_path)
@@ -131,8 +131,8 @@ def test_a_running_episode_acts_as_a_fresh_look_and_a_saved_policy_as_the_first(
     def chunks(which: MMEPolicy, pieces: list[slice]) -> np.ndarray:
         episode = which.start_episode("press the button", seed=1)
         for piece in pieces:
-            shown = frames[piece]
-            episode.observe({"front": shown, "wrist": shown}, np.zeros((len(shown), 8), np.float32))
+            frames_ = frames[piece]
+            episode.observe({"front": frames_, "wrist": frames_}, np.zeros((len(frames_), 8), np.float32))
             which._memory_tokens([episode], which.observation([episode]))
         return which.act(episode)
 
@@ -157,7 +157,7 @@ def test_a_list_of_memories_is_understood_everywhere(tmp_path: Path) -> None:
     assert [member.budget for member in policy.memory.memories] == [128, 256]
 
 
-def test_inspect_draws_what_all_members_remember(tmp_path: Path) -> None:
+def test_inspect_draws_what_all_members_store(tmp_path: Path) -> None:
     inspect.main(
         compose("inspect", ["dataset=sample", "memory=[framesamp,ttt]", "episode=0", "step=40", f"output={tmp_path}"])
     )

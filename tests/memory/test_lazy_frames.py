@@ -24,7 +24,7 @@ def pictures(count: int) -> np.ndarray:
 
 @pytest.mark.parametrize("drawn", [None, np.array([1, 2, 3, 5])])
 def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -> None:
-    shown = pictures(6) if drawn is None else pictures(6)[drawn]
+    expected = pictures(6) if drawn is None else pictures(6)[drawn]
     encoded: list[int] = []
 
     def encode(frames: np.ndarray) -> torch.Tensor:
@@ -32,7 +32,7 @@ def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -
         return numbered(frames)
 
     lazy, eager = LazyHistory(SPEC, encode), OnlineHistory(SPEC)
-    batch = FrameBatch.of(shown, drawn, 6)
+    batch = FrameBatch.of(expected, drawn, 6)
     lazy.take(batch, encode)
     eager.take(batch, numbered)
     assert encoded == [] and len(lazy) == len(eager) == 6
@@ -46,7 +46,7 @@ def test_a_lazy_history_holds_what_an_eager_one_does(drawn: np.ndarray | None) -
 def test_a_waiting_frame_keeps_no_message_alive() -> None:
     lazy, message = LazyHistory(SPEC, numbered), pictures(4)
     lazy.take(FrameBatch.of(message), numbered)
-    assert all(not np.shares_memory(picture, message) for picture in lazy._waiting.values())
+    assert all(not np.shares_memory(image, message) for image in lazy._waiting.values())
 
 
 @pytest.mark.parametrize("model", ["ttt_expert", "rmt_context"])
@@ -56,13 +56,13 @@ def test_a_recurrent_policy_encodes_the_frames_it_reads_and_acts_as_ever(
     policy, frames = small_policy(model), moving_frames(40)
 
     def actions(policy: MMEPolicy) -> tuple[list[np.ndarray], int]:
-        seen, chunks = 0, []
+        n_frames, chunks = 0, []
         original = MMEPolicy.encode_frames
 
-        def counting(self: MMEPolicy, given: np.ndarray, batch_size: int = 32) -> torch.Tensor:
-            nonlocal seen
-            seen += len(given)
-            return original(self, given, batch_size)
+        def counting(self: MMEPolicy, images: np.ndarray, batch_size: int = 32) -> torch.Tensor:
+            nonlocal n_frames
+            n_frames += len(images)
+            return original(self, images, batch_size)
 
         with monkeypatch.context() as patch:
             patch.setattr(MMEPolicy, "encode_frames", counting)
@@ -71,7 +71,7 @@ def test_a_recurrent_policy_encodes_the_frames_it_reads_and_acts_as_ever(
                 part = frames[start : {0: 1, 1: 17, 17: 33, 33: 40}[start]]
                 episode.observe({"front": part, "wrist": part}, np.zeros((len(part), 8), np.float32))
                 chunks.append(policy.act(episode))
-        return chunks, seen
+        return chunks, n_frames
 
     lazy, few = actions(policy)
     monkeypatch.setattr(type(policy.memory), "lazy", False)

@@ -30,12 +30,12 @@ def composed(integration: str, position: str) -> MMEPolicy:
 def without(history: HistoryTokens, first: int, count: int) -> HistoryTokens:
     """The same selection as if one frame had not been remembered: the later tokens move up, padding follows."""
 
-    def moved(x: Tensor) -> Tensor:
-        rest = torch.cat([x[:, :first], x[:, first + count :]], 1)
-        return torch.cat([rest, torch.zeros_like(x[:, :count])], 1)
+    def shifted(x: Tensor) -> Tensor:
+        others = torch.cat([x[:, :first], x[:, first + count :]], 1)
+        return torch.cat([others, torch.zeros_like(x[:, :count])], 1)
 
-    mask = moved(history.mask)
-    return replace(history, features=moved(history.features), positions=moved(history.positions), mask=mask)
+    mask = shifted(history.mask)
+    return replace(history, features=shifted(history.features), positions=shifted(history.positions), mask=mask)
 
 
 def remembered(policy: MMEPolicy) -> HistoryTokens:
@@ -45,7 +45,7 @@ def remembered(policy: MMEPolicy) -> HistoryTokens:
 
 @pytest.mark.parametrize(("position", "shifts"), [("slot", True), ("time", False)])
 @pytest.mark.parametrize("integration", ["context", "expert"])
-def test_a_dropped_frame_shifts_how_far_the_older_ones_stand_from_the_view_only_by_slot(
+def test_a_dropped_frame_shifts_the_distance_the_older_ones_stand_from_the_view_only_by_slot(
     integration: str, position: str, shifts: bool
 ) -> None:
     policy = composed(integration, position)
@@ -67,7 +67,7 @@ def test_a_dropped_frame_shifts_how_far_the_older_ones_stand_from_the_view_only_
 
 
 @pytest.mark.parametrize(("position", "shifts"), [("slot", True), ("time", False)])
-def test_a_frame_that_is_not_there_moves_the_rest_of_what_the_modulator_reads_only_by_slot(
+def test_a_frame_that_is_not_there_moves_the_remainder_of_what_the_modulator_reads_only_by_slot(
     position: str, shifts: bool
 ) -> None:
     policy = composed("modul", position)
@@ -99,7 +99,7 @@ def test_time_is_counted_back_from_now(integration: str) -> None:
 
 
 @pytest.mark.parametrize("integration", ["context", "modulator", "expert"])
-def test_by_time_an_integration_keeps_an_integrations_promises(integration: str) -> None:
+def test_by_time_an_integration_keeps_an_integrations_contract(integration: str) -> None:
     check_integration(integration, memory_position="time")
 
 

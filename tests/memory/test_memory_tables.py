@@ -30,8 +30,8 @@ def sizes() -> ModuleType:
 
 @pytest.mark.parametrize("model", ["pi05", "tokendrop_expert", "framesamp_modul", "ttt_context", "rmt_expert"])
 def test_sizes_are_those_of_the_page(sizes: ModuleType, model: str) -> None:
-    written = (EVIDENCE / "cost.md").read_text()
-    assert sizes.of_model(model) in written.splitlines()
+    page = (EVIDENCE / "cost.md").read_text()
+    assert sizes.of_model(model) in page.splitlines()
 
 
 def test_the_page_has_every_model() -> None:

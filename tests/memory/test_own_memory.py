@@ -86,7 +86,7 @@ def test_own_memory_trains_and_is_evaluated_on_nano(tmp_path):
     assert json.loads((weights.parent / "config.json").read_text())["plugins"] == ["last_frames"]
 
 
-def test_own_memory_gets_a_loss_and_acts(policy):
+def test_custom_memory_gets_a_loss_and_acts(policy):
     batch = random_batch(policy, valid=32)
     loss, _ = policy(batch)
     loss.backward()
@@ -99,7 +99,7 @@ def test_own_memory_gets_a_loss_and_acts(policy):
     assert torch.isfinite(torch.from_numpy(policy.act([episode]))).all()
 
 
-def test_own_memory_trains_through_the_same_command(tmp_path, monkeypatch):
+def test_custom_memory_trains_through_the_same_command(tmp_path, monkeypatch):
     small = [
         "backbone.depth=1",
         "backbone.vision.depth=1",

@@ -103,15 +103,15 @@ def test_a_growing_window_needs_nothing_prepared(make):
 
 
 def acted(policy, prepare: bool, chunks: int = 6) -> list[np.ndarray]:
-    frames, found = moving_frames(16), []
+    frames, results = moving_frames(16), []
     episode = policy.start_episode("press the button")
     for chunk in range(chunks):
-        shown = np.roll(frames, chunk, axis=2)
-        episode.observe({"front": shown, "wrist": shown}, np.zeros((16, 8), np.float32))
-        found.append(policy.act(episode, 1))
+        frames_ = np.roll(frames, chunk, axis=2)
+        episode.observe({"front": frames_, "wrist": frames_}, np.zeros((16, 8), np.float32))
+        results.append(policy.act(episode, 1))
         while prepare and policy.prepare(episode):
             pass
-    return found
+    return results
 
 
 FULL = {
@@ -143,7 +143,7 @@ def test_policies_without_such_a_memory_have_nothing_to_prepare():
         assert not policy.prepare(episode)
 
 
-def test_a_longer_window_is_never_full_in_a_whole_episode():
+def test_a_longer_window_is_never_full_in_an_episode():
     """What docs/evidence/performance.md offers: 128 frames hold the longest video and 1,300 frames of execution."""
     longest = max(len(recurrent_frames(video + 1300, video, max_steps=1000)) for video in range(0, 1000, 7))
     assert 64 < longest <= 128
@@ -160,16 +160,16 @@ def test_preparing_waits_for_everybody_and_keeps_nobody():
     class Somebody:
         pass
 
-    turns: Scheduler = Scheduler(max_batch=2)
+    scheduler: Scheduler = Scheduler(max_batch=2)
     someone, gone = Somebody(), Somebody()
-    turns.later[gone] = turns.later[someone] = None
-    turns.acting.extend("abc")
-    assert [step.batch for step in turns.next_steps() if isinstance(step, Act)] == [["a", "b"]]
-    assert len(turns.later) == 2, "c still waits"
+    scheduler.later[gone] = scheduler.later[someone] = None
+    scheduler.acting.extend("abc")
+    assert [step.batch for step in scheduler.next_steps() if isinstance(step, Act)] == [["a", "b"]]
+    assert len(scheduler.later) == 2, "c still waits"
     del gone
-    steps = list(turns.next_steps())
+    steps = list(scheduler.next_steps())
     assert [type(step) for step in steps] == [Act, Prepare] and steps[1].work is someone
-    assert not turns
+    assert not scheduler
 
 
 def test_rollouts_prepare_between_chunks(monkeypatch):

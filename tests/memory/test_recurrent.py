@@ -100,9 +100,9 @@ def test_acting_carries_the_state_in_the_episode(monkeypatch):
     counted = []
     advance = policy.memory.layer.advance
 
-    def counting(state, x, *rest):
+    def counting(state, x, *arguments):
         counted.append(x.shape[1])
-        return advance(state, x, *rest)
+        return advance(state, x, *arguments)
 
     monkeypatch.setattr(policy.memory.layer, "advance", counting)
     frames = moving_frames(50)
@@ -169,8 +169,8 @@ def test_layers_compile_without_breaks(make):
     memory = make()
     x, valid = torch.randn(2, 4, GRID**2, 16), torch.tensor([[False, True, True, True], [True] * 4])
     compiled = torch.compile(memory.layer.advance, backend="eager", fullgraph=True)
-    ours, theirs = (f(memory.init_state(2), x, valid)[0] for f in (memory.layer.advance, compiled))
-    assert all(torch.allclose(a, b, atol=TOLERANCE) for a, b in zip(ours, theirs, strict=True))
+    actual, expected = (f(memory.init_state(2), x, valid)[0] for f in (memory.layer.advance, compiled))
+    assert all(torch.allclose(a, b, atol=TOLERANCE) for a, b in zip(actual, expected, strict=True))
 
 
 TTT_METRICS = [
@@ -195,12 +195,12 @@ def test_inner_statistics_are_metrics(model, names):
         assert metrics["memory/inner_loss_after"] < metrics["memory/inner_loss_before"]
 
 
-def test_statistics_are_computed_only_when_asked_for(make, monkeypatch):
-    memory, asked = make(), []
+def test_statistics_are_computed_only_when_requested(make, monkeypatch):
+    memory, queries = make(), []
     advance = memory.layer.advance
 
     def noting(state, x, valid, following=0, statistics=False):
-        asked.append(statistics)
+        queries.append(statistics)
         return advance(state, x, valid, following, statistics)
 
     monkeypatch.setattr(memory.layer, "advance", noting)
@@ -210,7 +210,7 @@ def test_statistics_are_computed_only_when_asked_for(make, monkeypatch):
     quiet = memory(tokens)
     quiet.tokens.sum().backward()  # recomputation included
     assert quiet.metrics == {}
-    assert not any(asked)
+    assert not any(queries)
     without = counted.calls if isinstance(memory, TTT) else 0
     memory.reporting = True
     telling = memory(tokens)
@@ -241,12 +241,12 @@ def test_jitter_keeps_order_parts_and_the_current_frame():
     history = RandomHistory(400, exec_start=100)
     fixed = memory.frames(history, 399)
     assert np.array_equal(fixed, recurrent_frames(399, 100)), "without randomness nothing moves"
-    moved = memory.frames(history, 399, np.random.default_rng(0))
-    assert not np.array_equal(fixed, moved)
-    assert (np.diff(moved) > 0).all()
-    assert moved[-1] == 399
-    assert (moved < 100).sum() == (fixed < 100).sum()
-    assert np.abs(moved - fixed).max() <= 5
+    shifted = memory.frames(history, 399, np.random.default_rng(0))
+    assert not np.array_equal(fixed, shifted)
+    assert (np.diff(shifted) > 0).all()
+    assert shifted[-1] == 399
+    assert (shifted < 100).sum() == (fixed < 100).sum()
+    assert np.abs(shifted - fixed).max() <= 5
     for step in range(40):
         frames = jittered(recurrent_frames(step, 20), 20, 7, np.random.default_rng(step))
         assert frames[0] >= 0
@@ -282,7 +282,7 @@ def test_options_that_cannot_be_are_refused(model, options, message):
 
 
 @pytest.mark.parametrize(("model", "constant"), [("ttt_modul", "ttt_base_lr_inv"), ("rmt_modul", "freqs_cis")])
-def test_derived_constants_are_written_and_checked(model, constant):
+def test_derived_constants_are_saved_and_checked(model, constant):
     policy, path = small_policy(model), f"mem_encoder/recur_layer/{constant}"
     tree = to_released(policy)
     assert path in tree

@@ -8,7 +8,7 @@ import pytest
 
 from helpers.probe_fakes import actions, made_up
 from helpers.rollout_fakes import FACTS, InlineEnvs, quick_policy, records, roll
-from helpers.scripted_env import ScriptedEnv, make_far_env
+from helpers.scripted_env import ScriptedEnv, make_moving_env
 from mme_vla.envs.make import make_env
 from mme_vla.envs.vector.pool import Job
 from mme_vla.errors import UserError
@@ -29,13 +29,13 @@ BEGAN = [0, 9, 21, 30, 44]
 def test_a_split_with_sessions_shows_them_first_and_its_records_are_on_the_curve() -> None:
     policy = quick_policy("framesamp_modul", 8).eval()
     before = with_sessions(policy, SPLIT, made_up())
-    envs = InlineEnvs(base=make_far_env)
+    envs = InlineEnvs(base=make_moving_env)
     roll(before, JOBS, envs)
     # The second of three recordings comes second, and the third is not shown.
-    distracted, plain = actions(policy, "distract:2"), actions(policy, "pause:0")
-    for job, as_probed, undisturbed in zip(JOBS, distracted, plain, strict=True):
-        seen = np.stack(envs.made[job].actions)
-        assert np.array_equal(seen, as_probed) and not np.array_equal(seen, undisturbed)
+    distracted, paused = actions(policy, "distract:2"), actions(policy, "pause:0")
+    for job, as_probed, undisturbed in zip(JOBS, distracted, paused, strict=True):
+        actions_ = np.stack(envs.made[job].actions)
+        assert np.array_equal(actions_, as_probed) and not np.array_equal(actions_, undisturbed)
     curves = stress_curves([*records("test", [1, 1, 0]), *records(SPLIT, [1, 0, 0])])
     ((_, task, dial),) = curves
     points = curves[next(iter(curves))]
@@ -45,7 +45,7 @@ def test_a_split_with_sessions_shows_them_first_and_its_records_are_on_the_curve
 def test_nobody_evaluates_such_a_split_without_showing_them(tmp_path: Path) -> None:
     policy = quick_policy("framesamp_modul").eval()
     with pytest.raises(UserError, match="2 unrelated episodes come before each, and 0 are shown"):
-        evaluate(policy, JOBS, tmp_path, FACTS, RolloutSettings(split=SPLIT), base=make_far_env)
+        evaluate(policy, JOBS, tmp_path, FACTS, RolloutSettings(split=SPLIT), base=make_moving_env)
     with pytest.raises(UserError, match="2 unrelated episodes come before each, and 0 are shown"):
         make_env("StopCube", SPLIT)
     with pytest.raises(UserError, match="2 recorded episodes to take from, and there are 1"):
@@ -89,9 +89,9 @@ def test_in_closed_loop_an_oracle_keeps_the_frames_at_which_subtasks_began(arm: 
 
 
 def test_where_nobody_tells_when_subtasks_begin_the_oracle_is_refused(tmp_path: Path) -> None:
-    wanted = ProbePlan(["oracle"], jobs=JOBS, offline=OfflineSettings())
+    request = ProbePlan(["oracle"], jobs=JOBS, offline=OfflineSettings())
     with pytest.raises(UserError, match="whose beginnings are told"):
         run_probe(
-            quick_policy("framesamp_modul").eval(), wanted, tmp_path, FACTS, RolloutSettings(), base=make_far_env,
+            quick_policy("framesamp_modul").eval(), request, tmp_path, FACTS, RolloutSettings(), base=make_moving_env,
             show_progress=False,
         )  # fmt: skip

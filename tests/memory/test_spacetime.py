@@ -43,7 +43,7 @@ def as_lerobots(only: str, folder: Path, **settings: Any) -> Path:
 
 @torch.no_grad()
 @pytest.mark.parametrize("only", ONLY)
-def test_a_checkpoint_of_lerobots_loads_whole_and_acts_as_it_does_there(only: str, tmp_path: Path) -> None:
+def test_a_checkpoint_of_lerobots_loads_completely_and_acts_as_it_does_there(only: str, tmp_path: Path) -> None:
     policy = load_weights(window_policy(*ONLY[only]), as_lerobots(only, tmp_path)).eval()
     expected = torch.tensor(json.loads(RECORDED.read_text())[only])
     batch = as_batch(policy)
@@ -55,7 +55,7 @@ def test_a_checkpoint_of_lerobots_loads_whole_and_acts_as_it_does_there(only: st
         assert float((other - expected).abs().max()) > 1e-2, "the past would not matter"
 
 
-def test_one_that_looks_otherwise_is_told_how_to_be_built(tmp_path: Path) -> None:
+def test_one_that_differs_is_reported_how_to_be_built(tmp_path: Path) -> None:
     folder = as_lerobots("both", tmp_path, memory_stride=30)
     with pytest.raises(UserError, match=r"integration\.mutual=true memory\.frames=3 memory\.stride=30 memory\.every=2"):
         load_weights(window_policy(True, True), folder)
@@ -66,7 +66,7 @@ def test_one_that_looks_otherwise_is_told_how_to_be_built(tmp_path: Path) -> Non
         )
 
 
-def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_elsewhere(tmp_path: Path) -> None:
+def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_otherwise(tmp_path: Path) -> None:
     folder, policy = as_lerobots("both", tmp_path), window_policy(True, True)
     start = transfer(policy, folder)
     assert not start.left and not start.new
@@ -81,12 +81,12 @@ def test_its_states_are_taken_where_tokens_are_as_wide_and_left_behind_by_name_e
 
 
 @torch.no_grad()
-def test_frames_before_the_episode_are_not_seen_and_those_in_it_are() -> None:
+def test_frames_before_the_episode_are_masked_and_those_in_it_are() -> None:
     policy = small()
     batch, draws = random_batch(policy), policy.training_noise(2, torch.Generator().manual_seed(0))
     assert batch.past is not None and not batch.past.mask[0, 0]
     policy.eval()
-    plain = float(policy(batch, draws)[0])
+    baseline = float(policy(batch, draws)[0])
 
     def changed(row: int, frame: int) -> float:
         assert batch.past is not None
@@ -94,15 +94,15 @@ def test_frames_before_the_episode_are_not_seen_and_those_in_it_are() -> None:
         images[row, frame] = 255 - images[row, frame]
         return float(policy(replace(batch, past=replace(batch.past, images=images)), draws)[0])
 
-    assert changed(0, 0) == plain
-    assert abs(changed(0, 1) - plain) > 1e-5 and abs(changed(1, 0) - plain) > 1e-5
+    assert changed(0, 0) == baseline
+    assert abs(changed(0, 1) - baseline) > 1e-5 and abs(changed(1, 0) - baseline) > 1e-5
 
 
 @torch.no_grad()
-def test_a_clip_of_one_frame_is_a_picture() -> None:
-    tower, pictures = small().backbone.vision, torch.rand(2, 3, 64, 64) * 2 - 1
-    alone = tower(pictures[:, None], torch.ones(2, 1, dtype=torch.bool), 2)
-    assert torch.allclose(alone, tower(pictures), atol=1e-5)
+def test_a_clip_of_one_frame_is_an_image() -> None:
+    tower, images = small().backbone.vision, torch.rand(2, 3, 64, 64) * 2 - 1
+    alone = tower(images[:, None], torch.ones(2, 1, dtype=torch.bool), 2)
+    assert torch.allclose(alone, tower(images), atol=1e-5)
 
 
 def test_augmentation_changes_past_views_as_it_does_the_current_ones() -> None:
@@ -110,23 +110,23 @@ def test_augmentation_changes_past_views_as_it_does_the_current_ones() -> None:
     batch = random_batch(policy)
     assert batch.past is not None
     still = batch.images[:, None].expand_as(batch.past.images)
-    drawn = torch.rand(2, 7, generator=torch.Generator().manual_seed(1))
-    seen = policy.prepare_images(replace(batch, past=replace(batch.past, images=still)), drawn)
-    views = seen.images
-    assert seen.past is not None and not torch.equal(views, policy.prepare_images(batch).images)
-    assert torch.equal(seen.past.images[:, 0], views) and torch.equal(seen.past.images[:, 1], views)
+    draws_ = torch.rand(2, 7, generator=torch.Generator().manual_seed(1))
+    current = policy.prepare_images(replace(batch, past=replace(batch.past, images=still)), draws_)
+    views = current.images
+    assert current.past is not None and not torch.equal(views, policy.prepare_images(batch).images)
+    assert torch.equal(current.past.images[:, 0], views) and torch.equal(current.past.images[:, 1], views)
 
 
 def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_difference() -> None:
     policy, source = small(), open_sources(["sample"])[0]
     processor = policy.require_processor()
     memory = policy.require_memory()
-    kept = np.zeros((1, 1, policy.backbone.vision_width), np.float32)
+    cached = np.zeros((1, 1, policy.backbone.vision_width), np.float32)
 
     class Cache:
         def history(self, episode: int) -> CachedHistory:
             length = int(source.lengths[episode])
-            return CachedHistory(memory.storage, kept, np.zeros(1, np.int64), length, None, start)
+            return CachedHistory(memory.storage, cached, np.zeros(1, np.int64), length, None, start)
 
     start = int(source.exec_starts[0])
     dataset = TrainingDataset([source], processor, memory, [Cache()])  # type: ignore[list-item]
@@ -140,20 +140,22 @@ def test_an_episode_sees_what_the_dataset_shows_and_its_pieces_make_no_differenc
             for at in range(0, len(frames), piece):
                 part = slice(at, at + piece)
                 episode.observe({name: view[part] for name, view in views.items()}, states[part], demo[part])
-            seen = policy.observation([episode])
-            assert seen.past is not None and batch.past is not None and batch.history is not None
-            assert torch.equal(seen.past.images, batch.past.images) and torch.equal(seen.past.mask, batch.past.mask)
+            observation = policy.observation([episode])
+            assert observation.past is not None and batch.past is not None and batch.history is not None
+            assert torch.equal(observation.past.images, batch.past.images) and torch.equal(
+                observation.past.mask, batch.past.mask
+            )
             assert torch.allclose(episode.gather_selection().features, batch.history.features[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("model", ["spacetime_context", "spacetime_modul"])
-def test_a_rollout_draws_of_every_camera_what_is_looked_back_at_and_nothing_changes(model: str) -> None:
-    *everything, video, plain = both_ways(small(model))
-    assert video["front"] == video["wrist"] and plain["front"] == plain["wrist"]
-    assert plain["front"] < everything[1]["front"] / 2
+def test_a_rollout_renders_past_views_of_every_camera_and_nothing_changes(model: str) -> None:
+    *everything, video, full = both_ways(small(model))
+    assert video["front"] == video["wrist"] and full["front"] == full["wrist"]
+    assert full["front"] < everything[1]["front"] / 2
 
 
-def test_it_joins_with_others_and_two_that_look_back_are_refused() -> None:
+def test_it_joins_with_others_and_two_that_read_past_frames_are_refused() -> None:
     words: dict[str, Any] = {"backbone": {"vision": SMALL_VISION}, "integration": "expert"}
     members: list[Any] = [{"name": "framesamp", "budget": 64, "grid": 4}, {"name": "spacetime", **SHORT}]
     policy = small_policy("framesamp_ttt_modul", memory={"members": members}, **words)
@@ -188,13 +190,13 @@ def test_where_it_has_no_place_a_sentence_says_so() -> None:
 
 def test_past_frames_of_one_camera_are_not_enough() -> None:
     episode = small().start_episode("press the button")
-    pictures = moving_frames(4)
+    images = moving_frames(4)
     with pytest.raises(UserError, match="of every camera"):
-        episode.add_frames(pictures)
+        episode.add_frames(images)
     with pytest.raises(UserError, match="of every camera"):
-        episode.set_view({"front": pictures[0], "wrist": pictures[0]}, np.zeros(8))
-    drawn = {"front": np.arange(8), "wrist": np.array([7])}
-    both = {"front": np.concatenate([pictures, pictures]), "wrist": pictures[:1]}
-    episode.observe(both, np.zeros((8, 8), np.float32), rendered=drawn)
+        episode.set_view({"front": images[0], "wrist": images[0]}, np.zeros(8))
+    rendered = {"front": np.arange(8), "wrist": np.array([7])}
+    both = {"front": np.concatenate([images, images]), "wrist": images[:1]}
+    episode.observe(both, np.zeros((8, 8), np.float32), rendered=rendered)
     with pytest.raises(UserError, match=r"looks back at the frames \[2\]"):
         small().act(episode)

@@ -63,11 +63,11 @@ def test_nothing_later_than_the_step_decides(policy, frames):
 def test_selections_respect_budget_and_time_order(policy, frames):
     history = cached_history(policy, frames)
     for step in range(0, FRAMES, 11):
-        chosen = policy.memory.select(history, step)
-        assert len(chosen) <= policy.memory.capacity
-        assert (np.diff(chosen[:, 0]) >= 0).all()
-        assert chosen[:, 0].max() <= step
-        assert len(np.unique(chosen, axis=0)) == len(chosen)
+        selected = policy.memory.select(history, step)
+        assert len(selected) <= policy.memory.capacity
+        assert (np.diff(selected[:, 0]) >= 0).all()
+        assert selected[:, 0].max() <= step
+        assert len(np.unique(selected, axis=0)) == len(selected)
 
 
 def test_streaming_and_offline_give_the_same_actions(policy, frames):
@@ -145,8 +145,8 @@ def test_bfloat16_history_is_what_the_cache_stores(frames):
 
 def test_tokendrop_at_the_smallest_budget_keeps_the_first_frame_alone(frames):
     policy = small_policy("tokendrop_context", backbone=FEW_TOKENS, memory={"budget": 64})
-    chosen = policy.memory.select(cached_history(policy, frames), FRAMES - 1)
-    assert chosen.tolist() == [[0, patch] for patch in range(64)]
+    selected = policy.memory.select(cached_history(policy, frames), FRAMES - 1)
+    assert selected.tolist() == [[0, patch] for patch in range(64)]
 
 
 def test_tokendrop_encodes_only_the_frames_it_can_choose(frames, monkeypatch):

@@ -101,11 +101,11 @@ class DepthEnv(ScriptedEnv):
 def readings(count: int, listed: bool = False) -> dict[str, Any]:
     """Depth and poses of both cameras, as an environment or a client sends them."""
     rng = np.random.default_rng(count)
-    found: dict[str, Any] = {}
+    readings_: dict[str, Any] = {}
     for camera in ("front", "wrist"):
-        found[f"{camera}_depth"] = rng.integers(400, 900, (count, SIDE, SIDE, 1)).astype(np.int16)
-        found[f"{camera}_camera_extrinsic"] = np.tile(POSE, (count, 1, 1))
-    return {f"{name}_list": list(values) for name, values in found.items()} if listed else found
+        readings_[f"{camera}_depth"] = rng.integers(400, 900, (count, SIDE, SIDE, 1)).astype(np.int16)
+        readings_[f"{camera}_camera_extrinsic"] = np.tile(POSE, (count, 1, 1))
+    return {f"{name}_list": list(values) for name, values in readings_.items()} if listed else readings_
 
 
 def make_depth_env(task: str, split: str, episode: int, max_steps: int, **options: Any) -> DepthEnv:
@@ -140,15 +140,15 @@ def test_it_is_served_what_it_answers_itself(model: str, loaded: Callable[[str],
     rng = np.random.default_rng(0)
     front, wrist = (rng.integers(0, 255, (5, SIDE, SIDE, 3), np.uint8) for _ in range(2))
     states, beside = np.full((5, 8), 0.04, np.float32), readings(5)
-    seen = {"front": front, "wrist": wrist} | {name: beside[name] for name in robot.readings}
+    images = {"front": front, "wrist": wrist} | {name: beside[name] for name in robot.readings}
     episode = policy.start_episode("pick up the cube", seed=42)
-    episode.observe(seen, states, np.arange(5) < 4)
+    episode.observe(images, states, np.arange(5) < 4)
     expected = policy.act(episode, 2)
     lists = {f"{name}_list": list(beside[name]) for name in robot.readings}
     with Served(policy) as served, served.client() as client:
         assert client.metadata["readings"] == list(robot.readings)
-        answer = client.infer(challenge(front, wrist, states, first=True, **lists))["actions"]
-    np.testing.assert_allclose(answer, expected[: robot.action.execute], rtol=1e-4, atol=1e-5)
+        reply = client.infer(challenge(front, wrist, states, first=True, **lists))["actions"]
+    np.testing.assert_allclose(reply, expected[: robot.action.execute], rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("model", SHORT)
@@ -157,29 +157,31 @@ def test_it_is_probed_on_recordings(
 ) -> None:
     policy = loaded(model)
     recordings = all_recordings(open_sources([data(model)], policy.embodiment))
-    chosen = OfflineSettings(draws=2, moments=2, flow_steps=2)
+    settings = OfflineSettings(draws=2, moments=2, flow_steps=2)
     torch.manual_seed(0)
-    found = probe_offline(policy, read_arms(["nodemo"]), recordings[:1], recordings, tmp_path / "lines.jsonl", chosen)
-    moments = [line for line in found if isinstance(line, MomentLine)]
+    results = probe_offline(
+        policy, read_arms(["nodemo"]), recordings[:1], recordings, tmp_path / "lines.jsonl", settings
+    )
+    moments = [line for line in results if isinstance(line, MomentLine)]
     assert len(moments) == 2 and {line.recording for line in moments} == {recordings[0].name}
     assert all(np.isfinite(line.change) for line in moments)
-    assert lines.read(tmp_path / "lines.jsonl")[0] == found
+    assert lines.read(tmp_path / "lines.jsonl")[0] == results
 
 
-def test_sam2act_is_told_which_depth_a_request_lacks(loaded: Callable[[str], Policy]) -> None:
+def test_sam2act_is_reported_which_depth_a_request_lacks(loaded: Callable[[str], Policy]) -> None:
     policy, frames, states = (
         loaded("sam2act_plus"),
         np.zeros((2, SIDE, SIDE, 3), np.uint8),
         np.zeros((2, 8), np.float32),
     )
     lists = readings(2, listed=True)
-    whole = challenge(frames, frames, states, first=True, **lists)
+    request = challenge(frames, frames, states, first=True, **lists)
     wrong = {
-        "lacks wrist_depth_list": {k: v for k, v in whole.items() if k != "wrist_depth_list"},
-        "front_depth_list must have one entry for each of 2 frames": whole | {"front_depth_list": []},
-        r"front_depth_list must hold arrays \[64, 64\]": whole | {"front_depth_list": [np.zeros((8, 8))] * 2},
-        "front_depth_list must be millimetres": whole | {"front_depth_list": [-d for d in lists["front_depth_list"]]},
-        r"wrist_camera_extrinsic_list must hold arrays \[3, 4\]": whole | {"wrist_camera_extrinsic_list": ["x", "y"]},
+        "lacks wrist_depth_list": {k: v for k, v in request.items() if k != "wrist_depth_list"},
+        "front_depth_list must have one entry for each of 2 frames": request | {"front_depth_list": []},
+        r"front_depth_list must hold arrays \[64, 64\]": request | {"front_depth_list": [np.zeros((8, 8))] * 2},
+        "front_depth_list must be millimetres": request | {"front_depth_list": [-d for d in lists["front_depth_list"]]},
+        r"wrist_camera_extrinsic_list must hold arrays \[3, 4\]": request | {"wrist_camera_extrinsic_list": ["x", "y"]},
         "add_buffer has no place for them": {"add_buffer": True, "images": frames[:, None], "state": states},
     }
     with Served(policy) as served:
@@ -189,11 +191,11 @@ def test_sam2act_is_told_which_depth_a_request_lacks(loaded: Callable[[str], Pol
 
 
 def test_sam2act_takes_depth_of_the_current_frame_in_the_other_schema(loaded: Callable[[str], Policy]) -> None:
-    policy, picture = loaded("sam2act_plus"), np.full((SIDE, SIDE, 3), 9, np.uint8)
+    policy, image = loaded("sam2act_plus"), np.full((SIDE, SIDE, 3), 9, np.uint8)
     beside = readings(1)
     episode = policy.start_episode("pick up the cube", seed=42)
-    episode.observe({"front": picture[None], "wrist": picture[None], **beside}, np.full((1, 8), 0.04, np.float32))
-    message = {"observation/image": picture, "observation/wrist_image": picture, "prompt": "pick up the cube"}
+    episode.observe({"front": image[None], "wrist": image[None], **beside}, np.full((1, 8), 0.04, np.float32))
+    message = {"observation/image": image, "observation/wrist_image": image, "prompt": "pick up the cube"}
     message |= {"observation/state": np.full(8, 0.04, np.float32)}
     message |= {f"observation/{name}": values[0] for name, values in beside.items()}
     with Served(policy) as served, served.client() as client:
@@ -215,8 +217,8 @@ def test_a_sam2act_episode_ends_after_its_waypoints(loaded: Callable[[str], Poli
 def test_it_is_explained_by_inspect_and_stands_beside_its_paper_row(model: str, trained: Callable[[str], Path]) -> None:
     console = Console(record=True, width=200, file=io.StringIO())
     show_checkpoint(trained(model), console)
-    said = console.export_text()
-    assert all(word in said for word in ("parameters", "action", "normalisation", model))
+    output = console.export_text()
+    assert all(word in output for word in ("parameters", "action", "normalisation", model))
     subgoal = {"openvla_oft_simplesg": "qwenvl", "openvla_oft_groundsg": "qwenvl"}.get(model)
     method = paper_method(model, subgoal)
     assert method is not None and method.family == "prior" and 0 <= average(method.name).mean < 30
@@ -229,5 +231,5 @@ def test_it_is_explained_by_inspect_and_stands_beside_its_paper_row(model: str, 
     [("diffusion_policy", "diffusion_policy"), ("openvla_oft", "openvla_oft"), ("memoryvla", "memoryvla"),
      ("sam2act_first", "sam2act_plus"), ("sam2act_memory", "sam2act_plus")],
 )  # fmt: skip
-def test_a_recipe_at_full_size_has_the_name_that_the_papers_row_is_found_by(recipe: str, name: str) -> None:
+def test_a_recipe_at_full_size_has_the_name_that_the_papers_row_has(recipe: str, name: str) -> None:
     assert compose("train", [f"experiment={recipe}"]).name == name

@@ -33,7 +33,7 @@ SMALL = {
 }  # fmt: skip
 
 
-def test_it_keeps_a_backbones_promises() -> None:
+def test_it_keeps_a_backbones_contract() -> None:
     check_backbone("nano", **SMALL)
 
 
@@ -51,10 +51,10 @@ def test_the_shipped_tower_weighs_under_six_megabytes_and_other_sizes_are_refuse
 def test_the_shipped_tower_names_what_is_where() -> None:
     """A red square on the table's grey, where a cube is seen: present in its token, and nowhere far from it."""
     tower = nano("pi05").backbone.vision
-    picture = torch.full((1, 3, 128, 128), 0.3)
-    picture[0, :, 52:60, 66:74] = torch.tensor([0.7, -0.9, -0.9])[:, None, None]
+    image = torch.full((1, 3, 128, 128), 0.3)
+    image[0, :, 52:60, 66:74] = torch.tensor([0.7, -0.9, -0.9])[:, None, None]
     with torch.no_grad():
-        shares = tower.answers(picture)[0].softmax(2)[0]  # token, class, place
+        shares = tower.answers(image)[0].softmax(2)[0]  # token, class, place
     red = shares[:, CLASSES.index("red cube")].amax(-1).view(8, 8)
     assert red.argmax() == 3 * 8 + 4 and red[3, 4] > 0.5
     assert shares[:, CLASSES.index("green cube")].max() < 0.5
@@ -65,7 +65,7 @@ def test_a_fresh_tower_knows_the_words_that_the_shipped_one_knows() -> None:
     assert torch.equal(class_words(), words) and words.sum() == 3
 
 
-def test_framesamp_remembers_every_eighth_frame_alone_when_told_so() -> None:
+def test_framesamp_stores_every_eighth_frame_alone_when_configured() -> None:
     memory = FrameSamp(16, 16, budget=256, grid=8, every=8)
     assert memory.chosen(66).tolist() == [0, 15, 39, 63]
     assert memory.chosen(5).tolist() == [0]
@@ -80,7 +80,7 @@ def test_framesamp_names_the_frames_it_will_read_also_when_it_stores_every_eight
         assert set(memory.frames_read([step], 30)) <= set(memory.storage.stored_frames(step + 1))
 
 
-def test_a_demonstration_is_read_as_it_was_written(tmp_path: Path) -> None:
+def test_a_demonstration_is_read_as_it_was_saved(tmp_path: Path) -> None:
     made = demonstration()
     made.save(tmp_path / "a.npz")
     read = Demonstration.load(tmp_path / "a.npz")
@@ -89,7 +89,7 @@ def test_a_demonstration_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert list(read.images) == ["front"] and np.array_equal(read.images["front"][66], made.images["front"][66])
 
 
-def test_a_frame_that_was_not_drawn_is_refused() -> None:
+def test_a_frame_that_was_not_rendered_is_refused() -> None:
     policy = nano()
     policy.require_processor().stats = statistics([demonstration()], policy)
     with pytest.raises(UserError, match=r"\[39\]"):
@@ -111,19 +111,19 @@ def test_decisions_are_the_samples_and_hold_what_an_episode_would_show() -> None
     assert torch.equal(history.positions, batch.history.positions[0])
 
 
-def test_tokens_made_beforehand_give_the_loss_of_the_pictures() -> None:
+def test_tokens_made_beforehand_give_the_loss_of_the_images() -> None:
     policy, made = nano("pi05").eval(), demonstration()
     processor = policy.require_processor()
     processor.stats = statistics([made], policy)
     batch = Decisions.of(policy, [made]).collate([0, 1, 2])
-    shown = processor.images([np.stack([made.images["front"][frame] for frame in (66, 120, 155)])])
+    images = processor.images([np.stack([made.images["front"][frame] for frame in (66, 120, 155)])])
     draws = policy.training_noise(3, torch.Generator().manual_seed(0))
     with torch.no_grad():
-        ready, drawn = policy(batch, draws)[0], policy(replace(batch, images=shown, view_tokens=None), draws)[0]
-    assert torch.allclose(ready, drawn, atol=1e-5)
+        ready, from_images = policy(batch, draws)[0], policy(replace(batch, images=images, view_tokens=None), draws)[0]
+    assert torch.allclose(ready, from_images, atol=1e-5)
 
 
-def test_decisions_are_read_as_they_were_written(tmp_path: Path) -> None:
+def test_decisions_are_read_as_they_were_saved(tmp_path: Path) -> None:
     policy = nano()
     policy.require_processor().stats = statistics([demonstration()], policy)
     made = Decisions.of(policy, [demonstration()])
@@ -154,7 +154,7 @@ def test_demonstrations_are_counted_by_difficulty(counts: object, words: str) ->
         check_counts(counts)
 
 
-def test_a_tasks_own_settings_come_with_its_name_unless_others_are_named(
+def test_a_tasks_settings_come_with_its_name_unless_others_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "nano").mkdir()
@@ -177,14 +177,14 @@ def test_the_policy_that_ships_has_four_memory_tokens_and_acts() -> None:
     assert policy.act(episode).shape == (4, 7)
 
 
-def test_what_the_goal_names_first_is_marked_in_pictures_and_memory() -> None:
+def test_what_the_goal_names_first_is_highlighted_in_images_and_memory() -> None:
     backbone, processor = nano().backbone, nano().require_processor()
     ids, mask = processor.prompt("pick up the container hiding the green cube, then the one hiding the red cube")
-    plain, plain_mask = processor.prompt("press the button")
+    unmarked, unmarked_mask = processor.prompt("press the button")
     tokens = torch.arange(96.0).expand(2, 3, 96)
-    marked = backbone.condition_on_prompt(tokens, torch.stack([ids, plain]), torch.stack([mask, plain_mask]))
-    assert marked[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
-    assert torch.equal(marked[1], tokens[1])
+    annotated = backbone.condition_on_prompt(tokens, torch.stack([ids, unmarked]), torch.stack([mask, unmarked_mask]))
+    assert annotated[0, 0, [1, 2, 13, 14, 60]].tolist() == [2, 1, 14, 13, 60]
+    assert torch.equal(annotated[1], tokens[1])
 
 
 def page_row(records: list[EpisodeRecord]) -> str:
@@ -192,8 +192,8 @@ def page_row(records: list[EpisodeRecord]) -> str:
     rate = sum(record.success for record in records) / len(records)
     interval = wilson(rate, len(records))
     levels = [[record.success for record in records if record.difficulty == level] for level in LEVELS]
-    shown = f"**{100 * rate:.0f} %** ({100 * interval.low:.0f} … {100 * interval.high:.0f})"
-    return f"| {len(records)} | {shown} | " + " | ".join(f"{sum(part)}/{len(part)}" for part in levels) + " |"
+    cell = f"**{100 * rate:.0f} %** ({100 * interval.low:.0f} … {100 * interval.high:.0f})"
+    return f"| {len(records)} | {cell} | " + " | ".join(f"{sum(part)}/{len(part)}" for part in levels) + " |"
 
 
 def test_the_pages_figures_follow_from_the_records() -> None:

@@ -26,31 +26,31 @@ def test_its_decisions_stand_where_a_policy_that_decides_alike_would_stand() -> 
     made = record("SwingXtimes", choices=[], cameras=[], carried_out=True, **SCENE)  # type: ignore[arg-type]
     assert made is not None
     env = make_env("SwingXtimes", action_space="waypoint", render=False, **SCENE)  # type: ignore[arg-type]
-    seen, _ = env.reset()
+    observation, _ = env.reset()
     for number, (frame, target) in enumerate(zip(made.motions.decisions, made.motions.targets, strict=True)):
-        now = benchmark_state(seen["joint_state_list"][-1], seen["gripper_state_list"][-1])
+        now = benchmark_state(observation["joint_state_list"][-1], observation["gripper_state_list"][-1])
         assert np.allclose(made.states[frame], now, atol=1e-3), number
-        seen, _, ended, _, info = env.step(target)
+        observation, _, ended, _, info = env.step(target)
     env.close()
     assert ended and info["status"] == "success"
 
 
-def test_noise_is_in_what_is_learned_and_not_in_what_is_asked_for() -> None:
+def test_noise_is_in_what_is_learned_and_not_in_what_is_requested() -> None:
     policy, made = nano().eval(), demonstration()
     policy.require_processor().stats = statistics([made], policy)
-    plain, noisy = (Decisions.of(policy, [made], noise=noise) for noise in (0.0, 0.2))
+    exact, noisy = (Decisions.of(policy, [made], noise=noise) for noise in (0.0, 0.2))
     torch.manual_seed(0)
-    batch, moved = plain.collate([0, 1, 2]), noisy.collate([0, 1, 2])
-    assert batch.state is not None and moved.state is not None and batch.history and moved.history
-    for before, after, spread in (
-        (batch.view_tokens, moved.view_tokens, 0.2),
-        (batch.history.features, moved.history.features, 0.2),
-        (batch.state[:, :-1], moved.state[:, :-1], 0.01),
+    batch, shifted = exact.collate([0, 1, 2]), noisy.collate([0, 1, 2])
+    assert batch.state is not None and shifted.state is not None and batch.history and shifted.history
+    for before, after, std in (
+        (batch.view_tokens, shifted.view_tokens, 0.2),
+        (batch.history.features, shifted.history.features, 0.2),
+        (batch.state[:, :-1], shifted.state[:, :-1], 0.01),
     ):
         assert before is not None and after is not None
-        assert (after - before).std().item() == pytest.approx(spread, rel=0.5)
-    assert torch.equal(batch.state[:, -1], moved.state[:, -1])
-    assert batch.actions is not None and torch.equal(batch.actions, moved.actions)  # type: ignore[arg-type]
+        assert (after - before).std().item() == pytest.approx(std, rel=0.5)
+    assert torch.equal(batch.state[:, -1], shifted.state[:, -1])
+    assert batch.actions is not None and torch.equal(batch.actions, shifted.actions)  # type: ignore[arg-type]
 
 
 def test_what_the_demonstrator_does_solves_an_episode_through_the_actions_of_policies() -> None:

@@ -32,8 +32,8 @@ def test_a_demonstration_for_a_robot_that_chooses_is_its_choices_and_says_the_op
 @pytest.mark.parametrize(("task", "level"), [("SwingXtimes", "easy"), ("VideoRepick", "hard")])
 def test_a_row_by_choices_is_of_a_hundred_scenes_of_one_difficulty(task: str, level: str) -> None:
     config = compose("nano", [f"nano={task}", f"task={task}"])
-    chosen = choose_episodes(task, list(config.episodes), config.split)
-    assert len({spec.seed for spec in chosen}) == 100 and {spec.difficulty for spec in chosen} == {level}
+    specs = choose_episodes(task, list(config.episodes), config.split)
+    assert len({spec.seed for spec in specs}) == 100 and {spec.difficulty for spec in specs} == {level}
 
 
 @pytest.mark.parametrize(

@@ -40,9 +40,9 @@ def demonstration(frames: range | list[int]) -> Demonstration:
 
 @pytest.mark.parametrize(("execute", "asked"), [(1, [0, 1, 2, 3, 4]), (2, [0, 2, 4]), (14, [0])])
 def test_what_is_executed_without_asking_again_is_no_decision_to_learn(execute: int, asked: list[int]) -> None:
-    found, made = policy(execute), demonstration(range(120))
-    found.require_processor().stats = statistics([made], found)
-    samples = Decisions.of(found, [made])
+    routed, made = policy(execute), demonstration(range(120))
+    routed.require_processor().stats = statistics([made], routed)
+    samples = Decisions.of(routed, [made])
     batch = samples.collate(range(len(asked)))
     assert len(samples.batch.prompt) == len(samples.distant) == len(asked)
     assert batch.state is not None and batch.action_mask is not None
@@ -51,30 +51,30 @@ def test_what_is_executed_without_asking_again_is_no_decision_to_learn(execute: 
 
 
 def test_a_route_decided_at_once_needs_the_frames_before_it_alone() -> None:
-    found, video = policy(14), demonstration([0, 7, 15, 20])
-    found.require_processor().stats = statistics([video], found)
-    assert len(Decisions.of(found, [video])) == 1
+    routed, video = policy(14), demonstration([0, 7, 15, 20])
+    routed.require_processor().stats = statistics([video], routed)
+    assert len(Decisions.of(routed, [video])) == 1
     with pytest.raises(UserError, match="holds no tokens"):
-        Decisions.of(found, [demonstration([0, 7, 20])])
+        Decisions.of(routed, [demonstration([0, 7, 20])])
 
 
 def test_few_decisions_are_blurred_as_they_are_learned_and_measured_as_they_are(tmp_path: Path) -> None:
-    found, made = policy(1), demonstration(range(120))
-    found.require_processor().stats = statistics([made], found)
-    sharp = Decisions.of(found, [made])
+    routed, made = policy(1), demonstration(range(120))
+    routed.require_processor().stats = statistics([made], routed)
+    sharp = Decisions.of(routed, [made])
     sharp.save(tmp_path / "a.safetensors")
     blurred = Decisions.load(tmp_path / "a.safetensors", token_noise=0.5)
     now, same, other = blurred.collate([0, 1, 2]), blurred.collate([0, 1, 2]), blurred.collate([2, 1, 0])
-    seen = sharp.collate([0, 1, 2])
-    assert now.view_tokens is not None and seen.view_tokens is not None and now.history is not None
-    assert same.view_tokens is not None and other.view_tokens is not None and seen.history is not None
+    batch = sharp.collate([0, 1, 2])
+    assert now.view_tokens is not None and batch.view_tokens is not None and now.history is not None
+    assert same.view_tokens is not None and other.view_tokens is not None and batch.history is not None
     assert torch.equal(now.view_tokens, same.view_tokens)
     assert not torch.equal(now.view_tokens[1], other.view_tokens[1])
-    spread = sharp.batch.view_tokens.float().flatten(0, -2).std(0)  # type: ignore[union-attr]
-    off = (now.view_tokens.float() - seen.view_tokens.float()).flatten(0, -2).std(0)
-    assert torch.allclose(off[spread > 0.01], 0.5 * spread[spread > 0.01], rtol=0.4)
-    assert torch.equal(now.history.mask, seen.history.mask)
-    assert not torch.equal(now.history.features, seen.history.features)
+    std = sharp.batch.view_tokens.float().flatten(0, -2).std(0)  # type: ignore[union-attr]
+    off = (now.view_tokens.float() - batch.view_tokens.float()).flatten(0, -2).std(0)
+    assert torch.allclose(off[std > 0.01], 0.5 * std[std > 0.01], rtol=0.4)
+    assert torch.equal(now.history.mask, batch.history.mask)
+    assert not torch.equal(now.history.features, batch.history.features)
 
 
 def test_the_robot_of_routes_has_a_motion_for_each_half_of_the_longest_route() -> None:
@@ -91,16 +91,16 @@ def step(number: int, video: int) -> SimpleNamespace:
 
 
 @pytest.mark.parametrize(("every", "drawn"), [(1, {3, 4, 6, 8}), (2, {3, 6}), (14, {3})])
-def test_only_decisions_that_a_policy_is_asked_for_are_drawn(every: int, drawn: set[int]) -> None:
+def test_only_decisions_that_a_policy_is_requested_are_rendered(every: int, drawn: set[int]) -> None:
     steps = [step(number, 3) for number in range(11)]
-    found = FrameChoice(AT_DECISIONS, None, every).render_request(steps)  # type: ignore[arg-type]
-    assert set(found.frames["front"]) == drawn
+    selection = FrameChoice(AT_DECISIONS, None, every).render_request(steps)  # type: ignore[arg-type]
+    assert set(selection.frames["front"]) == drawn
 
 
 def test_the_pages_figures_of_routes_follow_from_the_records() -> None:
     records = read_folders(find_records([REPOSITORY / "benchmarks" / "nano" / "RouteStick"]))
     won = {model: {r.episode for r in records if r.model.startswith(model) and r.success} for model in ROWS}
-    assert len(records) == 300 and {model: len(found) for model, found in won.items()} == ROWS
+    assert len(records) == 300 and {model: len(rows) for model, rows in won.items()} == ROWS
     assert won["pi05"] < won["framesamp"]
     page = (REPOSITORY / "docs" / "evidence" / "nano.md").read_text()
     assert "| **73 %** (64 … 81) | 50/50 | 19/25 | 4/25 |" in page and "| 3 % (1 … 8) | 3/50 | 0/25 | 0/25 |" in page

@@ -34,14 +34,14 @@ def drawn_for(policy: MMEPolicy) -> Demonstration:
 
 
 @pytest.mark.parametrize("memory", ["tokendrop", "ttt", "rmt"])
-def test_decisions_hold_what_an_episode_would_remember(memory: str) -> None:
+def test_decisions_hold_what_an_episode_would_store(memory: str) -> None:
     policy = nano(f"{memory}_modul").eval()
     made = drawn_for(policy)
     policy.require_processor().stats = statistics([made], policy)
     batch = Decisions.of(policy, [made]).collate([0])
-    pictures = made.images["front"]
+    images = made.images["front"]
     episode = policy.start_episode(made.goal)
-    frames = np.stack([pictures.get(frame, pictures[0]) for frame in range(67)])
+    frames = np.stack([images.get(frame, images[0]) for frame in range(67)])
     episode.observe({"front": frames}, made.states[:67], is_demo=np.arange(67) < 66)
     history = episode.gather_selection()
     assert batch.history is not None
@@ -58,8 +58,8 @@ def test_a_model_that_reads_subgoals_learns_from_what_the_simulator_says(model: 
     processor = policy.require_processor()
     processor.stats = statistics([made], policy)
     batch = Decisions.of(policy, [made]).batch
-    plain = Decisions.of(nano_like(policy), [made]).batch
-    assert batch.prompt_mask.sum() > plain.prompt_mask.sum()
+    baseline = Decisions.of(nano_like(policy), [made]).batch
+    assert batch.prompt_mask.sum() > baseline.prompt_mask.sum()
     ids = batch.prompt[0][batch.prompt_mask[0]].tolist()
     assert words in processor.tokenizer.decode(ids)
 
@@ -70,21 +70,21 @@ def nano_like(policy: MMEPolicy) -> MMEPolicy:
     return other
 
 
-def test_how_far_off_is_measured_where_the_arm_goes_to_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_is_measured_where_the_arm_goes_to_another_place(monkeypatch: pytest.MonkeyPatch) -> None:
     policy = nano("pi05").eval()
     made = drawn_for(policy)
     policy.require_processor().stats = statistics([made], policy)
-    held = Decisions.of(policy, [made])
-    batch = held.collate(held.distant.nonzero()[:, 0].tolist())
+    decisions = Decisions.of(policy, [made])
+    batch = decisions.collate(decisions.distant.nonzero()[:, 0].tolist())
     assert batch.actions is not None
     monkeypatch.setattr(policy, "sample_actions", lambda *_: batch.actions)
-    assert torch.equal(position_error(policy, held), torch.zeros(int(held.distant.sum())))
+    assert torch.equal(position_error(policy, decisions), torch.zeros(int(decisions.distant.sum())))
     shifted = batch.actions.clone()
     shifted[:, 0, 0] += 0.5  # of half the range that the statistics have
     monkeypatch.setattr(policy, "sample_actions", lambda *_: shifted)
     stats = policy.require_processor().require_stats().actions
     half = 0.5 * float(stats.q99[0] - stats.q01[0]) / 2
-    assert position_error(policy, held).allclose(torch.full((int(held.distant.sum()),), half), atol=1e-4)
+    assert position_error(policy, decisions).allclose(torch.full((int(decisions.distant.sum()),), half), atol=1e-4)
 
 
 def scenes(folder: Path, count: int, *choices: FrameChoice) -> list[Scene]:
@@ -101,15 +101,15 @@ def test_scenes_are_demonstrated_until_there_are_enough_and_once(
         return None if seed == 1 else demonstration()
 
     monkeypatch.setattr(demonstrations, "record", record)
-    found = demonstrate(iter(scenes(tmp_path, 9)), 3)
-    assert [path.stem for path in found] == ["easy-0", "easy-2", "easy-3"] and tried == [0, 1, 2, 3]
-    assert demonstrate(iter(scenes(tmp_path, 9)), 3) == found and tried == [0, 1, 2, 3]
+    results = demonstrate(iter(scenes(tmp_path, 9)), 3)
+    assert [path.stem for path in results] == ["easy-0", "easy-2", "easy-3"] and tried == [0, 1, 2, 3]
+    assert demonstrate(iter(scenes(tmp_path, 9)), 3) == results and tried == [0, 1, 2, 3]
     other_memory = FrameChoice(DECISIONS, {"name": "framesamp", "budget": 4, "grid": 1, "every": 4})
     demonstrate(iter(scenes(tmp_path, 9, other_memory)), 1)
     assert tried == [0, 1, 2, 3, 0], "a demonstration without the frames of a new memory is made again"
 
 
-def test_scene_after_scene_without_a_demonstration_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scene_after_scene_without_a_demonstration_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demonstrations, "record", lambda *_: None)
     with pytest.raises(UserError, match="20 easy scenes in a row, to seed 19"):
         demonstrate(iter(scenes(tmp_path, 40)), 3)

@@ -8,7 +8,7 @@ pytest.importorskip("mani_skill", reason="needs the simulator: uv sync --inexact
 from mme_vla.nano.demonstrations import record
 
 
-def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
+def test_marks_and_traces_are_rendered_as_the_episode_showed_them() -> None:
     """Marks come and go, and belong to no thing of the task: what is drawn afterwards has them where they were."""
     from mme_vla.envs.make import make_env
     from mme_vla.envs.observations import RenderRequest
@@ -18,13 +18,13 @@ def test_marks_and_traces_are_drawn_as_the_episode_showed_them() -> None:
     made = record("PatternLock", 3_000_001, "easy", [FrameChoice("decisions", remembered)], ["front"])
     assert made is not None
     env = make_env("PatternLock", seed=3_000_001, difficulty="easy", action_space="waypoint")
-    drawn = made.images["front"]
-    env.render_request = RenderRequest({"front": drawn}, now=())
+    images = made.images["front"]
+    env.render_request = RenderRequest({"front": images}, now=())
     try:
-        shown = env.reset()[0]["front_rgb_list"]
+        frames = env.reset()[0]["front_rgb_list"]
     finally:
         env.close()
-    assert made.exec_start == len(shown) - 1 and len(drawn) > 3
-    for frame, picture in drawn.items():
+    assert made.exec_start == len(frames) - 1 and len(images) > 3
+    for frame, image in images.items():
         if frame < made.exec_start:
-            assert np.abs(picture.astype(int) - shown[frame]).max() <= 2, frame
+            assert np.abs(image.astype(int) - frames[frame]).max() <= 2, frame

@@ -33,16 +33,16 @@ def buffer(parity):
 def tokens(buffer):
     """Unpooled tokens [t, 256, d] of every golden frame."""
     tensors, about = buffer
-    given = params(tensors, "PaliGemma/img/")
-    kernel = given["PaliGemma/img/embedding/kernel"]
-    heads = given["PaliGemma/img/Transformer/encoderblock/MultiHeadDotProductAttention_0/query/bias"].shape[1]
-    fc = given["PaliGemma/img/Transformer/encoderblock/MlpBlock_0/Dense_0/bias"]
-    side = round(given["PaliGemma/img/pos_embedding"].shape[1] ** 0.5)
+    image_params = params(tensors, "PaliGemma/img/")
+    kernel = image_params["PaliGemma/img/embedding/kernel"]
+    heads = image_params["PaliGemma/img/Transformer/encoderblock/MultiHeadDotProductAttention_0/query/bias"].shape[1]
+    fc = image_params["PaliGemma/img/Transformer/encoderblock/MlpBlock_0/Dense_0/bias"]
+    side = round(image_params["PaliGemma/img/pos_embedding"].shape[1] ** 0.5)
     sizes = {"width": kernel.shape[-1], "depth": len(fc), "mlp_dim": fc.shape[1], "num_heads": heads}
     vision = vision_config({**sizes, "patch": len(kernel)}, side * len(kernel))
     tower = VisionTower(vision, about["img_dim"])
     widths = ExpertConfig(about["img_dim"], 8)
-    tower.vit.load_state_dict(read(_vision(BackboneConfig(vision=vision, vlm=widths, action=widths)), given))
+    tower.vit.load_state_dict(read(_vision(BackboneConfig(vision=vision, vlm=widths, action=widths)), image_params))
     with torch.no_grad():
         return tower.eval()(resize_with_pad(tensors["in/frames"], vision.image_size))
 
@@ -52,8 +52,8 @@ def history_of(memory, frames, tokens, until: int) -> OnlineHistory:
     history = OnlineHistory(memory.storage, make_scorer(memory))
     pooled = pool_grid(tokens, memory.storage.grid)
     for t in range(until + 1):
-        wanted = history.to_encode(1) + t
-        history.append(frames[t : t + 1], pooled[wanted])
+        n_required = history.to_encode(1) + t
+        history.append(frames[t : t + 1], pooled[n_required])
     return history
 
 
@@ -104,9 +104,9 @@ def test_recurrent_selection_is_exact(buffer, tokens):
         memory = recurrent(about, entry)
         history = history_of(memory, frames, tokens, entry["step"])
         history.exec_start = entry["exec_start"]
-        chosen = memory.select(history, entry["step"])
+        selected = memory.select(history, entry["step"])
         patches = memory.storage.grid**2
-        assert chosen.tolist() == [[f, p] for f in entry["indices"] for p in range(patches)], entry["step"]
+        assert selected.tolist() == [[f, p] for f in entry["indices"] for p in range(patches)], entry["step"]
         key = f"out/recurrent_step{entry['step']}_exec{entry['exec_start']}"
         if f"{key}/mask" in tensors:
             recalled = memory.gather_selection(history, entry["step"])
@@ -123,7 +123,7 @@ def test_pooled_tokens_of_a_frame(buffer, tokens):
         assert error(pool_grid(tokens[frame : frame + 1], grid), tensors[key]) <= TOLERANCE, key
 
 
-def test_whole_episode_selection_is_exact(buffer, tokens):
+def test_full_episode_selection_is_exact(buffer, tokens):
     """The released offline rule: the whole episode competes for the heap, the step filters afterwards."""
     tensors, about = buffer
     memory = memories(about)["token_drop"]
@@ -131,8 +131,8 @@ def test_whole_episode_selection_is_exact(buffer, tokens):
     ranked = ranked_patches(scores, memory.storage.grid**2, about["keptsize"])
     assert ranked.tolist() == [[f, p] for f, _, p in about["offline_kept_indices_ascending_score"]]
     for entry in about["offline"]:
-        chosen = most_changed(ranked, entry["step"], entry["budget"])
-        assert chosen.tolist() == [[f, p] for f, _, p in entry["token_drop"]], (entry["step"], entry["budget"])
+        frames = most_changed(ranked, entry["step"], entry["budget"])
+        assert frames.tolist() == [[f, p] for f, _, p in entry["token_drop"]], (entry["step"], entry["budget"])
 
 
 def test_frame_sampling_indices(parity):

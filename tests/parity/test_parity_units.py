@@ -51,22 +51,22 @@ def test_vision_tower(unit):
     tensors, about = unit("unit_siglip")
     tower = vision_tower(tensors, about, about["res"], about["output_dim"])
     images = tensors["in/image"].permute(0, 3, 1, 2)
-    seen = {}
-    tower.vit.blocks[0].register_forward_hook(lambda m, i, o: seen.update(embedded=i[0], block0=o))
-    tower.vit.norm.register_forward_hook(lambda m, i, o: seen.update(encoded=o))
+    outputs = {}
+    tower.vit.blocks[0].register_forward_hook(lambda m, i, o: outputs.update(embedded=i[0], block0=o))
+    tower.vit.norm.register_forward_hook(lambda m, i, o: outputs.update(encoded=o))
     assert error(tower(images), tensors["out/tokens"]) <= TOLERANCE
-    assert error(seen["embedded"], tensors["out/with_posemb"]) <= TOLERANCE
-    assert error(seen["block0"], tensors["out/block0"]) <= TOLERANCE
-    assert error(seen["encoded"], tensors["out/encoded"]) <= TOLERANCE
+    assert error(outputs["embedded"], tensors["out/with_posemb"]) <= TOLERANCE
+    assert error(outputs["block0"], tensors["out/block0"]) <= TOLERANCE
+    assert error(outputs["encoded"], tensors["out/encoded"]) <= TOLERANCE
 
 
 @torch.no_grad()
 def test_norms(unit):
     tensors, _ = unit("unit_norms")
     x, condition = tensors["in/x"], tensors["in/cond"]
-    plain = RMSNorm(x.shape[-1])
-    plain.load_state_dict({"scale": tensors["params/rmsnorm/scale"]})
-    assert error(plain(x)[0], tensors["out/rmsnorm"]) <= TOLERANCE
+    norm = RMSNorm(x.shape[-1])
+    norm.load_state_dict({"scale": tensors["params/rmsnorm/scale"]})
+    assert error(norm(x)[0], tensors["out/rmsnorm"]) <= TOLERANCE
     adaptive = AdaRMSNorm(x.shape[-1], condition.shape[-1])
     adaptive.load_state_dict(read(prefixed("dense", linear("adarms/Dense_0")), params(tensors)))
     out, gate = adaptive(x, condition)
@@ -106,18 +106,18 @@ def joint_block(tensors, about) -> JointBlock:
 def test_joint_attention_with_cache_and_a_fully_masked_row(unit):
     tensors, about = unit("unit_attention")
     block = joint_block(tensors, about)
-    turn = rotation(tensors["in/positions"], about["head_dim"])
+    rope = rotation(tensors["in/positions"], about["head_dim"])
     q, k, v = [], [], []
     for expert, x in (("vlm", tensors["in/x0"]), ("action", tensors["in/x1"])):
         projected = block.experts[expert].qkv(x).unflatten(-1, (-1, about["head_dim"]))
         parts = projected.split([about["num_heads"], about["num_kv_heads"], about["num_kv_heads"]], dim=-2)
-        for whole, part in zip((q, k, v), parts, strict=True):
-            whole.append(part)
-    keys, values = rotate(torch.cat(k, 1), turn), torch.cat(v, 1)
+        for full, part in zip((q, k, v), parts, strict=True):
+            full.append(part)
+    keys, values = rotate(torch.cat(k, 1), rope), torch.cat(v, 1)
     assert error(keys, tensors["out/k"]) <= TOLERANCE
     assert error(values, tensors["out/v"]) <= TOLERANCE
     mask, split = tensors["in/mask"], about["len"]
-    queries = rotate(torch.cat(q, 1), turn)
+    queries = rotate(torch.cat(q, 1), rope)
     y0, y1 = attend(queries, keys, values, additive_mask(mask, torch.float32)).split(split, 1)
     assert not mask.any(-1).all(), "the golden mask should hold a row that sees nothing"
     assert error(block.experts["vlm"].out(y0), tensors["out/y0"]) <= TOLERANCE
@@ -126,7 +126,7 @@ def test_joint_attention_with_cache_and_a_fully_masked_row(unit):
     assert error(block.experts["action"].out(last), tensors["out/y_last_from_cache"]) <= TOLERANCE
 
 
-def test_boolean_mask_backend_agrees_on_rows_that_see_a_key(unit):
+def test_boolean_mask_backend_matches_on_rows_that_see_a_key(unit):
     tensors, about = unit("unit_attention")
     generator = torch.Generator().manual_seed(0)
     b, n, heads, h = 2, tensors["in/mask"].shape[1], about["num_heads"], about["head_dim"]
@@ -142,8 +142,8 @@ def test_boolean_mask_backend_agrees_on_rows_that_see_a_key(unit):
 def released_attention_mask(block_start, no_attend, valid):
     """Mask from released flags: a new block wherever a flag starts one or the no-attend flag turns."""
     cumulative = np.cumsum(block_start)
-    turn = np.concatenate([[True], (np.diff(cumulative) != 0) | (np.diff(no_attend.astype(int)) != 0)])
-    starts = [*np.nonzero(turn)[0], len(cumulative)]
+    starts_block = np.concatenate([[True], (np.diff(cumulative) != 0) | (np.diff(no_attend.astype(int)) != 0)])
+    starts = [*np.nonzero(starts_block)[0], len(cumulative)]
     spans = [Span(str(i), int(b - a)) for i, (a, b) in enumerate(pairwise(starts))]
     first_image = int(np.argmax(no_attend)) if no_attend.any() else len(cumulative)
     table = {
@@ -193,16 +193,16 @@ def test_position_features(unit):
         dim, grid = (int(part.lstrip("dimgr")) for part in key.removeprefix("out/").split("_"))
         for row, frame in enumerate(tensors[f"in/dim{dim}_frames"].tolist()):
             indices = np.stack([np.full(grid**2, frame), np.arange(grid**2)], 1)
-            ours = position_features(torch.from_numpy(patch_positions(indices, grid)), dim)
-            assert error(ours, tensors[key][row]) <= TOLERANCE, key
+            actual = position_features(torch.from_numpy(patch_positions(indices, grid)), dim)
+            assert error(actual, tensors[key][row]) <= TOLERANCE, key
 
 
 def test_pooling(unit):
     tensors, _ = unit("unit_pool")
     for key in (k for k in tensors if k.startswith("out/p")):
         tokens, _, kind = key.removeprefix("out/p").partition("_")
-        ours = pool_grid(tensors["in/tokens"], round(int(tokens) ** 0.5), kind or "mean")
-        assert error(ours, tensors[key]) <= TOLERANCE, key
+        actual = pool_grid(tensors["in/tokens"], round(int(tokens) ** 0.5), kind or "mean")
+        assert error(actual, tensors[key]) <= TOLERANCE, key
 
 
 @torch.no_grad()
@@ -239,5 +239,5 @@ def test_modulator(unit):
 def test_time_embedding(unit):
     tensors, _ = unit("unit_time_embedding")
     for key in (k for k in tensors if k.startswith("out/")):
-        ours = flow.time_embedding(tensors["in/time"], int(key.removeprefix("out/dim")))
-        assert error(ours, tensors[key]) <= 1e-3, key
+        actual = flow.time_embedding(tensors["in/time"], int(key.removeprefix("out/dim")))
+        assert error(actual, tensors[key]) <= 1e-3, key

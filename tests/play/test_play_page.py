@@ -41,10 +41,10 @@ class Served:
         if body is not None:
             headers = {"Content-Type": "application/json", **headers}
         connection.request(method, path, content, headers)
-        answer = connection.getresponse()
-        read = answer.read()
+        response = connection.getresponse()
+        read = response.read()
         connection.close()
-        return answer, read
+        return response, read
 
     def state(self):
         return json.loads(self.ask("GET", "/state")[1])
@@ -86,8 +86,8 @@ def test_an_episode_is_played_over_http_and_recorded(tmp_path, caplog):
         for name in ("blue", "red"):
             state = page.until("choosing")
             choice = {"session": state["session"], "decision": len(state["decisions"]), "choice": "a"}
-            answer, _ = page.ask("POST", "/choose", {**choice, "point": BLOCKS[name]})
-            assert answer.status == 200
+            response, _ = page.ask("POST", "/choose", {**choice, "point": BLOCKS[name]})
+            assert response.status == 200
             page.desk._thread.submit(lambda: None).result()
         state = page.until("ended")
         assert (state["status"], state["played"], state["successes"]) == ("success", 1, 1)
@@ -103,10 +103,10 @@ def test_an_episode_is_played_over_http_and_recorded(tmp_path, caplog):
 def test_frames_come_as_jpegs_behind_a_table(tmp_path):
     with served(tmp_path) as page:
         state = page.until("choosing")
-        answer, packed = page.ask("GET", f"/frames/{state['session']}/0")
+        response, packed = page.ask("GET", f"/frames/{state['session']}/0")
         count = struct.unpack_from("<I", packed)[0]
         sizes = struct.unpack_from(f"<{count}I", packed, 4)
-        assert (answer.status, count) == (200, VIDEO + 1)
+        assert (response.status, count) == (200, VIDEO + 1)
         assert len(packed) == 4 * (count + 1) + sum(sizes)
         assert packed[4 * (count + 1) :].startswith(b"\xff\xd8")
         for path in (f"/frames/{state['session']}/1", "/frames/other/0"):
@@ -116,22 +116,22 @@ def test_frames_come_as_jpegs_behind_a_table(tmp_path):
 def test_a_choice_that_cannot_be_made_is_answered_and_changes_nothing(tmp_path):
     with served(tmp_path) as page:
         state = page.until("choosing")
-        asked = {"session": state["session"], "decision": 0, "choice": "a", "point": [1, 1]}
+        request = {"session": state["session"], "decision": 0, "choice": "a", "point": [1, 1]}
         for body, status, reason in (
-            ({**asked, "point": None}, 400, "needs a point"),
-            ({**asked, "choice": "z"}, 400, "no option 'z'"),
-            ({**asked, "decision": 1}, 409, "decided already"),
-            ({**asked, "session": "other"}, 409, "decided already"),
+            ({**request, "point": None}, 400, "needs a point"),
+            ({**request, "choice": "z"}, 400, "no option 'z'"),
+            ({**request, "decision": 1}, 409, "decided already"),
+            ({**request, "session": "other"}, 409, "decided already"),
             (b"{", 400, "not valid JSON"),
             (b"[]", 400, "must hold an object"),
             (b"\xff\xfe", 400, "not valid JSON"),
             (b" " * 5000, 400, "longer than 4096 bytes"),
         ):
-            answer, content = page.ask("POST", "/choose", body)
-            assert answer.status == status, content
+            response, content = page.ask("POST", "/choose", body)
+            assert response.status == status, content
             assert reason in json.loads(content)["error"]
-        answer, _ = page.ask("POST", "/choose", json.dumps(asked), **{"Content-Type": "text/plain"})
-        assert answer.status == 400
+        response, _ = page.ask("POST", "/choose", json.dumps(request), **{"Content-Type": "text/plain"})
+        assert response.status == 400
         assert page.state()["decisions"] == []
 
 
@@ -142,10 +142,10 @@ def test_only_this_machine_is_answered_and_the_page_loads_nothing_foreign(tmp_pa
         for host in ("localhost:1", "127.0.0.1", "[::1]:80"):
             assert page.ask("GET", "/state", Host=host)[0].status == 200
         for name in ("", "play.js", "player.js", "play.css"):
-            answer, content = page.ask("GET", f"/{name}")
-            assert answer.status == 200
+            response, content = page.ask("GET", f"/{name}")
+            assert response.status == 200
             assert b"://" not in content
-            assert "default-src 'none'" in answer.headers["content-security-policy"]
+            assert "default-src 'none'" in response.headers["content-security-policy"]
         assert page.ask("GET", "/desk.py")[0].status == 404
     assert is_local("::1")
     assert not is_local("0.0.0.0")
@@ -188,7 +188,7 @@ def test_ctrl_c_frees_the_simulator_and_goes_on_behind_the_page(tmp_path):
     assert "Traceback" not in errors
 
 
-def test_an_episode_that_cannot_be_set_up_is_said_and_can_be_tried_again(tmp_path):
+def test_an_episode_that_cannot_be_set_up_is_reported_and_can_be_retried(tmp_path):
     outcomes = [UserError("No Vulkan driver here."), RuntimeError("the scene fell apart"), None]
 
     def make(which):
@@ -288,12 +288,12 @@ def test_the_state_survives_a_session_that_goes_while_it_is_read(tmp_path):
     class Vanishing(Desk):
         """Its session is gone, and the episode played, after the first look."""
 
-        looks = 0
+        n_reads = 0
 
         @property
         def session(self):
-            self.looks += 1
-            return a_session() if self.looks == 1 else None
+            self.n_reads += 1
+            return a_session() if self.n_reads == 1 else None
 
         @session.setter
         def session(self, _):

@@ -38,7 +38,7 @@ def says(name):
         ('{"choice": "b"} {not json}', "b", None),
     ],
 )
-def test_the_last_object_of_an_answer_counts(answer, choice, point):
+def test_the_last_object_of_a_reply_counts(answer, choice, point):
     assert parse_choice(answer, OPTIONS) == {"choice": choice, "point": point}
 
 
@@ -61,7 +61,7 @@ def test_the_last_object_of_an_answer_counts(answer, choice, point):
         ('{"choice": "a", "point": ' + 100_000 * "[" + 100_000 * "]" + "}", "no JSON object"),
     ],
 )  # the long ones are more than Python reads
-def test_an_answer_that_cannot_be_used_says_why(answer, reason):
+def test_a_reply_that_cannot_be_used_says_why(answer, reason):
     with pytest.raises(MalformedReply, match=reason):
         parse_choice(answer, OPTIONS)
 
@@ -73,15 +73,15 @@ class Client:
     """Has google-genai's interface; gives these answers in turn."""
 
     def __init__(self, *answers):
-        self.answers, self.asked, self.models = list(answers), [], self
+        self.answers, self.queries, self.models = list(answers), [], self
 
     def generate_content(self, *, model, contents, config):
-        self.asked.append(contents)
-        answer = self.answers.pop(0)
-        if isinstance(answer, Exception):
-            raise answer
+        self.queries.append(contents)
+        reply = self.answers.pop(0)
+        if isinstance(reply, Exception):
+            raise reply
         used = SimpleNamespace(prompt_token_count=1000, candidates_token_count=20, thoughts_token_count=80)
-        return SimpleNamespace(text=answer, usage_metadata=used, candidates=[], prompt_feedback=None)
+        return SimpleNamespace(text=reply, usage_metadata=used, candidates=[], prompt_feedback=None)
 
 
 def gemini(*answers, **options):
@@ -89,18 +89,18 @@ def gemini(*answers, **options):
     return GeminiPlayer(client=client, requests_per_minute=None, backoff=0, retries=0, **options), client
 
 
-def kinds(turn):
-    return ["text" if "text" in part else part["inline_data"]["mime_type"] for part in turn["parts"]]
+def kinds(message):
+    return ["text" if "text" in part else part["inline_data"]["mime_type"] for part in message["parts"]]
 
 
-def test_a_conversation_brings_the_frames_since_the_last_decision():
+def test_a_conversation_holds_the_frames_since_the_last_decision():
     player, client = gemini(says("blue"), '{"choice": "b"}', says("red"))
     session = play(a_session(), player)
     assert session.status == "success"
-    first, second, third = client.asked
+    first, second, third = client.queries
     assert kinds(first[0]) == ["video/mp4", "image/png", "text"]
     assert "a: press the block [point]\nb: wait\n" in first[0]["parts"][-1]["text"]
-    assert [turn["role"] for turn in third] == ["user", "model", "user", "model", "user"]
+    assert [message["role"] for message in third] == ["user", "model", "user", "model", "user"]
     assert kinds(second[-1]) == ["video/mp4", "image/png", "text"]
     assert second[-1]["parts"][-1]["text"].startswith("You chose a: press the block at [703, 742]; the video shows it")
     assert kinds(third[-1]) == ["image/png", "text"]
@@ -109,11 +109,11 @@ def test_a_conversation_brings_the_frames_since_the_last_decision():
     assert (usage["calls"], usage["input_tokens"], usage["output_tokens"], usage["problems"]) == (3, 3000, 300, {})
 
 
-def test_an_unusable_answer_is_counted_and_asked_again_with_the_reason():
+def test_an_unusable_reply_is_counted_and_requested_again_with_the_reason():
     player, client = gemini("no idea", says("blue"), '{"choice": "z"}', says("red"))
     session = play(a_session(), player)
     assert session.status == "success"
-    assert "could not be used: the answer holds no JSON object" in client.asked[1][-1]["parts"][0]["text"]
+    assert "could not be used: the answer holds no JSON object" in client.queries[1][-1]["parts"][0]["text"]
     assert player.notes()["usage"]["problems"] == {"malformed": 2}
     assert session.decisions[0].note == {"answers": ["no idea", says("blue")]}
     player.start(a_session())
@@ -139,19 +139,19 @@ class Scripted:
     """Answers these in turn instead of generating, and keeps the questions; its processor only holds its limits."""
 
     def __init__(self, *answers):
-        self.answers, self.asked = list(answers), []
+        self.answers, self.queries = list(answers), []
         self.processor = SimpleNamespace(video_processor=SimpleNamespace(size=None))
 
     def generate(self, questions, max_new_tokens):
-        self.asked += questions
+        self.queries += questions
         return [Completion(self.answers.pop(0), 10, 3)]
 
 
-def test_every_question_tells_the_whole_episode():
+def test_every_question_tells_the_full_episode():
     vlm = Scripted(says("blue"), '{"choice": "b"}', "?", says("red"))
     player = QwenPlayer(vlm=vlm, clip_frames=4)
     assert play(a_session(), player).status == "success"
-    first, _, third, again = vlm.asked
+    first, _, third, again = vlm.queries
     assert first.user.startswith(
         "The task: press the blocks in the order of the video\nThe video that comes before you"
     )
@@ -230,7 +230,7 @@ def test_the_oracle_solves_episodes_without_rendering(tmp_path):
         ([], "task"),
     ],
 )
-def test_what_cannot_work_is_said_before_anything_begins(words, message, tmp_path):
+def test_what_cannot_work_is_reported_before_anything_begins(words, message, tmp_path):
     done = commands.run("mme_vla.play", *words, f"output={tmp_path / 'run'}")
     assert done.returncode == 2
     assert message in done.stderr

@@ -53,7 +53,7 @@ def test_the_episode_ends_with_the_environments_status():
             session.choose(press("red"))
 
 
-def test_a_choice_that_moves_nothing_reveals_nothing_and_the_present_picture_stays():
+def test_a_choice_that_moves_nothing_reveals_nothing_and_the_present_image_stays():
     session = a_session()
     frame = session.start().frames[-1]
     assert session.choose({"choice": " B "}) == Reveal("wait", [], VIDEO + 1)
@@ -70,7 +70,7 @@ def test_a_player_that_never_gets_on_is_timed_out():
     assert (record.outcome, record.extra["ended_by"], record.steps) == ("timeout", "max_choices", 0)
 
 
-def test_an_error_of_the_planner_ends_the_episode_and_is_kept():
+def test_an_error_of_the_planner_ends_the_episode_and_is_recorded():
     session = a_session()
     session.start()
     assert session.choose({"choice": "c"}).frames == []
@@ -99,12 +99,12 @@ def test_a_choice_that_cannot_be_made_is_refused_and_changes_nothing(action, mes
     session.start()
     with pytest.raises(UserError, match=message):
         session.choose(action)
-    assert (session.env.asked, session.decisions, session.status) == ([], [], "ongoing")
+    assert (session.env.received_actions, session.decisions, session.status) == ([], [], "ongoing")
     session.choose(press("blue"))
     assert len(session.decisions) == 1
 
 
-def test_nothing_can_be_chosen_before_the_start_and_recorded_before_the_end():
+def test_nothing_can_be_selected_before_the_start_and_recorded_before_the_end():
     session = a_session()
     with pytest.raises(UserError, match="before start"):
         session.choose(press("blue"))
@@ -117,7 +117,7 @@ def test_nothing_can_be_chosen_before_the_start_and_recorded_before_the_end():
 
 def test_an_environment_of_another_kind_is_refused():
     class Blind(BlocksEnv):
-        def _seen(self, count):
+        def _observation(self, count):
             return {"joint_state_list": [np.zeros(7)] * count}
 
     class Other(BlocksEnv):
@@ -163,8 +163,8 @@ def test_random_choices_depend_on_seed_and_episode_alone():
             session = a_session(which)
             session.start()
             player.start(session)
-            drawn = [player.choose(session)[0] for _ in range(6)]
-        return json.dumps(drawn)
+            sampled = [player.choose(session)[0] for _ in range(6)]
+        return json.dumps(sampled)
 
     assert choices(0, 1) == choices(0, 1, before=2)
     assert len({choices(*which) for which in ((0, 1), (0, 2), (1, 1))}) == 3
@@ -211,7 +211,7 @@ def test_a_run_of_other_settings_needs_another_folder(tmp_path):
         a_run(tmp_path, max_choices=3)
 
 
-def test_an_error_is_played_again_only_when_asked(tmp_path):
+def test_an_error_is_played_again_only_when_requested(tmp_path):
     with a_run(tmp_path, [0]) as run:
         session = run.make(run.todo[0])
         session.start()
@@ -259,7 +259,7 @@ def test_episodes_that_are_not_there_are_refused(words, message):
         choose_episodes(*words)
 
 
-def test_records_of_runs_below_the_folder_are_not_its_own(tmp_path):
+def test_records_of_runs_below_the_folder_are_excluded(tmp_path):
     with a_run(tmp_path / "below") as other:
         other.save(play(other.make(other.todo[0]), RandomPlayer()))
     with a_run(tmp_path) as run:

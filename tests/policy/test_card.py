@@ -21,7 +21,7 @@ def test_every_name_stays_a_name(policy: MMEPolicy, name: str) -> None:
     assert data.license is None and data.eval_results is None
 
 
-def test_licence_origin_data_and_results_are_told(policy: MMEPolicy) -> None:
+def test_licence_origin_data_and_results_are_reported(policy: MMEPolicy) -> None:
     known = {
         "license": "apache-2.0",
         "base_model": "lerobot/pi05_base",

@@ -28,30 +28,30 @@ SIZES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def test_every_memory_that_ships_is_asked() -> None:
+def test_every_memory_that_ships_is_queried() -> None:
     shipped = {file.stem for file in (config_dir() / "memory").glob("*.yaml")}
     assert set(SIZES) == shipped - {"none", "joined"}  # the latter is made of others
 
 
 @pytest.mark.parametrize("name", SIZES)
-def test_every_memory_of_the_library_keeps_a_memorys_promises(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_memory_of_the_library_keeps_a_memorys_contract(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     check_memory(name, **SIZES[name])
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [name] * 4
 
 
 @pytest.mark.parametrize("name", ["context", "modulator", "expert"])
-def test_every_integration_of_the_library_keeps_an_integrations_promises(
+def test_every_integration_of_the_library_keeps_an_integrations_contract(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     check_integration(name)
     assert [line.split(":")[0] for line in capsys.readouterr().out.splitlines()] == [name] * 4
 
 
-def test_the_backbone_of_the_library_keeps_a_backbones_promises() -> None:
+def test_the_backbone_of_the_library_keeps_a_backbones_contract() -> None:
     check_backbone("pi05", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})
 
 
-def test_a_task_of_the_library_keeps_a_tasks_promises() -> None:
+def test_a_task_of_the_library_keeps_a_tasks_contract() -> None:
     pytest.importorskip("mani_skill", reason="the simulator is not installed: the extra `sim` has it")
     check_task("StopCube", difficulty="easy")
 
@@ -66,27 +66,27 @@ class _LooksAhead(FrameSamp):
 
 class _Dices(FrameSamp):
     def select(self, history: History, step: int, rng: np.random.Generator | None = None) -> np.ndarray:
-        chosen = super().select(history, step, rng)
-        return chosen[np.sort(np.random.default_rng().permutation(len(chosen))[: max(len(chosen) // 2, 1)])]
+        frames = super().select(history, step, rng)
+        return frames[np.sort(np.random.default_rng().permutation(len(frames))[: max(len(frames) // 2, 1)])]
 
 
 class _ReadsPadding(FrameSamp):
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        found = super().forward(history)
-        return MemoryTokens(found.tokens + history.features.mean(), found.mask)
+        tokens = super().forward(history)
+        return MemoryTokens(tokens.tokens + history.features.mean(), tokens.mask)
 
 
 class _Forgets(FrameSamp):
     def forward(self, history: HistoryTokens) -> MemoryTokens:
-        found = super().forward(history)
-        return MemoryTokens(torch.ones_like(found.tokens), found.mask)
+        tokens = super().forward(history)
+        return MemoryTokens(torch.ones_like(tokens.tokens), tokens.mask)
 
 
 @pytest.mark.parametrize(
     ("broken", "words"),
     [(_LooksAhead, "later"), (_Dices, "same choice"), (_ReadsPadding, "padding"), (_Forgets, "does not read")],
 )
-def test_a_broken_memory_is_told_which_promise_it_breaks(
+def test_a_broken_memory_is_reported_which_prefix_it_breaks(
     broken: type, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(MEMORIES._entries, "broken", broken)
@@ -102,7 +102,7 @@ class _Unread(Context):
         self.visibility = {**PI05_VISIBILITY, "memory": {"memory"}}
 
 
-def test_an_integration_that_loses_memory_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_integration_that_loses_memory_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(INTEGRATIONS._entries, "broken", _Unread)
     with pytest.raises(AssertionError, match="does not reach the action"):
         check_integration("broken")
@@ -113,7 +113,7 @@ class _Random(Pi05Backbone):
         return super().loss(*args, **kwargs) + torch.rand(())
 
 
-def test_a_backbone_whose_loss_does_not_repeat_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backbone_whose_loss_does_not_repeat_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(BACKBONES._entries, "broken", _Random)
     with pytest.raises(AssertionError, match="same noise must give the same loss"):
         check_backbone("broken", **{k: v for k, v in tiny_sections("pi05")["backbone"].items() if k != "name"})

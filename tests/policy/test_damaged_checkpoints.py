@@ -44,8 +44,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def checkpoint(whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(whole, tmp_path / whole.name))
+def checkpoint(intact: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(intact, tmp_path / intact.name))
 
 
 def resume(checkpoint: Path) -> None:
@@ -79,7 +79,7 @@ def test_every_file_that_is_read_has_a_sum(checkpoint: Path) -> None:
         ("model.safetensors", lambda folder: start_from(tiny(), folder)),
     ],
 )  # fmt: skip
-def test_one_flipped_bit_in_any_file_is_found(name: str, read: Callable[[Path], Any], checkpoint: Path) -> None:
+def test_one_flipped_bit_in_any_file_is_detected(name: str, read: Callable[[Path], Any], checkpoint: Path) -> None:
     read(checkpoint)
     data = bytearray((checkpoint / name).read_bytes())
     data[-20] ^= 1
@@ -87,7 +87,7 @@ def test_one_flipped_bit_in_any_file_is_found(name: str, read: Callable[[Path], 
     assert f"{name} is damaged" in refusal(read, checkpoint)
 
 
-def test_a_flipped_bit_in_one_shard_is_found(tmp_path: Path) -> None:
+def test_a_flipped_bit_in_one_shard_is_detected(tmp_path: Path) -> None:
     policy = tiny()
     policy.save_pretrained(tmp_path)
     (tmp_path / "model.safetensors").unlink()

@@ -52,7 +52,7 @@ def test_reading_asks_no_network(monkeypatch) -> None:
     assert len(source) == 4 and source.name == "sample"
 
 
-def test_values_and_pictures_equal_lerobots_own_reader(sample: EpisodeSource) -> None:
+def test_values_and_images_equal_lerobots_reader(sample: EpisodeSource) -> None:
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     reference = LeRobotDataset("local/sample", root=SAMPLE, video_backend="pyav", return_uint8=True)
@@ -67,7 +67,7 @@ def test_values_and_pictures_equal_lerobots_own_reader(sample: EpisodeSource) ->
             assert np.array_equal(item[column].permute(1, 2, 0).numpy(), frame)
 
 
-def test_single_pictures_equal_the_sequence_in_any_order(sample: EpisodeSource) -> None:
+def test_single_images_equal_the_sequence_in_any_order(sample: EpisodeSource) -> None:
     sequence = sample.frames(0, np.arange(173))
     order = np.random.default_rng(0).permutation(173)[:20]
     assert np.array_equal(sample.frames(0, order), sequence[order])
@@ -115,7 +115,7 @@ def test_a_wrong_width_is_refused(copy: Path) -> None:
         EpisodeSource(copy)
 
 
-def test_a_dataset_of_the_old_version_is_told_the_conversion(copy: Path) -> None:
+def test_a_dataset_of_the_old_version_is_reported_the_conversion(copy: Path) -> None:
     edit_info(copy, lambda info: info.update(codebase_version="v2.1"))
     with pytest.raises(UserError, match=r"python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=copy"):
         EpisodeSource(copy)
@@ -139,18 +139,18 @@ def test_a_dataset_without_demonstration_flag_needs_a_side_file(copy: Path, samp
         EpisodeSource(copy, copy / "starts.json")
 
 
-def test_exec_start_idx_alone_is_enough_and_said(copy: Path, caplog) -> None:
+def test_exec_start_idx_alone_is_enough_and_reported(copy: Path, caplog) -> None:
     edit_info(copy, without("is_demo"))
     assert EpisodeSource(copy).exec_starts.tolist() == [66, 74, 0, 66]
     assert "has no is_demo" in caplog.text
 
 
-def test_only_the_subgoals_that_exist_are_given(copy: Path) -> None:
+def test_only_the_subgoals_that_exist_are_passed(copy: Path) -> None:
     edit_info(copy, without("simple_subgoal_online", "grounded_subgoal_online"))
     assert set(EpisodeSource(copy).subgoals(0, 70)) == {"simple_subgoal", "grounded_subgoal"}
 
 
-def test_no_or_half_a_dataset_is_refused_before_the_hub_is_asked(copy: Path, tmp_path: Path) -> None:
+def test_no_or_half_a_dataset_is_refused_before_the_hub_is_queried(copy: Path, tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"No LeRobot dataset at .*hf download"):
         EpisodeSource(tmp_path / "nothing")
     shutil.rmtree(copy / "meta" / "episodes")
@@ -168,8 +168,8 @@ def test_missing_rows_are_noticed(copy: Path) -> None:
 
 def test_damaged_and_missing_videos_are_named(copy: Path) -> None:
     video = next(copy.glob("videos/image/**/*.mp4"))
-    whole = video.read_bytes()
-    video.write_bytes(whole[: len(whole) // 2])
+    content = video.read_bytes()
+    video.write_bytes(content[: len(content) // 2])
     with pytest.raises(UserError, match=r"file-000.mp4 holds no image at 42.650 s"):
         EpisodeSource(copy).frames(3, [200])
     video.write_bytes(b"no video at all")

@@ -65,10 +65,10 @@ def test_expert_only_learns_the_action_side_and_the_memory(variant: str) -> None
 def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> None:
     pytest.importorskip("peft", reason="LoRA needs the extra 'vlm'")
     policy = small_policy(variant, backbone=FEW_TOKENS)
-    plain = chunk(policy)
+    baseline = chunk(policy)
     names = set(policy.state_dict())
     counts = apply_finetuning(policy, "lora", rank=4, alpha=8)
-    assert torch.equal(chunk(policy), plain)
+    assert torch.equal(chunk(policy), baseline)
     assert counts["vision"] == 0
     spec = policy.finetune_spec
     assert all(
@@ -84,7 +84,7 @@ def test_adapters_begin_silent_learn_and_merge(variant: str, tmp_path: Path) -> 
     optimizer.step()
     assert all(torch.equal(policy.get_parameter(name), tensor) for name, tensor in frozen.items())
     taught = chunk(policy)
-    assert (taught - plain).abs().max() > 1e-3
+    assert (taught - baseline).abs().max() > 1e-3
 
     policy.save_pretrained(tmp_path / "apart")
     loaded = MMEPolicy.from_pretrained(tmp_path / "apart")

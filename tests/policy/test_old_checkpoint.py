@@ -31,8 +31,8 @@ def test_it_loads_and_chooses_the_same_actions() -> None:
 def test_it_is_inspected() -> None:
     console = Console(record=True, width=160, file=StringIO())
     show_checkpoint(FOLDER / "run", console)
-    shown = console.export_text()
-    assert "framesamp_modul" in shown and "step_000002" in shown
+    output = console.export_text()
+    assert "framesamp_modul" in output and "step_000002" in output
 
 
 def test_its_training_goes_on_with_the_losses_it_had(tmp_path: Path) -> None:

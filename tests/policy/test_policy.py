@@ -80,8 +80,8 @@ def test_remembered_history_changes_the_action(remembering):
 def test_order_of_time_matters_through_positions_alone(remembering):
     batch = random_batch(remembering, valid=100)
     before = velocity(remembering, batch)
-    seen = batch.history.mask[0]
-    batch.history.positions[:, seen, 0] = batch.history.positions[:, seen, 0].flip(1)
+    mask = batch.history.mask[0]
+    batch.history.positions[:, mask, 0] = batch.history.positions[:, mask, 0].flip(1)
     assert (velocity(remembering, batch) - before).abs().max() > 1e-6  # fresh slots hardly move yet
 
 
@@ -159,23 +159,26 @@ def test_vision_and_language_run_once_per_chunk(policy):
 
 
 def test_exact_identity_modulator_is_the_memoryless_policy_to_the_bit():
-    plain, modulated = (
+    memoryless, modulated = (
         small_policy("pi05", backbone=FEW_TOKENS),
         small_policy("framesamp_modul", backbone=FEW_TOKENS, integration={"exact_identity": "true"}),
     )
-    shared = plain.state_dict()
+    shared = memoryless.state_dict()
     assert not modulated.load_state_dict(shared, strict=False).unexpected_keys
-    batch = random_batch(plain)
-    before = velocity(plain, batch)
+    batch = random_batch(memoryless)
+    before = velocity(memoryless, batch)
     batch.history = random_history(modulated, 2, 100)
     assert torch.equal(velocity(modulated, batch), before)
 
 
 def test_released_modulator_starts_near_the_memoryless_policy():
-    plain, modulated = small_policy("pi05", backbone=FEW_TOKENS), small_policy("framesamp_modul", backbone=FEW_TOKENS)
-    modulated.load_state_dict(plain.state_dict(), strict=False)
-    batch = random_batch(plain)
-    before = velocity(plain, batch)
+    memoryless, modulated = (
+        small_policy("pi05", backbone=FEW_TOKENS),
+        small_policy("framesamp_modul", backbone=FEW_TOKENS),
+    )
+    modulated.load_state_dict(memoryless.state_dict(), strict=False)
+    batch = random_batch(memoryless)
+    before = velocity(memoryless, batch)
     batch.history = random_history(modulated, 2, 100)
     distance = (velocity(modulated, batch) - before).norm() / before.norm()
     assert 0 < distance < 0.05
@@ -197,10 +200,10 @@ def prefix_keys(policy, batch):
 
 
 @pytest.mark.parametrize("integration", ["context", "expert"])
-def test_prompt_sees_memory_only_if_asked(integration):
+def test_prompt_sees_memory_only_if_requested(integration):
     for sees in (True, False):
-        asked = {"prompt_sees_memory": str(sees).lower()}
-        policy = small_policy(f"framesamp_{integration}", backbone=FEW_TOKENS, memory=MEMORY, integration=asked)
+        setting = {"prompt_sees_memory": str(sees).lower()}
+        policy = small_policy(f"framesamp_{integration}", backbone=FEW_TOKENS, memory=MEMORY, integration=setting)
         row = policy.integration.visibility["prompt"]
         assert ("memory" in row) is sees
         batch = random_batch(policy)
@@ -223,7 +226,7 @@ def test_budget_is_a_number_in_the_config(memory, budget):
 @pytest.mark.parametrize(
     ("memory", "budget"), [("framesamp", 500), ("tokendrop", 63), ("tokendrop", 4096), ("ttt", 4097), ("rmt", 0)]
 )
-def test_a_budget_that_cannot_be_held_is_refused(memory, budget):
+def test_an_impossible_budget_is_refused(memory, budget):
     with pytest.raises(UserError, match=f"memory.budget={budget}"):
         build_policy(f"{memory}_context", memory={"budget": budget})
 
@@ -286,16 +289,16 @@ def test_a_masked_loss_does_not_depend_on_what_is_computed_together():
     batch.action_mask = torch.arange(batch.actions.shape[1]).expand(4, -1) < torch.tensor([[1], [20], [7], [20]])
     noise, time_ = torch.randn(batch.actions.shape), torch.full((4,), 0.5)
     with torch.no_grad():
-        whole, _ = policy(batch, noise, time_)
+        together, _ = policy(batch, noise, time_)
         halves = [
             policy(batch._map(lambda x, rows=rows: x[rows]), noise[rows], time_[rows])[0]
             for rows in (slice(0, 2), slice(2, 4))
         ]
-        moved = batch.actions.clone()
-        moved[0, 1:] += 9.0
-        batch.actions = moved
+        changed = batch.actions.clone()
+        changed[0, 1:] += 9.0
+        batch.actions = changed
         unchanged, _ = policy(batch, noise, time_)
-    assert whole.item() == pytest.approx(sum(h.item() for h in halves) / 2, abs=1e-5)
+    assert together.item() == pytest.approx(sum(h.item() for h in halves) / 2, abs=1e-5)
     assert torch.isfinite(unchanged)
 
 

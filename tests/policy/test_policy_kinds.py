@@ -27,8 +27,8 @@ class QuietPolicy(MMEPolicy):
 
 
 def test_the_section_policy_says_which_class_is_built() -> None:
-    own = build_policy("pi05", policy={"name": "quiet"})
-    assert type(own) is QuietPolicy and own.config["name"].startswith("quiet")
+    built = build_policy("pi05", policy={"name": "quiet"})
+    assert type(built) is QuietPolicy and built.config["name"].startswith("quiet")
     assert type(build_policy("pi05")) is MMEPolicy
     assert policy_class({}) is policy_class({"policy": {"compute_dtype": "float32"}}) is MMEPolicy
     for name in ("dreaming", 5, None):
@@ -58,7 +58,7 @@ def test_a_kind_comes_back_as_what_it_was(tmp_path: Any) -> None:
     assert type(Policy.from_pretrained(tmp_path)) is type(MMEPolicy.from_pretrained(tmp_path)) is QuietPolicy
 
 
-def test_the_usual_kind_changes_no_digest_and_another_does() -> None:
+def test_the_default_kind_changes_no_digest_and_another_does() -> None:
     config = {"backbone": {"name": "pi05"}, "memory": None}
     named = {**config, "policy": {"name": "mme", "compute_dtype": "float32"}}
     assert composition_digest(config) == composition_digest(named)

@@ -97,15 +97,15 @@ def test_push_and_load_by_name(policy: MMEPolicy, tmp_path: Path, monkeypatch: p
         ("login", "secret"), ("create", "group/modul", True, True), ("branch", "v1"),
         ("upload", "group/modul", "first", "v1"),
     ]  # fmt: skip
-    asked: dict[str, Any] = {}
+    calls: dict[str, Any] = {}
 
     def snapshot(repo_id: str, **options: Any) -> str:
-        asked.update(options, repo_id=repo_id)
+        calls.update(options, repo_id=repo_id)
         return str(tmp_path / "repository")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
     loaded = MMEPolicy.from_pretrained("group/modul", revision="v1", token="secret")
-    assert asked == {"repo_id": "group/modul", "revision": "v1", "token": "secret"}
+    assert calls == {"repo_id": "group/modul", "revision": "v1", "token": "secret"}
     assert all(torch.equal(tensor, loaded.state_dict()[name]) for name, tensor in policy.state_dict().items())
     load_weights(small_policy("framesamp_modul"), "group/modul")
     with pytest.raises(UserError, match="owner/name"):

@@ -29,11 +29,11 @@ def words(policy, item) -> str:
     return policy.processor.tokenizer.decode(item["prompt"][item["prompt_mask"]].tolist())
 
 
-def test_point_noise_has_the_released_range_and_spread(parity):
+def test_point_noise_has_the_released_range_and_deviation(parity):
     golden = json.loads((parity / "pipeline_text.json").read_text())["grounding_noise"]
     rng = np.random.default_rng(0)
-    moved = [perturb_point("pick at <100, 100>", golden["max"], rng) for _ in range(5000)]
-    shifts = np.array([[int(x) - 100 for x in POINT.search(text).groups()] for text in moved])
+    shifted = [perturb_point("pick at <100, 100>", golden["max"], rng) for _ in range(5000)]
+    shifts = np.array([[int(x) - 100 for x in POINT.search(text).groups()] for text in shifted])
     assert shifts.min() == golden["min"] and shifts.max() == golden["maxv"]
     assert shifts.std() == pytest.approx(golden["sample_std"], rel=0.03)
     assert abs(np.corrcoef(shifts.T)[0, 1]) < 0.05, "both numbers move independently"
@@ -105,9 +105,9 @@ def test_past_actions_of_training_are_the_ones_right_before_the_chunk(source):
 def test_an_episode_knows_its_executed_actions_by_the_frames_that_follow():
     policy, frames = small_policy("pi05_past_actions"), moving_frames(40)
 
-    def observe(episode, count, **given):
+    def observe(episode, count, **options):
         view = {"front": frames[:count], "wrist": frames[:count]}
-        episode.observe(view, np.zeros((count, 8)), **given)
+        episode.observe(view, np.zeros((count, 8)), **options)
 
     episode = policy.start_episode("press the button")
     observe(episode, 5, is_demo=True)
@@ -136,9 +136,11 @@ def test_hybrid_reads_subgoal_and_memory_and_both_change_its_actions(source):
         episode.subgoal = subgoal
         return policy.act([episode])
 
-    usual = act(frames, "press the button at <1, 2>")
-    assert not np.allclose(usual, act(frames, "put it down"))
-    assert not np.allclose(usual, act(np.concatenate([frames[:39][::-1], frames[39:]]), "press the button at <1, 2>"))
+    baseline = act(frames, "press the button at <1, 2>")
+    assert not np.allclose(baseline, act(frames, "put it down"))
+    assert not np.allclose(
+        baseline, act(np.concatenate([frames[:39][::-1], frames[39:]]), "press the button at <1, 2>")
+    )
 
 
 def test_hybrid_keeps_memory_and_subgoal_within_one_budget():

@@ -23,16 +23,18 @@ NEURAL_ARMS = ["drop:all", "shuffle", "swap", "delay:16", "recent:8", "oracle", 
 
 
 @pytest.mark.parametrize("slot", [0, 2, 4])
-def test_the_slot_that_a_policy_reads_is_found_at_its_distance(slot: int, tmp_path: Path) -> None:
-    found = Findings.of(probed(reader(slot), [], tmp_path))
-    assert len(found.entries) == 2 * 5
-    for entry in found.entries:
+def test_the_slot_that_a_policy_reads_is_detected_at_its_distance(slot: int, tmp_path: Path) -> None:
+    findings = Findings.of(probed(reader(slot), [], tmp_path))
+    assert len(findings.entries) == 2 * 5
+    for entry in findings.entries:
         assert (entry.change > entry.spread) == (entry.slot == slot)
         assert (entry.change == 0) == (entry.slot != slot)
         assert entry.age == entry.step - entry.time
         assert entry.time == np.linspace(0, entry.step, 5).astype(int)[entry.slot]
-    mattered = [entry for entry in found.entries if entry.slot == slot]
-    assert found.reach() == pytest.approx(np.average([e.age for e in mattered], weights=[e.change for e in mattered]))
+    mattered = [entry for entry in findings.entries if entry.slot == slot]
+    assert findings.reach() == pytest.approx(
+        np.average([e.age for e in mattered], weights=[e.change for e in mattered])
+    )
 
 
 def test_only_interventions_that_touch_the_slot_have_an_effect(tmp_path: Path) -> None:
@@ -52,14 +54,14 @@ def test_the_entry_that_is_used_most_is_dropped_first(tmp_path: Path) -> None:
         assert line.change == pytest.approx(entries[line.step, 1].change)
 
 
-def test_a_policy_that_cannot_remember_shows_no_effect(tmp_path: Path) -> None:
+def test_a_memoryless_policy_shows_no_effect(tmp_path: Path) -> None:
     deaf = Findings.of(probed(reader(None), NEURAL_ARMS, tmp_path / "deaf"))
-    assert [found.change for found in deaf.arms().values()] == [0] * len(NEURAL_ARMS)
-    assert all(found.spread > 0 and found.distance == 0 for found in deaf.arms().values())
+    assert [arm.change for arm in deaf.arms().values()] == [0] * len(NEURAL_ARMS)
+    assert all(arm.spread > 0 and arm.distance == 0 for arm in deaf.arms().values())
     assert all(entry.change == 0 for entry in deaf.entries) and len(deaf.entries) == 10
     memoryless = quick_policy("pi05").eval()
-    found = Findings.of(probed(memoryless, ["pause:8", "distract:1", "nodemo"], tmp_path / "memoryless"))
-    assert [effect.change for effect in found.arms().values()] == [0, 0, 0] and not found.entries
+    arm = Findings.of(probed(memoryless, ["pause:8", "distract:1", "nodemo"], tmp_path / "memoryless"))
+    assert [effect.change for effect in arm.arms().values()] == [0, 0, 0] and not arm.entries
 
 
 def test_interventions_on_entries_are_refused_where_there_are_none() -> None:
@@ -86,10 +88,10 @@ def test_interventions_on_entries_are_refused_where_there_are_none() -> None:
         (7, "with=7"),
     ],
 )
-def test_words_that_are_no_arms_are_told(word: Any, message: str) -> None:
-    with pytest.raises(UserError) as told:
+def test_words_that_are_no_arms_are_reported(word: Any, message: str) -> None:
+    with pytest.raises(UserError) as caught:
         read_arm(word)
-    assert message in str(told.value)
+    assert message in str(caught.value)
 
 
 def test_arms_compose_in_their_order(tmp_path: Path) -> None:
@@ -110,13 +112,13 @@ def test_through_the_probe_an_unprobed_policy_answers_as_it_does(name: str) -> N
     mine, its = probe.start_episode(recording.goal, 7), policy.start_episode(recording.goal, 7)
     for episode in (mine, its):
         recording.show(episode, 0, 41)
-    recollection, stores = probe.snapshot(mine)
-    drawn = [policy.sampling_noise(torch.Generator().manual_seed(7))]
-    asked = probe.ask(mine, recollection, [stores], drawn, 2)[0, 0]
-    given = policy.sample_actions(policy.observation([its]), {k: v[None] for k, v in drawn[0].items()}, 2,
+    snapshot, stores = probe.snapshot(mine)
+    draws = [policy.sampling_noise(torch.Generator().manual_seed(7))]
+    actual = probe.ask(mine, snapshot, [stores], draws, 2)[0, 0]
+    expected = policy.sample_actions(policy.observation([its]), {k: v[None] for k, v in draws[0].items()}, 2,
                                   memory=policy._memory_tokens([its], policy.observation([its])))  # fmt: skip
     action = policy.embodiment.action
-    assert torch.allclose(asked, given[0, : action.execute, : action.width], atol=1e-5)
+    assert torch.allclose(actual, expected[0, : action.execute, : action.width], atol=1e-5)
     chunks = [probe.act(mine, 2), policy.act(its, 2)]
     assert np.array_equal(*chunks) and UNPROBED.feed == ProbedPolicy(policy).arm.feed
 
@@ -124,10 +126,10 @@ def test_through_the_probe_an_unprobed_policy_answers_as_it_does(name: str) -> N
 def test_what_is_done_is_not_done_again_and_a_torn_line_is_done_anew(tmp_path: Path) -> None:
     lines = probed(reader(2), ["shuffle"], tmp_path, count=2)
     path = tmp_path / "offline.jsonl"
-    whole = path.read_bytes()
-    assert probed(reader(2), ["shuffle"], tmp_path, count=2) == lines and path.read_bytes() == whole
+    content = path.read_bytes()
+    assert probed(reader(2), ["shuffle"], tmp_path, count=2) == lines and path.read_bytes() == content
     for cut in (100, 1):  # within the last line, and its end alone
-        path.write_bytes(whole[:-cut])
+        path.write_bytes(content[:-cut])
         with pytest.warns(UserWarning, match="half-written") if cut > 1 else nullcontext():
             assert probed(reader(2), ["shuffle"], tmp_path, count=2) == lines
     append(path, [], "another")
@@ -160,7 +162,7 @@ def test_a_damaged_line_of_a_probe_is_named(tmp_path: Path) -> None:
 
 def test_a_change_is_measured_against_the_noise_of_the_same_policy() -> None:
     before = torch.randn(6, 4, 2, generator=torch.Generator().manual_seed(0))
-    same, moved = compare_chunks(before, before.clone()), compare_chunks(before, before + 0.5)
+    same, changed = compare_chunks(before, before.clone()), compare_chunks(before, before + 0.5)
     assert (same.change, same.distance) == (0, 0) and same.spread > 0
-    assert moved.change == pytest.approx(0.5) and moved.spread == same.spread and moved.distance > 0
+    assert changed.change == pytest.approx(0.5) and changed.spread == same.spread and changed.distance > 0
     assert compare_chunks(before, before[[1, 2, 3, 4, 5, 0]]).distance == pytest.approx(0, abs=1e-12)

@@ -52,63 +52,63 @@ KINDS = {
 def chunks(policy: Any, word: str | None, step: int = 36) -> tuple[ProbedPolicy, list[np.ndarray]]:
     """What a policy chooses under an arm at two moments of a synthetic episode."""
     recordings = made_up(robot=policy.embodiment)
-    own = recordings[0]
+    recording = recordings[0]
     arm = read_arm(word) if word else UNPROBED
     donors = DonorEpisodes(policy, channel_of(policy), recordings) if word == "swap" else None
     probe = ProbedPolicy(policy, arm, recordings[1:], donors)
     probe.eval()
-    episode = probe.start_episode(own.goal, 5)
-    episode.recording = own
-    found, seen = [], 0
+    episode = probe.start_episode(recording.goal, 5)
+    episode.recording = recording
+    chunks_, n_frames = [], 0
     for now in (20, step):
-        own.show(episode, seen, now + 1)
-        seen = now + 1
-        found.append(probe.act(episode, 2))
-    return probe, found
+        recording.show(episode, n_frames, now + 1)
+        n_frames = now + 1
+        chunks_.append(probe.act(episode, 2))
+    return probe, chunks_
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_memory_answers_otherwise_when_its_entries_are_others(kind: str) -> None:
     policy = KINDS[kind]()
-    plain = chunks(policy, None)[1]
+    baseline = chunks(policy, None)[1]
     words = ["drop:all", "shuffle", "swap", "delay:40"] + (["recent:4"] if channel_of(policy).chooses else [])
     for word in words:
         changed = chunks(policy, word)[1]
         if not (kind == "by change" and word == "shuffle"):  # where all that changed is of one frame, nothing moves
-            assert any(np.abs(a - b).max() > 1e-6 for a, b in zip(plain, changed, strict=True)), word
-    assert all(np.array_equal(*pair) for pair in zip(plain, chunks(policy, None)[1], strict=True))
+            assert any(np.abs(a - b).max() > 1e-6 for a, b in zip(baseline, changed, strict=True)), word
+    assert all(np.array_equal(*pair) for pair in zip(baseline, chunks(policy, None)[1], strict=True))
 
 
 @pytest.mark.parametrize("kind", ["perceptual", "recurrent", "film", "bank"])
-def test_what_a_policy_is_shown_is_what_it_would_be_shown_by_hand(kind: str) -> None:
+def test_probe_frames_equal_manually_composed_ones(kind: str) -> None:
     policy = KINDS[kind]()
     recordings = made_up(robot=policy.embodiment)
-    own, other = recordings[0], recordings[1]
+    recording, other = recordings[0], recordings[1]
     by_hand: dict[str, Any] = {}
     for name in ("nodemo", "distract:1"):
-        episode = policy.start_episode(own.goal, 5)
+        episode = policy.start_episode(recording.goal, 5)
         if name == "distract:1":
             other.show(episode, 0, other.length, video=True)
-        own.show(episode, 0 if name == "distract:1" else own.exec_start, 21)
+        recording.show(episode, 0 if name == "distract:1" else recording.exec_start, 21)
         by_hand[name] = policy.act(episode, 2)
     for name, expected in by_hand.items():
         assert np.array_equal(chunks(policy, name)[1][0], expected), name
 
 
-def test_a_pause_is_a_frame_seen_again_and_again() -> None:
+def test_a_pause_is_a_frame_repeated() -> None:
     policy = KINDS["perceptual"]()
-    own = made_up()[0]
-    expected = policy.start_episode(own.goal, 5)
-    own.show(expected, 0, 21)
+    recording = made_up()[0]
+    expected = policy.start_episode(recording.goal, 5)
+    recording.show(expected, 0, 21)
     for _ in range(6):
-        views, _ = own.views(20, 21, None)
-        expected.observe(views, own.source.states(0, 20, 21), False)
+        views, _ = recording.views(20, 21, None)
+        expected.observe(views, recording.source.states(0, 20, 21), False)
     policy.act(expected, 2)
-    own.show(expected, 21, 37)
-    probe, found = chunks(policy, "pause:6")
-    assert np.array_equal(found[1], policy.act(expected, 2))
-    episode = probe.start_episode(own.goal, 5)
-    own.show(episode, 0, 37)
+    recording.show(expected, 21, 37)
+    probe, chunks_ = chunks(policy, "pause:6")
+    assert np.array_equal(chunks_[1], policy.act(expected, 2))
+    episode = probe.start_episode(recording.goal, 5)
+    recording.show(episode, 0, 37)
     assert isinstance(episode.inner.history, OnlineHistory)
     assert (len(episode.inner.history), episode.n_observed_frames) == (43, 37)
 
@@ -116,21 +116,21 @@ def test_a_pause_is_a_frame_seen_again_and_again() -> None:
 @pytest.mark.parametrize("video", [True, False])
 @pytest.mark.parametrize(("stills", "at"), [(0, 0), (5, 0), (5, 7)])
 def test_frames_find_their_way_through_a_feed_and_back(video: bool, stills: int, at: int) -> None:
-    feed, own, before = Feed(video=video, stills=stills, at=at), np.arange(40), 11
-    shown = feed.displayed(own, 12, before)
-    kept = own[shown >= 0]
-    assert np.array_equal(kept, own if video else own[12:])
-    assert (np.diff(shown[shown >= 0]) >= 1).all() and shown[-1] == before + (40 if video else 28) - 1 + stills
+    feed, stills_, before = Feed(video=video, stills=stills, at=at), np.arange(40), 11
+    indices = feed.displayed(stills_, 12, before)
+    remaining = stills_[indices >= 0]
+    assert np.array_equal(remaining, stills_ if video else stills_[12:])
+    assert (np.diff(indices[indices >= 0]) >= 1).all() and indices[-1] == before + (40 if video else 28) - 1 + stills
     assert all(
         feed.source_frames(np.array([place]), 12, before).tolist() == [frame]
-        for place, frame in zip(shown[kept], kept, strict=True)
+        for place, frame in zip(indices[remaining], remaining, strict=True)
     )
     still = feed.displayed(np.array([12 + at]), 12, before)[0]
     assert feed.source_frames(np.arange(still - stills, still + 1), 12, before).tolist() == [12 + at]
     assert feed.source_frames(np.arange(before), 12, before).size == 0
 
 
-def test_a_memory_that_is_written_where_chunks_are_chosen_sees_no_pause() -> None:
+def test_a_memory_stored_where_chunks_are_selected_sees_no_pause() -> None:
     policy = memoryvla()
     with pytest.raises(UserError, match="a memory that sees frames at which nothing is decided"):
         choose_arms(["pause"], policy, channel_of(policy), 3, boundaries=True)
@@ -145,10 +145,10 @@ def test_keyframes_are_probed_and_the_bank_goes_on_as_it_was() -> None:
     episode: Any = policy.start_episode("pick up the cube")
     maps = tuple(torch.full((3, 4, 2), float(i)) for i in range(3))
     episode.remembered = BankState(maps)
-    recollection = channel.read(episode)
-    store = recollection.stores[0]
+    snapshot = channel.read(episode)
+    store = snapshot.stores[0]
     assert [store.age(slot) for slot in store.occupied] == [3, 2, 1]
-    twin = channel.counterfactual(episode, recollection, [store.without([1])])
+    twin = channel.counterfactual(episode, snapshot, [store.without([1])])
     assert [float(m[0, 0, 0]) for m in twin.remembered.maps] == [0, 2] and len(episode.remembered) == 3
     twin.decided(BankState((*twin.remembered.maps, torch.full((3, 4, 2), 9.0))))
     channel.commit(episode, twin)
@@ -165,7 +165,7 @@ def test_keyframes_are_probed_and_the_bank_goes_on_as_it_was() -> None:
         ("subgoal_delay:1", "the third thing", "the second thing"),
     ],
 )
-def test_what_is_said_can_be_wrong_by_one_or_late(word: str, said: str, expected: str) -> None:
+def test_subgoals_can_be_wrong_by_one_or_late(word: str, said: str, expected: str) -> None:
     policy = quick_policy("simplesg")
     probe = ProbedPolicy(policy, read_arm(word))
     episode = probe.start_episode("press the button")

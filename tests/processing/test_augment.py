@@ -21,13 +21,13 @@ def augmented(images: Tensor, seed: int = 7) -> Tensor:
     return augment_views(images, VIEWS, augmentation_draws(len(images), torch.Generator().manual_seed(seed)))
 
 
-def test_same_generator_gives_same_pictures_and_another_seed_others() -> None:
+def test_same_generator_gives_same_images_and_another_seed_others() -> None:
     images = pictures()
     assert torch.equal(augmented(images), augmented(images))
     assert not torch.equal(augmented(images), augmented(images, seed=8))
 
 
-def test_range_shape_and_input_are_kept() -> None:
+def test_range_shape_and_input_are_unchanged() -> None:
     images = pictures().half()
     before = images.clone()
     result = augmented(images)
@@ -36,7 +36,7 @@ def test_range_shape_and_input_are_kept() -> None:
     assert torch.equal(images, before)
 
 
-def test_wrist_views_are_never_moved_and_half_of_them_not_touched() -> None:
+def test_wrist_views_are_never_shifted_and_half_of_them_not_touched() -> None:
     images = pictures(batch=200, size=8)
     result = augmented(images)
     untouched = (result[:, 1] - images[:, 1]).abs().amax((1, 2, 3)) < 1e-6
@@ -53,7 +53,7 @@ def test_both_views_of_a_sample_share_their_colours() -> None:
     assert len({tuple(row) for row in middle[:, 1].mul(1e4).round().tolist()}) > 10
 
 
-def test_samples_do_not_depend_on_their_neighbours_pictures() -> None:
+def test_samples_do_not_depend_on_their_neighbours_images() -> None:
     images = pictures()
     changed = images.clone()
     changed[1:] = 0
@@ -67,7 +67,7 @@ def test_no_rotation_and_no_offset_is_the_centre_crop() -> None:
     assert torch.allclose(zoomed[0, 0, 0, 20], expected, atol=1e-6)
 
 
-def test_extreme_offset_reaches_exactly_the_border_of_the_picture() -> None:
+def test_extreme_offset_reaches_exactly_the_border_of_the_image() -> None:
     bright = torch.ones(1, 1, 3, 40, 40)
     corner = crop_and_rotate(bright, torch.ones(1, 2), torch.zeros(1))
     assert corner.min() > 0.95  # no black is pulled in beyond the half pixel at the rim
@@ -79,7 +79,7 @@ def test_rotation_fills_the_corners_with_black() -> None:
     assert turned.min() == 0 and turned[..., 100, 100].min() == 1
 
 
-def test_rotation_turns_about_the_centre() -> None:
+def test_rotation_is_about_the_centre() -> None:
     dot = torch.zeros(1, 1, 3, 101, 101)
     dot[..., 50, 90] = 1
     turned = crop_and_rotate(dot, torch.zeros(1, 2), torch.tensor([math.radians(5)]))[0, 0, 0]

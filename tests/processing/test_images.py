@@ -53,14 +53,14 @@ def test_both_paths_shrink_a_simulator_frame_as_released(parity: Path) -> None:
     assert (smooth - tensors["case0/out_float_crop"]).abs().max() <= 1e-5
 
 
-def test_pictures_of_the_right_size_are_left_alone() -> None:
+def test_images_of_the_right_size_are_left_alone() -> None:
     frames = np.random.default_rng(0).integers(0, 256, (2, 12, 12, 3), dtype=np.uint8)
     assert resize_with_pad_uint8(frames, 12) is frames
     pixels = torch.from_numpy(frames)
     assert torch.equal(resize_with_pad(pixels, 12), to_unit_range(pixels.permute(0, 3, 1, 2)))
 
 
-def test_stacks_are_resized_like_single_pictures() -> None:
+def test_stacks_are_resized_like_single_images() -> None:
     frames = np.random.default_rng(1).integers(0, 256, (3, 2, 20, 30, 3), dtype=np.uint8)
     stacked = resize_with_pad_uint8(frames, (9, 14))
     assert stacked.shape == (3, 2, 9, 14, 3)
@@ -73,7 +73,7 @@ def test_padding_is_black_on_both_paths() -> None:
     assert resize_with_pad(torch.from_numpy(white), 16)[0, :, 0].max() == -1
 
 
-def test_float_and_channel_first_pictures_become_the_same_bytes() -> None:
+def test_float_and_channel_first_images_become_the_same_bytes() -> None:
     levels = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
     as_float = torch.from_numpy(levels).permute(2, 0, 1).float() / 255
     assert (as_uint8_frames(as_float) == levels).all()
@@ -89,7 +89,7 @@ def test_float_and_channel_first_pictures_become_the_same_bytes() -> None:
         (np.zeros((4, 4, 3), np.int64), "int64"),
     ],
 )
-def test_what_is_no_picture_is_refused(picture: np.ndarray, message: str) -> None:
+def test_what_is_no_image_is_refused(picture: np.ndarray, message: str) -> None:
     with pytest.raises(UserError, match=message):
         as_uint8_frames(picture)
 

@@ -52,25 +52,25 @@ def test_memory_frames_become_unit_range_floats_also_from_read_only_arrays() -> 
 def test_actions_come_back_after_a_detour_through_the_network_form() -> None:
     rng = np.random.default_rng(1)
     chunk, state = rng.normal(size=(5, 8)), rng.normal(size=8).astype(np.float32)
-    answer = processor().actions(chunk, state)
-    assert answer.shape == (5, 32) and answer.dtype == torch.float32 and not answer[:, 8:].any()
-    back = processor().absolute_actions(answer[None], torch.tensor(state)[None])
+    actions = processor().actions(chunk, state)
+    assert actions.shape == (5, 32) and actions.dtype == torch.float32 and not actions[:, 8:].any()
+    back = processor().absolute_actions(actions[None], torch.tensor(state)[None])
     assert back.shape == (1, 5, 8)
     assert np.allclose(back[0].numpy(), chunk, atol=1e-5)
 
 
-def test_prompt_state_is_normalised_before_it_is_written() -> None:
+def test_prompt_state_is_normalised_before_it_is_saved() -> None:
     proc = processor(prompt="state", prompt_length=64)
     ids, mask = proc.prompt("press it", state=stats().state.q01)
     text = proc.tokenizer.decode(ids[mask].tolist())
     assert text == "Task: press it; State: 0 0 0 0 0 0 0 0;\nAction: "
 
 
-def test_prompt_takes_what_its_format_needs_and_ignores_the_rest() -> None:
-    plain, subgoal = processor(stats=None), processor(prompt="subgoal", stats=None)
+def test_prompt_takes_what_its_format_needs_and_ignores_the_remainder() -> None:
+    unprompted, subgoal = processor(stats=None), processor(prompt="subgoal", stats=None)
     assert torch.equal(
-        plain.prompt("press it", "put it down", np.zeros(8))[0],
-        plain.prompt("press it")[0],
+        unprompted.prompt("press it", "put it down", np.zeros(8))[0],
+        unprompted.prompt("press it")[0],
     )
     ids, mask = subgoal.prompt("press it", "put it down")
     assert "Current Subgoal: put it down" in subgoal.tokenizer.decode(ids[mask].tolist())

@@ -43,7 +43,7 @@ def test_pieces_are_the_golden_ones(parity: Path) -> None:
         assert [list(piece) for piece in pieces] == case["encoded_pieces"]
 
 
-def test_plain_prompt_is_the_goal_and_a_newline_of_its_own(tokenizer: Tokenizer) -> None:
+def test_goal_prompt_is_the_goal_and_a_separate_newline(tokenizer: Tokenizer) -> None:
     ids, mask = encode_prompt(PROMPTS["plain"](), tokenizer, PromptInput(" pick_up the cube\n"), 64)
     expected = tokenizer.encode("pick up the cube", bos=True) + tokenizer.encode("\n", bos=False)
     assert ids[mask].tolist() == expected
@@ -57,22 +57,22 @@ def test_prompt_is_padded_on_the_right_with_zeros(tokenizer: Tokenizer) -> None:
 
 
 def test_long_prompts_lose_their_end_with_one_warning(tokenizer: Tokenizer) -> None:
-    given = PromptInput("pick up the red cube " * 10)
+    prompt = PromptInput("pick up the red cube " * 10)
     with pytest.warns(UserWarning, match="prompt_length=8"):
-        ids, mask = encode_prompt(PROMPTS["plain"](), tokenizer, given, 8)
+        ids, mask = encode_prompt(PROMPTS["plain"](), tokenizer, prompt, 8)
     assert ids.shape == (8,) and mask.all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        encode_prompt(PROMPTS["plain"](), tokenizer, given, 8)
+        encode_prompt(PROMPTS["plain"](), tokenizer, prompt, 8)
 
 
-def test_a_missing_subgoal_gives_the_plain_prompt_and_says_so_once() -> None:
-    given = PromptInput("press the button")
+def test_a_missing_subgoal_gives_the_goal_prompt_and_one_warning() -> None:
+    prompt = PromptInput("press the button")
     with pytest.warns(UserWarning, match="no subgoal"):
-        assert PROMPTS["subgoal"]().pieces(given) == PROMPTS["plain"]().pieces(given)
+        assert PROMPTS["subgoal"]().pieces(prompt) == PROMPTS["plain"]().pieces(prompt)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert PROMPTS["subgoal_sentence"]().pieces(given) == PROMPTS["plain"]().pieces(given)
+        assert PROMPTS["subgoal_sentence"]().pieces(prompt) == PROMPTS["plain"]().pieces(prompt)
 
 
 def test_a_missing_state_is_refused() -> None:
@@ -91,6 +91,6 @@ def test_formats_say_what_they_read() -> None:
     assert reads["subgoal"] == reads["subgoal_sentence"] == (True, False)
 
 
-def test_an_unknown_format_brings_near_names() -> None:
+def test_an_unknown_format_suggests_near_names() -> None:
     with pytest.raises(UserError, match="'subgoal'"):
         PROMPTS["subgaol"]

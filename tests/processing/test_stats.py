@@ -34,14 +34,14 @@ def expected(recorded: list[Recorded], starts: list[int], offset: int = 0) -> tu
 def test_statistics_are_those_of_execution_states_and_delta_chunks(data, offset: int) -> None:
     source, recorded = data
     stats = compute_norm_stats([source], action_offset=offset)
-    for found, rows in zip((stats.state, stats.actions), expected(recorded, [12, 0], offset), strict=True):
-        assert np.allclose(found.mean, rows.mean(0), atol=1e-5) and np.allclose(found.std, rows.std(0), atol=1e-5)
+    for actual, rows in zip((stats.state, stats.actions), expected(recorded, [12, 0], offset), strict=True):
+        assert np.allclose(actual.mean, rows.mean(0), atol=1e-5) and np.allclose(actual.std, rows.std(0), atol=1e-5)
         bin_width = np.ptp(rows, axis=0) / 5000
         quantiles = np.quantile(rows, [0.01, 0.99], axis=0, method="inverted_cdf")
-        assert (np.abs(np.stack([found.q01, found.q99]) - quantiles) <= 2 * bin_width + 1e-6).all()
+        assert (np.abs(np.stack([actual.q01, actual.q99]) - quantiles) <= 2 * bin_width + 1e-6).all()
 
 
-def test_only_the_chosen_episodes_count(data) -> None:
+def test_only_the_selected_episodes_count(data) -> None:
     source, recorded = data
     stats = compute_norm_stats([source], [np.array([1])])
     assert np.allclose(stats.state.mean, recorded[1].state.mean(0), atol=1e-5)

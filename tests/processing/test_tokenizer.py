@@ -91,16 +91,16 @@ def test_a_foreign_file_is_refused(tmp_path: Path) -> None:
 def test_hub_ids_are_split_into_repository_and_file(
     tokenizer: Tokenizer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    requests = []
     tokenizer.save(tmp_path / "t.model")
 
     def download(repository: str, filename: str) -> str:
-        asked.append((repository, filename))
+        requests.append((repository, filename))
         return str(tmp_path / "t.model")
 
     monkeypatch.setattr(huggingface_hub, "hf_hub_download", download)
     assert Tokenizer.load("hf://owner/repo/sub/t.model").spec == "hf://owner/repo/sub/t.model"
-    assert asked == [("owner/repo", "sub/t.model")]
+    assert requests == [("owner/repo", "sub/t.model")]
 
 
 def test_an_unreachable_hub_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:

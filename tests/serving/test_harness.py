@@ -42,10 +42,10 @@ class Scripted(StepBenchmark):
         self.taken: list[np.ndarray] = []
 
     def observation(self) -> dict[str, Any]:
-        pictures = self.rng.integers(0, 200, (2, 64, 64, 3), np.uint8)
+        images = self.rng.integers(0, 200, (2, 64, 64, 3), np.uint8)
         at = int(abs(self.state[0]) * 20) % 50
-        pictures[:, at : at + 12, 20:40] = 255
-        return {"images": {"agentview": pictures[0], "wrist": pictures[1]}, "states": self.state.copy(),
+        images[:, at : at + 12, 20:40] = 255
+        return {"images": {"agentview": images[0], "wrist": images[1]}, "states": self.state.copy(),
                 "task_description": f"touch square {self.number}"}  # fmt: skip
 
     def reset(self, task: Any) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def in_process(policy: MMEPolicy, numbers: list[int]) -> np.ndarray:
     while len(worlds[0].taken) < STEPS:
         for episode, frames in zip(episodes, seen, strict=True):
             views = {"front": "agentview", "wrist": "wrist"}
-            pictures = {ours: np.stack([f["images"][name] for f in frames]) for ours, name in views.items()}
+            pictures = {camera: np.stack([f["images"][name] for f in frames]) for camera, name in views.items()}
             episode.observe(pictures, np.stack([frame["states"] for frame in frames]))
         chunks = policy.act(episodes)[:, :16]
         left = STEPS - len(worlds[0].taken)
@@ -118,7 +118,7 @@ def policy() -> MMEPolicy:
     return small_policy("tokendrop_expert")
 
 
-def test_an_episode_is_the_policys_own(policy: MMEPolicy) -> None:
+def test_an_episode_has_the_type_of_its_policy(policy: MMEPolicy) -> None:
     benchmark = Scripted(2)
     server = through_the_harness(policy, [benchmark])
     np.testing.assert_array_equal(np.stack(benchmark.taken), in_process(policy, [2])[0])
@@ -137,13 +137,13 @@ def test_sessions_act_in_one_batch_and_stay_apart(policy: MMEPolicy, monkeypatch
     benchmarks = [Scripted(number) for number in (0, 1, 3)]
     through_the_harness(policy, benchmarks, max_wait_time=0.5)
     assert max(sizes) > 1 and sum(sizes) == 9
-    found = np.stack([benchmark.taken for benchmark in benchmarks])
+    actions = np.stack([benchmark.taken for benchmark in benchmarks])
     expected = in_process(policy, [0, 1, 3])
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
     assert np.abs(expected[0] - expected[1]).max() > 1e-3
 
 
-def test_an_observation_without_pictures_ends_its_episode_alone(policy: MMEPolicy) -> None:
+def test_an_observation_without_images_ends_its_episode_alone(policy: MMEPolicy) -> None:
     failing = Scripted(1, fails_at=4)
     with pytest.raises(ModelActError, match="lacks agentview, wrist, states"):
         through_the_harness(policy, [failing])
@@ -151,9 +151,9 @@ def test_an_observation_without_pictures_ends_its_episode_alone(policy: MMEPolic
 
 def test_it_asks_for_what_the_policy_reads() -> None:
     server = MMEVLAModelServer(small_policy("groundsg"), execute=8)
-    wanted = {"send_state": True, "send_video_history": True, "send_wrist_image": True, "action_space": "joint_angle",
+    expected = {"send_state": True, "send_video_history": True, "send_wrist_image": True, "action_space": "joint_angle",
               "send_subgoal": True, "subgoal_mode": "grounded"}  # fmt: skip
-    assert server.get_observation_params() == wanted
+    assert server.get_observation_params() == expected
     assert set(server.get_observation_spec()) == {"agentview", "wrist", "state", "language", "subgoal"}
     assert server.chunk_size == 8
 

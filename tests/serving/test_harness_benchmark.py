@@ -63,7 +63,7 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
     return np.stack(taken)
 
 
-def test_its_own_benchmark_runs_on_our_environments_and_takes_the_policys_actions(
+def test_its_benchmark_runs_on_our_environments_and_takes_the_policys_actions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(RoboMMEBenchmark, "_render_env", {})  # the renderer is this library's affair

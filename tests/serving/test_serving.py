@@ -50,9 +50,9 @@ def by_buffer(client: Client, parts: list, **more) -> list[np.ndarray]:
     for index, (front, wrist, state) in enumerate(parts):
         added = client.add_buffer(front, state, exec_start=len(front) - 1 if index == 0 else 0)
         assert added["add_buffer_finished"] is True and added["add_buffer_time_ms"] > 0
-        answer = client.infer(observation(front[-1], wrist[-1], state[-1], **more))
-        assert answer["infer_time_ms"] > 0
-        chunks.append(answer["actions"])
+        reply = client.infer(observation(front[-1], wrist[-1], state[-1], **more))
+        assert reply["infer_time_ms"] > 0
+        chunks.append(reply["actions"])
     return chunks
 
 
@@ -60,26 +60,26 @@ def by_buffer(client: Client, parts: list, **more) -> list[np.ndarray]:
 def test_both_schemas_give_what_the_policy_gives(name, policy):
     policy = policy if name == "tokendrop_expert" else serving_policy(name)
     parts = course(video=20)
-    wanted = acted_directly(policy, parts)
+    expected = acted_directly(policy, parts)
     with Served(policy) as served, served.client() as client:
-        for chunk, answer in zip(wanted, by_buffer(client, parts), strict=True):
-            np.testing.assert_allclose(answer, chunk, **CLOSE)
-        for chunk, answer in zip(wanted, by_challenge(client, parts), strict=True):
-            np.testing.assert_allclose(answer, chunk[:16], **CLOSE)
-    assert not np.allclose(wanted[0], wanted[1], atol=1e-3)
+        for chunk, reply in zip(expected, by_buffer(client, parts), strict=True):
+            np.testing.assert_allclose(reply, chunk, **CLOSE)
+        for chunk, reply in zip(expected, by_challenge(client, parts), strict=True):
+            np.testing.assert_allclose(reply, chunk[:16], **CLOSE)
+    assert not np.allclose(expected[0], expected[1], atol=1e-3)
 
 
-def test_a_symbolic_policy_reads_its_own_kind_of_subgoal():
+def test_a_symbolic_policy_reads_its_kind_of_subgoal():
     policy = serving_policy("groundsg")
     parts = course(rounds=0)
     text = "pick up the cube at <3, 4>"
-    wanted = acted_directly(policy, parts, subgoal=text)[0]
+    expected = acted_directly(policy, parts, subgoal=text)[0]
     with Served(policy) as served, served.client() as client:
         assert client.metadata["subgoal"] == "grounded_subgoal"
         texts = {"grounded_subgoal": text, "simple_subgoal": "something else"}
-        np.testing.assert_allclose(by_buffer(client, parts, **texts)[0], wanted, **CLOSE)
-        np.testing.assert_allclose(by_challenge(client, parts, **texts)[0], wanted[:16], **CLOSE)
-        assert not np.allclose(by_buffer(client, parts)[0], wanted, atol=1e-4)
+        np.testing.assert_allclose(by_buffer(client, parts, **texts)[0], expected, **CLOSE)
+        np.testing.assert_allclose(by_challenge(client, parts, **texts)[0], expected[:16], **CLOSE)
+        assert not np.allclose(by_buffer(client, parts)[0], expected, atol=1e-4)
 
 
 def test_the_client_learns_about_the_server(served):
@@ -92,7 +92,7 @@ def test_the_client_learns_about_the_server(served):
 
 def test_many_clients_act_in_one_batch_and_get_the_numbers_they_get_alone(policy):
     courses = [course(seed) for seed in range(6)]
-    wanted = [acted_directly(policy, parts) for parts in courses]
+    expected = [acted_directly(policy, parts) for parts in courses]
     with Served(policy) as served:
         together = threading.Barrier(6)
 
@@ -104,9 +104,9 @@ def test_many_clients_act_in_one_batch_and_get_the_numbers_they_get_alone(policy
         with ThreadPoolExecutor(6) as pool:
             answers = list(pool.map(run, courses))
         counts = served.server.stats.counts
-    for chunks, answered in zip(wanted, answers, strict=True):
-        for chunk, answer in zip(chunks, answered, strict=True):
-            np.testing.assert_allclose(answer, chunk[:16], **CLOSE)
+    for chunks, answered in zip(expected, answers, strict=True):
+        for chunk, reply in zip(chunks, answered, strict=True):
+            np.testing.assert_allclose(reply, chunk[:16], **CLOSE)
     assert counts["batched"] == 18
     assert counts["batch"] < 18, "nothing was batched"
 
@@ -178,8 +178,8 @@ def test_a_bad_message_is_answered_with_the_reason_and_1011(policy, message, sai
         with connect(f"ws://127.0.0.1:{served.server.port}", compression=None) as raw:
             raw.recv(10)
             raw.send(message)
-            answer = raw.recv(10)
-            assert isinstance(answer, str) and said in answer and "Traceback" not in answer
+            reply = raw.recv(10)
+            assert isinstance(reply, str) and said in reply and "Traceback" not in reply
             with pytest.raises(ConnectionClosed) as closed:
                 raw.recv(10)
             assert closed.value.rcvd.code == 1011
@@ -213,17 +213,17 @@ def test_what_the_policy_cannot_do_fails_for_its_client_without_a_traceback(poli
         act = policy.act
         policy.act = lambda *_: 1 / 0
         try:
-            with pytest.raises(UserError, match="ZeroDivisionError") as told:
+            with pytest.raises(UserError, match="ZeroDivisionError") as caught:
                 by_challenge(client, course()[:1])
         finally:
             policy.act = act
             del policy.act
-        assert "Traceback" not in str(told.value)
+        assert "Traceback" not in str(caught.value)
         client.reconnect()
         by_challenge(client, course()[:1])
 
 
-def test_a_key_is_asked_for(policy):
+def test_a_key_is_requested(policy):
     with Served(policy, api_key="right") as served:
         for key in (None, "wrong", "righ", "right2"):
             with pytest.raises(UserError, match="Api-Key"):
@@ -237,7 +237,7 @@ def test_a_page_in_a_browser_is_refused(served):
         connect(f"ws://127.0.0.1:{served.server.port}", origin="http://example.com")
 
 
-def test_a_full_server_says_so_and_has_room_again_later(policy):
+def test_a_full_server_says_so_and_has_capacity_again_later(policy):
     with Served(policy, encode_chunk=1, limits=Limits(connections=1)) as served, served.reading():
         busy = served.client()
         front = np.zeros((40, 64, 64, 3), np.uint8)
@@ -293,11 +293,11 @@ def test_a_long_video_does_not_keep_others_waiting(policy):
         front = np.zeros((40, 64, 64, 3), np.uint8)
         video = challenge(front, front, np.zeros((40, 8), np.float32), first=True)
         with served.reading() as reading:
-            answer = pool.submit(watcher.infer, video)
+            pending = pool.submit(watcher.infer, video)
             assert reading.begun.wait(30)
             by_challenge(other, course())  # within its client's time limit
-            assert not answer.done()
-        assert answer.result(60)["actions"].shape == (16, 8)
+            assert not pending.done()
+        assert pending.result(60)["actions"].shape == (16, 8)
 
 
 def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
@@ -308,12 +308,12 @@ def test_stopping_finishes_what_is_running_and_says_goodbye(policy):
         wait_until(lambda: served.busy == 0)  # the answer to the reset comes before the server rests
         front = np.zeros((40, 64, 64, 3), np.uint8)
         with served.reading():
-            answer = pool.submit(busy.infer, challenge(front, front, np.zeros((40, 8), np.float32), first=True))
+            pending = pool.submit(busy.infer, challenge(front, front, np.zeros((40, 8), np.float32), first=True))
             wait_until(lambda: served.busy == 1)
             stopped = pool.submit(served.on_loop, served.server.stop())
             wait_until(lambda: served.server.connections.stopping)
         stopped.result(60)
-        assert answer.result(60)["actions"].shape == (16, 8)
+        assert pending.result(60)["actions"].shape == (16, 8)
         for client in (idle, busy):
             with pytest.raises(ConnectionError, match=r"1001.*stopping"):
                 client.reset()

@@ -101,11 +101,15 @@ def test_requests_are_recognised_by_their_keys():
     assert isinstance(parse({"reset": True}, 10), Reset)
     added = parse({"add_buffer": True, "images": PICTURE[None, None], "state": states(1), "exec_start_idx": 3}, 10)
     assert isinstance(added, AddBuffer) and added.exec_start == 3 and len(added.frames) == 1
-    seen = parse(observation(PICTURE, PICTURE, states(1)[0], grounded_subgoal="pick at <3, 4>"), 10)
-    assert isinstance(seen, Infer) and seen.frames is None and seen.subgoals == {"grounded_subgoal": "pick at <3, 4>"}
-    asked = parse(challenge([PICTURE] * 2, [PICTURE] * 2, states(2), True), 10)
-    assert isinstance(asked, Infer) and asked.first and asked.goal == GOAL
-    assert np.array_equal(asked.state, states(2)[-1])
+    native = parse(observation(PICTURE, PICTURE, states(1)[0], grounded_subgoal="pick at <3, 4>"), 10)
+    assert (
+        isinstance(native, Infer)
+        and native.frames is None
+        and native.subgoals == {"grounded_subgoal": "pick at <3, 4>"}
+    )
+    challenge_request = parse(challenge([PICTURE] * 2, [PICTURE] * 2, states(2), True), 10)
+    assert isinstance(challenge_request, Infer) and challenge_request.first and challenge_request.goal == GOAL
+    assert np.array_equal(challenge_request.state, states(2)[-1])
 
 
 @pytest.mark.parametrize(

@@ -59,29 +59,29 @@ def test_health_metadata_and_statistics(served):
 
 def test_an_episode_by_http_is_the_episode_itself(policy, served):
     parts = course()
-    for chunk, answer in zip(acted_directly(policy, parts), by_http(served, parts), strict=True):
-        np.testing.assert_allclose(answer, chunk[:16], **CLOSE)
+    for chunk, reply in zip(acted_directly(policy, parts), by_http(served, parts), strict=True):
+        np.testing.assert_allclose(reply, chunk[:16], **CLOSE)
 
 
 def test_many_requests_travel_on_one_connection(served):
     connection = http.client.HTTPConnection(*served.address, timeout=60)
     for index, part in enumerate(course()):
         connection.request("POST", "/infer", pack(challenge(*part, first=index == 0)))
-        answer = connection.getresponse()
-        assert answer.status == 200 and unpack(answer.read())["actions"].shape == (16, 8)
+        response = connection.getresponse()
+        assert response.status == 200 and unpack(response.read())["actions"].shape == (16, 8)
     connection.close()
 
 
-def test_sessions_of_one_address_are_told_apart_by_the_header(policy, served):
-    ours, theirs = course(1), course(2)
-    wanted = acted_directly(policy, ours)
+def test_sessions_of_one_address_are_distinguished_by_the_header(policy, served):
+    first, second = course(1), course(2)
+    expected = acted_directly(policy, first)
     for index in range(3):  # the two episodes in turn
-        for name, parts in (("ours", ours), ("theirs", theirs)):
+        for name, parts in (("ours", first), ("theirs", second)):
             body = pack(challenge(*parts[index], first=index == 0))
-            status, _, answer = ask(served, "POST", "/infer", body, X_Session=name)
+            status, _, reply = ask(served, "POST", "/infer", body, X_Session=name)
             assert status == 200
             if name == "ours":
-                np.testing.assert_allclose(unpack(answer)["actions"], wanted[index][:16], **CLOSE)
+                np.testing.assert_allclose(unpack(reply)["actions"], expected[index][:16], **CLOSE)
 
 
 @pytest.mark.parametrize(
@@ -98,9 +98,9 @@ def test_sessions_of_one_address_are_told_apart_by_the_header(policy, served):
 )
 def test_wrong_requests_get_a_status_and_a_reason(policy, method, path, body, status, said):
     with Served(policy, limits=Limits(message_mib=1)) as served:
-        found, kind, answer = ask(served, method, path, body)
-        assert (found, kind) == (status, "text/plain; charset=utf-8")
-        assert said in answer and b"Traceback" not in answer
+        code, kind, reply = ask(served, method, path, body)
+        assert (code, kind) == (status, "text/plain; charset=utf-8")
+        assert said in reply and b"Traceback" not in reply
         assert ask(served, "GET", "/healthz")[0] == 200
 
 
@@ -108,20 +108,20 @@ def test_what_the_policy_cannot_do_is_a_500(policy):
     with Served(policy) as served:
         policy.act = lambda *_: 1 / 0
         try:
-            status, _, answer = ask(served, "POST", "/infer", pack(challenge(*course()[0], first=True)))
+            status, _, reply = ask(served, "POST", "/infer", pack(challenge(*course()[0], first=True)))
         finally:
             del policy.act
-        assert status == 500 and b"ZeroDivisionError" in answer and b"Traceback" not in answer
-        status, _, answer = ask(served, "POST", "/infer", pack(challenge(*course()[1], first=False)))
-        assert status == 409 and b"begin the episode again" in answer, "an error ends the episode"
+        assert status == 500 and b"ZeroDivisionError" in reply and b"Traceback" not in reply
+        status, _, reply = ask(served, "POST", "/infer", pack(challenge(*course()[1], first=False)))
+        assert status == 409 and b"begin the episode again" in reply, "an error ends the episode"
 
 
-def test_a_key_is_asked_for_but_not_for_health_and_metadata(policy):
+def test_a_key_is_requested_but_not_for_health_and_metadata(policy):
     with Served(policy, api_key="right") as served:
         for path in ("/healthz", "/metadata"):  # the challenge's client asks for the metadata without its key
             assert ask(served, "GET", path)[0] == 200
-        for given in (None, "Api-Key wrong", "Bearer right", "Api-Key rïght"):
-            assert ask(served, "GET", "/stats", **({"Authorization": given} if given else {}))[0] == 401
+        for header in (None, "Api-Key wrong", "Bearer right", "Api-Key rïght"):
+            assert ask(served, "GET", "/stats", **({"Authorization": header} if header else {}))[0] == 401
         assert ask(served, "GET", "/stats", Authorization="Api-Key right")[0] == 200
         assert ask(served, "POST", "/infer", b"x")[0] == 401
 
@@ -183,18 +183,18 @@ def test_garbage_on_the_wire_is_answered_and_harms_nobody(served, sent):
         raw.sendall(sent)
         if not sent.endswith(b"\r\n\r\n"):
             raw.shutdown(socket.SHUT_WR)
-        answer = b""
+        reply = b""
         try:
             while piece := raw.recv(4096):
-                answer += piece
+                reply += piece
         except ConnectionResetError:
             pass
-    assert answer.startswith(b"HTTP/1.1 4")
+    assert reply.startswith(b"HTTP/1.1 4")
     assert ask(served, "GET", "/healthz")[0] == 200
 
 
 @pytest.mark.slow
-def test_the_command_serves_and_stops_when_told(tmp_path):
+def test_the_command_serves_and_stops_on_request(tmp_path):
     words = ("mme_vla.serve", "model=framesamp_modul", "backbone=tiny", "port=0")
     server = commands.start(*words, env={"OMP_NUM_THREADS": "1", "MME_VLA_API_KEY": "secret"})
     try:
@@ -217,8 +217,8 @@ def test_the_command_serves_and_stops_when_told(tmp_path):
 
 @pytest.mark.slow
 def test_the_command_says_what_it_needs():
-    for words, said in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
-        with pytest.raises(UserError, match=said):
+    for words, expected in (([], "checkpoint="), (["checkpoint=nowhere"], "nowhere")):
+        with pytest.raises(UserError, match=expected):
             load_policy(compose("serve", words), "serve", LOGGER)
     done = commands.run("mme_vla.serve", "checkpoint=x", "model=pi05")
     assert done.returncode == 2 and "leave out model=pi05" in done.stderr and "Traceback" not in done.stderr
@@ -236,21 +236,21 @@ def test_a_new_session_takes_the_place_of_the_longest_silent(served):
     sessions, settings = served.server.sessions, served.server.settings
     sessions.entries.clear()
     names = [("127.0.0.1", str(i)) for i in range(settings.limits.connections)]
-    kept = {name: sessions.find(name, Reset()) for name in names}
-    kept[names[0]].requests = 1  # at work
-    kept[names[3]].used -= 100
+    sessions_ = {name: sessions.find(name, Reset()) for name in names}
+    sessions_[names[0]].requests = 1  # at work
+    sessions_[names[3]].used -= 100
     newcomer = ("127.0.0.1", "new")
     sessions.find(newcomer, Reset())
     assert set(sessions.entries) == {*names, newcomer} - {names[3]}
     for name in names:
-        kept[name].requests = 1
+        sessions_[name].requests = 1
     sessions.entries[newcomer].requests = 1
     with pytest.raises(BusyError, match="at work"):
         sessions.find(("127.0.0.1", "another"), Reset())
     sessions.entries.clear()
 
 
-def test_a_request_that_waited_does_not_go_on_with_an_episode_that_failed_meanwhile(served):
+def test_a_request_that_waited_does_not_continue_with_an_episode_that_failed_meanwhile(served):
     sessions, name = served.server.sessions, ("127.0.0.1", "twice")
 
     async def meet():
@@ -272,7 +272,7 @@ def test_a_request_that_waited_does_not_go_on_with_an_episode_that_failed_meanwh
 @pytest.mark.parametrize(
     "word", ["policy.compute_dtype=bfloat16", "policy.history_dtype=float32", "token_budget=64", "+subgoal_text.kind=x"]
 )
-def test_what_a_checkpoint_brings_cannot_be_set_beside_it(word, monkeypatch):
+def test_what_a_checkpoint_defines_cannot_be_set_beside_it(word, monkeypatch):
     overrides = SimpleNamespace(overrides=SimpleNamespace(task=["checkpoint=x", word]))
     monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.initialized", lambda: True)
     monkeypatch.setattr("hydra.core.hydra_config.HydraConfig.get", lambda: overrides)

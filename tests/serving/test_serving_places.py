@@ -40,13 +40,13 @@ def released_episode(address: str, seed: int) -> tuple[object, np.ndarray]:
         observation(PICTURE, PICTURE, state[0], reset=False, add_buffer=False),
     ):
         raw.send(pack(message))
-        answer = raw.recv()
-        assert isinstance(answer, bytes), answer
-        chunks.append(unpack(answer).get("actions"))
+        reply = raw.recv()
+        assert isinstance(reply, bytes), reply
+        chunks.append(unpack(reply).get("actions"))
     return raw, np.stack([chunk for chunk in chunks if chunk is not None])
 
 
-def test_a_whole_evaluation_whose_connections_are_never_closed(monkeypatch):
+def test_a_full_evaluation_whose_connections_are_never_closed(monkeypatch):
     policy = serving_policy("pi05")
     born: list[weakref.ref] = []
     start = policy.start_episode
@@ -56,18 +56,18 @@ def test_a_whole_evaluation_whose_connections_are_never_closed(monkeypatch):
         born.append(weakref.ref(episode))
         return episode
 
-    def told(episodes, _):  # which episode was asked, and how many frames it remembers
+    def predict(episodes, _):  # which episode was asked, and how many frames it remembers
         return np.stack([np.full((20, 8), episode.state[0] + episode.n_observed_frames) for episode in episodes])
 
     monkeypatch.setattr(policy, "start_episode", watched)
-    monkeypatch.setattr(policy, "act", told)
+    monkeypatch.setattr(policy, "act", predict)
     with Served(policy, limits=Limits(connections=PLACES)) as served:
         address = f"ws://127.0.0.1:{served.server.port}"
         with ThreadPoolExecutor(LIVE) as pool:
-            kept = list(pool.map(lambda seed: released_episode(address, seed), range(EPISODES)))
-        for seed, (_, chunks) in enumerate(kept):
-            wanted = states(1, seed)[0, 0] + 1
-            np.testing.assert_allclose(chunks[0, 0, 0], wanted, rtol=1e-5, err_msg=f"episode {seed}")
+            results = list(pool.map(lambda seed: released_episode(address, seed), range(EPISODES)))
+        for seed, (_, chunks) in enumerate(results):
+            expected = states(1, seed)[0, 0] + 1
+            np.testing.assert_allclose(chunks[0, 0, 0], expected, rtol=1e-5, err_msg=f"episode {seed}")
         counts = served.server.stats.counts
         assert (counts["infer"], counts["refused"], counts["failed"]) == (EPISODES, 0, 0)
         assert counts["let_go"] == EPISODES - PLACES
@@ -75,7 +75,7 @@ def test_a_whole_evaluation_whose_connections_are_never_closed(monkeypatch):
         assert sum(ref() is not None for ref in born) <= PLACES
 
 
-def test_a_websocket_that_is_let_go_hears_why(policy):
+def test_a_websocket_that_is_closed_gets_the_reason(policy):
     with Served(policy, limits=Limits(connections=2)) as served:
         silent, other, newcomer = served.client(), served.client(), None
         other.reset()
@@ -102,38 +102,38 @@ def test_a_silent_websocket_is_closed_and_its_episode_freed(policy):
 
 
 def idle(served: Served, count: int, request: bytes) -> list[socket.socket]:
-    held = []
+    sockets = []
     for _ in range(count):
         raw = socket.create_connection(served.address, timeout=10)
         if request:
             raw.sendall(request)
             raw.recv(4096)
-        held.append(raw)
-    return held
+        sockets.append(raw)
+    return sockets
 
 
 @pytest.mark.parametrize("request_", [b"", b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n",
                                       b"GET /stats HTTP/1.1\r\nHost: x\r\n\r\n"])  # fmt: skip
-def test_strangers_take_no_place_from_those_who_have_the_key(policy, request_):
+def test_unauthenticated_clients_take_no_place_from_those_who_have_the_key(policy, request_):
     with Served(policy, api_key="right", limits=Limits(connections=2)) as served:
         known = served.client(api_key="right")
-        held = idle(served, connections.MAX_UNAUTHENTICATED + 20, request_)
+        sockets = idle(served, connections.MAX_UNAUTHENTICATED + 20, request_)
         with served.client(api_key="right") as client:
             assert client.reset() and known.reset()
             assert ask(served, "GET", "/healthz")[0] == 200
         assert len(served.server.connections.open) <= connections.MAX_UNAUTHENTICATED + 3
-        for raw in held:
+        for raw in sockets:
             raw.close()
 
 
 def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
     monkeypatch.setattr(connections, "HEAD_S", 0.5)
     with Served(policy, limits=Limits(receive_s=1)) as served:
-        held = idle(served, 1, b"")
-        held += idle(served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")  # answered, and then it dawdles
+        sockets = idle(served, 1, b"")
+        sockets += idle(served, 1, b"GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n")  # answered, and then it dawdles
         until = time.monotonic() + 30
         while time.monotonic() < until and served.server.connections.open:
-            for raw in held:
+            for raw in sockets:
                 with suppress(OSError):
                     raw.sendall(b"G")
             time.sleep(0.1)
@@ -141,14 +141,14 @@ def test_headers_that_never_end_are_not_waited_for(policy, monkeypatch):
 
 
 def resident_mib() -> float:
-    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
-    assert found
-    return int(found[1]) / 1024
+    match = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+    assert match
+    return int(match[1]) / 1024
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads memory from /proc")
 @pytest.mark.parametrize("path", ["/healthz", "/metadata", "/infer"])
-def test_a_body_that_nobody_asked_for_is_not_kept(policy, monkeypatch, path):
+def test_an_unrequested_body_is_discarded(policy, monkeypatch, path):
     monkeypatch.setattr("mme_vla.serving.app.LINGER_S", 0.5)
     piece = bytes(2**20)
     with Served(policy, api_key="right") as served:
@@ -172,8 +172,8 @@ def test_a_lost_http_episode_is_not_gone_on_with(policy):
         for other in "bc":  # two others come, and the first has to go
             assert ask(served, "POST", "/infer", first, X_Session=other)[0] == 200
         for lost in (later, buffer):
-            status, _, answer = ask(served, "POST", "/infer", lost, X_Session="a")
-            assert status == 409 and b"Reset and begin the episode again" in answer
+            status, _, reply = ask(served, "POST", "/infer", lost, X_Session="a")
+            assert status == 409 and b"Reset and begin the episode again" in reply
         assert ask(served, "POST", "/infer", later, X_Session="c")[0] == 200
         assert ask(served, "POST", "/infer", b"garbage", X_Session="c")[0] == 400
         assert ask(served, "POST", "/infer", later, X_Session="c")[0] == 409
@@ -182,7 +182,7 @@ def test_a_lost_http_episode_is_not_gone_on_with(policy):
 
 def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeypatch):
     parts = course()
-    wanted = acted_directly(policy, parts)[0][:16]
+    expected = acted_directly(policy, parts)[0][:16]
     act = policy.act
 
     def brittle(episodes, steps):
@@ -206,10 +206,10 @@ def test_one_broken_episode_does_not_fail_those_that_act_with_it(policy, monkeyp
                     return str(error)
 
         with ThreadPoolExecutor(4) as pool:
-            said, *chunks = pool.map(run, range(4))
-    assert "broken" in said
+            failure, *chunks = pool.map(run, range(4))
+    assert "broken" in failure
     for chunk in chunks:
-        np.testing.assert_allclose(chunk, wanted, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(chunk, expected, rtol=1e-4, atol=1e-5)
 
 
 def test_an_empty_key_is_none():

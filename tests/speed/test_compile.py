@@ -73,7 +73,7 @@ def test_a_run_compiles_few_graphs_at_any_depth(model: str, depth: int) -> None:
     assert counted.graphs >= 3, "the tower, a layer, and the last layer"
 
 
-def test_what_cannot_be_compiled_whole_is_an_error_and_not_slow() -> None:
+def test_what_cannot_be_fully_compiled_is_an_error_and_not_slow() -> None:
     policy = small_policy("pi05", **SHORT_TOWER, policy={"augment": False})
     policy.compile(backend=Counted())
     policy.backbone.transformer.layers[0].experts["vlm"].mlp = Printing()
@@ -93,6 +93,6 @@ def test_a_hook_of_layers_answers_as_one_of_numbers() -> None:
     for layer, expected in enumerate((2.0, 2.0)):
         bound = bind_hook(hook, layer)
         assert bound is not None and torch.equal(bound(x), hook(layer, x)) and float(bound(x)[0]) == expected
-    own = bind_hook(lambda layer, x: x + layer, 3)
-    assert own is not None and float(own(x)[0]) == 4
+    bound_layer = bind_hook(lambda layer, x: x + layer, 3)
+    assert bound_layer is not None and float(bound_layer(x)[0]) == 4
     assert bind_hook(None, 0) is None

@@ -95,16 +95,16 @@ def captures(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize("model", ["pi05", "framesamp_expert"])
-def test_few_sizes_are_captured_and_each_batch_gets_its_own_answer(model: str, captures: list[int]) -> None:
+def test_few_sizes_are_captured_and_each_batch_gets_its_reply(model: str, captures: list[int]) -> None:
     policy = small_policy(model).eval()
     generator = torch.Generator().manual_seed(0)
     cases = [(random_batch(policy, n, seed=n), torch.randn(n, 20, 32, generator=generator)) for n in (3, 4, 1, 3, 2)]
     expected = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     policy.compile_sampling()
     policy._sampler = CapturedSampling(policy._sample, policy.backbone.sampling_stamp)
-    found = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
+    chunks = [policy.sample_actions(batch, noise, steps=2) for batch, noise in cases]
     assert captures == [4, 1, 2]
-    assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(found, expected, strict=True))
+    assert all(torch.allclose(a, b, atol=1e-5) for a, b in zip(chunks, expected, strict=True))
     policy.train()
     policy.sample_actions(*cases[0], steps=2)
     policy.eval()
@@ -112,10 +112,10 @@ def test_few_sizes_are_captured_and_each_batch_gets_its_own_answer(model: str, c
         policy.backbone.time_in.bias.add_(1)
     changed = policy.sample_actions(*cases[2], steps=2)
     assert captures == [4, 1, 2, 1], "what was captured from other modulations is dropped"
-    assert not torch.allclose(changed, found[2])
+    assert not torch.allclose(changed, chunks[2])
 
 
-def test_a_command_compiles_what_it_is_asked_to() -> None:
+def test_a_command_compiles_what_it_is_requested() -> None:
     logger = logging.getLogger("test")
     policy = small_policy("pi05").eval()
     prepare_sampling(policy, "auto", logger)

@@ -23,13 +23,13 @@ def switches() -> tuple[object, ...]:
 def test_the_switch_is_set_inside_and_as_it_was_behind_it(how: str, before: str) -> None:
     torch.set_float32_matmul_precision(before)
     try:
-        found = switches()
+        inside = switches()
         with float32_products(how):
             assert SWITCH.fp32_precision == how
-        assert switches() == found
+        assert switches() == inside
         with pytest.raises(ZeroDivisionError), float32_products(how):
             _ = 1 / 0
-        assert switches() == found
+        assert switches() == inside
     finally:
         torch.set_float32_matmul_precision("highest")
 
@@ -40,22 +40,22 @@ def test_recurrent_layers_alone_see_it_the_recomputed_ones_too(
     model: str, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     policy = small_policy(model, **{"+policy": {"float32_products": how}}).train()
-    layer, found, outside = policy.memory.layer, [], switches()
+    layer, inside, outside = policy.memory.layer, [], switches()
     advance = type(layer).advance
 
     def watched(*inputs, **named):
-        found.append(SWITCH.fp32_precision)
+        inside.append(SWITCH.fp32_precision)
         return advance(layer, *inputs, **named)
 
     monkeypatch.setattr(layer, "advance", watched)
-    seen = []
-    policy.backbone.vision.register_forward_hook(lambda *_: seen.append(switches()))
-    policy.memory.encoder.register_forward_hook(lambda *_: seen.append(switches()))
+    precisions = []
+    policy.backbone.vision.register_forward_hook(lambda *_: precisions.append(switches()))
+    policy.memory.encoder.register_forward_hook(lambda *_: precisions.append(switches()))
     loss, _ = policy(random_batch(policy, 2))
-    forward = len(found)
+    forward = len(inside)
     loss.backward()
-    assert set(found) == {how} and len(found) == 2 * forward, "every chunk once more for the backward pass"
-    assert set(seen) == {outside} and switches() == outside
+    assert set(inside) == {how} and len(inside) == 2 * forward, "every chunk once more for the backward pass"
+    assert set(precisions) == {outside} and switches() == outside
 
 
 def test_on_a_cpu_it_changes_no_number() -> None:
@@ -71,7 +71,7 @@ def test_an_unknown_way_is_refused() -> None:
         small_policy("ttt_modul", **{"+policy": {"float32_products": "tf23"}})
 
 
-def test_members_of_a_joined_memory_are_told() -> None:
+def test_members_of_a_joined_memory_are_reported() -> None:
     policy = small_policy("framesamp_ttt_modul", **{"+policy": {"float32_products": "tf32"}})
     _, recurrent = policy.memory.memories
     assert recurrent.float32_products == "tf32"

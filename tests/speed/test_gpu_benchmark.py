@@ -33,21 +33,21 @@ def test_it_runs_on_a_cpu_and_says_what_it_could_not_measure(
     report.write_text('{"processes": {"8": {}}}')
     words = [*SMALL, "--workers", "0", "--no-lerobot", "--models", "framesamp_modul", "--output", str(report)]
     assert gpu.main(words) == 0
-    whole = json.loads(report.read_text())
-    assert whole["lerobot"] == "not measured" and "8" in whole["processes"], "what another run found is kept"
-    found = whole["models"]["framesamp_modul"]
-    assert 0 < found["feeding"]["waiting"] < 1 and found["feeding"]["samples_per_s"] > 0
-    assert found["training"]["mfu"] is None and found["training"]["tflop_per_sample"] > 0
-    assert found["chunk"].keys() == {"eager"} and found["chunk"]["eager"]["p50_ms"] > 0
+    result = json.loads(report.read_text())
+    assert result["lerobot"] == "not measured" and "8" in result["processes"], "what another run found is kept"
+    timings = result["models"]["framesamp_modul"]
+    assert 0 < timings["feeding"]["waiting"] < 1 and timings["feeding"]["samples_per_s"] > 0
+    assert timings["training"]["mfu"] is None and timings["training"]["tflop_per_sample"] > 0
+    assert timings["chunk"].keys() == {"eager"} and timings["chunk"]["eager"]["p50_ms"] > 0
     printed = capsys.readouterr().out
     assert "MFU not measured" in printed and "NaN sweep: none" in printed
 
 
-def test_what_misses_a_goal_is_told(gpu: Any) -> None:
+def test_what_misses_a_goal_is_reported(gpu: Any) -> None:
     ways = {"eager": {"p50_ms": 90.0}, "graph": {"p50_ms": 14.0}}
     row = {"training": {"finite": True, "mfu": 0.51}, "chunk": ways}
     good: dict[str, Any] = {"device": "cuda", "nan": [], "models": {"pi05": row}}
     assert gpu.judge(good) == []
     bad = {"training": {"finite": False, "mfu": 0.4}, "chunk": {"eager": {"p50_ms": 16.0}}}
-    told = " ".join(gpu.judge({**good, "nan": ["sdpa at 576 keys"], "models": {"pi05": bad}}))
-    assert all(word in told for word in ("576", "no number", "MFU 40%", "16.0 ms"))
+    message = " ".join(gpu.judge({**good, "nan": ["sdpa at 576 keys"], "models": {"pi05": bad}}))
+    assert all(word in message for word in ("576", "no number", "MFU 40%", "16.0 ms"))

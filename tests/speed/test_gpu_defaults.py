@@ -12,16 +12,16 @@ from mme_vla.training.logging import Window
 from mme_vla.types import send
 
 
-def test_pictures_are_changed_alike_however_an_update_is_divided() -> None:
+def test_images_are_changed_alike_however_an_update_is_divided() -> None:
     policy = small_policy("pi05").train()
     batch = random_batch(policy, 4)
     changes = policy.augmentation_params(4, torch.Generator().manual_seed(3))["changes"]
-    whole = policy.prepare_images(batch, changes).images
+    together = policy.prepare_images(batch, changes).images
     pieces = [
         policy.prepare_images(batch.rows(torch.tensor(rows)), changes[rows]).images for rows in ([0], [1, 2], [3])
     ]
-    assert torch.equal(torch.cat(pieces), whole)
-    assert not torch.equal(whole, policy.prepare_images(batch).images)
+    assert torch.equal(torch.cat(pieces), together)
+    assert not torch.equal(together, policy.prepare_images(batch).images)
 
 
 def test_weights_for_acting_are_rounded_where_they_may_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,7 +39,7 @@ def test_weights_for_acting_are_rounded_where_they_may_be(tmp_path: Path, monkey
     assert {p.dtype for p in unlike.parameters()} == {torch.float32}
 
 
-def test_a_plain_number_is_averaged_like_one_on_the_device() -> None:
+def test_a_python_number_is_averaged_like_one_on_the_device() -> None:
     window = Window(batch_size=2)
     for rate in (1.0, 2.0):
         window.add({"loss": torch.tensor(rate), "lr": rate})

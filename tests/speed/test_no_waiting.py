@@ -22,7 +22,7 @@ class HostWork(TorchDispatchMode):
 
     def __init__(self) -> None:
         super().__init__()
-        self.found: list[str] = []
+        self.waits: list[str] = []
 
     def __torch_dispatch__(
         self, func: Any, types: Sequence[type], args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
@@ -33,7 +33,7 @@ class HostWork(TorchDispatchMode):
             any(x.device.type == "cpu" and x.numel() for x in tensors)
             or func is torch.ops.aten._local_scalar_dense.default
         ):
-            self.found.append(str(func))
+            self.waits.append(str(func))
         return result
 
 
@@ -54,7 +54,7 @@ def test_an_update_touches_nothing_on_the_cpu(model: str) -> None:
     with HostWork() as work:
         loss, _ = policy(batch, draws)
         loss.backward()
-    assert work.found == []
+    assert work.waits == []
     assert all(p.grad is not None for name, p in policy.named_parameters() if "time_in" in name)
 
 
@@ -64,12 +64,12 @@ def test_a_chunk_touches_nothing_on_the_cpu(model: str) -> None:
     batch, draws = on_meta(policy)
     with HostWork() as work:
         chunk = policy.sample_actions(batch, {"noise": draws["noise"]}, steps=2)
-    assert work.found == [] and chunk.device.type == "meta"
+    assert work.waits == [] and chunk.device.type == "meta"
 
 
-def test_what_waits_is_found() -> None:
+def test_what_waits_is_detected() -> None:
     x = torch.ones(2, device="meta")
     with HostWork() as work:
         x + torch.tensor([1.0, 2.0]).to("meta")
         x.new_tensor([1.0, 2.0])
-    assert len(work.found) >= 2
+    assert len(work.waits) >= 2

@@ -35,8 +35,8 @@ def test_weights_are_full_until_the_chunk_is_there_and_then_fade() -> None:
     weights = overlap_weights(delay=3, count=9, horizon=12)
     assert weights[:3].tolist() == [1, 1, 1] and weights[9:].tolist() == [0, 0, 0]
     assert (weights[3:9].diff() < 0).all() and weights[8] > 0 and weights[3] < 1
-    rest = (9 - 3) / (9 - 3 + 1)
-    assert weights[3].item() == pytest.approx(rest * (np.exp(rest) - 1) / (np.e - 1))
+    remaining = (9 - 3) / (9 - 3 + 1)
+    assert weights[3].item() == pytest.approx(remaining * (np.exp(remaining) - 1) / (np.e - 1))
     assert overlap_weights(4, 4, 4).tolist() == [1, 1, 1, 1]
 
 
@@ -54,16 +54,16 @@ def test_the_pull_is_the_gradient_through_the_network() -> None:
         return (x.flatten(1) @ mixing).reshape(x.shape)
 
     with torch.no_grad():
-        given = rtc_guidance(velocity, overlap, time)(x, 0)
+        gradient = rtc_guidance(velocity, overlap, time)(x, 0)
     jacobian = torch.eye(6) - 0.5 * mixing.T
     missing = (overlap.actions - (x - 0.5 * velocity(x, 0))) * overlap.weight
     expected = velocity(x, 0) - 2.0 * (missing.flatten() @ jacobian).reshape(x.shape)
-    assert not given.requires_grad
-    torch.testing.assert_close(given, expected)
+    assert not gradient.requires_grad
+    torch.testing.assert_close(gradient, expected)
     assert rtc_guidance(velocity, None, time) is velocity
 
 
-def test_the_next_chunk_honours_what_was_promised(policy: MMEPolicy, before: np.ndarray) -> None:
+def test_the_next_chunk_honours_what_was_committed(policy: MMEPolicy, before: np.ndarray) -> None:
     free = policy.act(episode_of(policy))
     episode = episode_of(policy)
     episode.set_action_prefix(before, delay=4)
@@ -75,7 +75,7 @@ def test_the_next_chunk_honours_what_was_promised(policy: MMEPolicy, before: np.
     np.testing.assert_array_equal(policy.act(episode_of(policy)), free)
 
 
-def test_a_promise_changes_its_own_episode_alone(policy: MMEPolicy, before: np.ndarray) -> None:
+def test_a_prefix_changes_its_episode_alone(policy: MMEPolicy, before: np.ndarray) -> None:
     alone = episode_of(policy)
     alone.set_action_prefix(before, delay=4)
     bound, other = episode_of(policy), episode_of(policy, seed=5)
@@ -94,7 +94,7 @@ def test_a_promise_changes_its_own_episode_alone(policy: MMEPolicy, before: np.n
         (np.zeros((3, 8)), 4, "delay=4 must be a whole number from 0 to 3"),
     ],
 )
-def test_a_promise_that_cannot_be_is_refused(policy: MMEPolicy, actions: np.ndarray, delay: int, said: str) -> None:
+def test_a_prefix_that_cannot_be_is_refused(policy: MMEPolicy, actions: np.ndarray, delay: int, said: str) -> None:
     with pytest.raises(UserError, match=said):
         episode_of(policy).set_action_prefix(actions, delay)
 

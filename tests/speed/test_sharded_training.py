@@ -90,9 +90,9 @@ def test_a_killed_process_ends_the_others(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_every_kind_of_policy_learns_and_answers_the_same_shared(folder: Path) -> None:
-    found = answer(folder, "policies")
-    assert set(sharded_runs.MODELS) <= set(found)
-    for name, one in found.items():
+    result = answer(folder, "policies")
+    assert set(sharded_runs.MODELS) <= set(result)
+    for name, one in result.items():
         assert one["shared"] == pytest.approx(one["alone"], rel=2e-5), name
         assert one["shared chunk"] == pytest.approx(one["alone chunk"], rel=1e-3 if "16" in name else 2e-5), name
         assert one["again"] == one["shared"][2], name
@@ -116,7 +116,7 @@ def test_an_incomplete_checkpoint_is_refused(folder: Path, tmp_path: Path) -> No
         read_state(resolve_checkpoint(copy))
 
 
-def test_what_cannot_be_shared_is_said_in_words() -> None:
+def test_what_cannot_be_shared_is_reported_in_words() -> None:
     with pytest.raises(UserError, match="torchrun"):
         ParallelSettings("fsdp").shards(torch.device("cpu"))
     with pytest.raises(UserError, match="Did you mean 'fsdp'"):

@@ -75,9 +75,9 @@ def test_sets_equal_the_released_ones_row_by_row(built, golden, name):
 
 @pytest.mark.parametrize("name", SETS)
 def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repeated_rows(labelled, golden, name):
-    found, expected = [], []
+    actual, expected = [], []
     for _, labels in labelled:
-        found += episode_rows(name, labels, RowOptions(noise=None)).rows
+        actual += episode_rows(name, labels, RowOptions(noise=None)).rows
     repeats = {
         f"qwenvl/images/{task}_ep{number}_step{step}.png": count
         for task, episodes in golden["qwen_selection"].items()
@@ -86,8 +86,8 @@ def test_the_repaired_defects_leave_these_episodes_as_they_are_but_for_the_repea
     }
     for row in golden["vlm_datasets"][SETS[name]]:
         expected += [row] * (1 + repeats.get(row["images"][0], 0))
-    assert found == expected
-    assert name.startswith("memer") or len(found) > len(golden["vlm_datasets"][SETS[name]])
+    assert actual == expected
+    assert name.startswith("memer") or len(actual) > len(golden["vlm_datasets"][SETS[name]])
 
 
 def test_selected_steps_and_repeats_equal_the_released_ones(labelled, golden):
@@ -99,7 +99,7 @@ def test_selected_steps_and_repeats_equal_the_released_ones(labelled, golden):
         assert {str(step): count for step, count in repeats.items()} == expected["duplicates"]
 
 
-def test_every_picture_and_video_a_row_names_is_there(built, labelled):
+def test_every_image_and_video_a_row_names_is_there(built, labelled):
     labels = {episode.name: (episode, its) for episode, its in labelled}
     for name in SETS:
         for row in rows_of(built, name):
@@ -123,20 +123,20 @@ def test_a_lerobot_dataset_gives_the_same_rows(h5, golden, tmp_path):
 
 def test_an_interrupted_build_continues_and_ends_the_same(h5, built, tmp_path, monkeypatch):
     episodes, output = open_input(h5), tmp_path / "data"
-    written, original = [], module._build_episode
+    names, original = [], module._build_episode
 
-    def interrupted(episode, *rest):
-        if len(written) == 2:
+    def interrupted(episode, *arguments):
+        if len(names) == 2:
             raise KeyboardInterrupt
-        original(episode, *rest)
-        written.append(episode.name)
+        original(episode, *arguments)
+        names.append(episode.name)
 
     monkeypatch.setattr(module, "_build_episode", interrupted)
     with pytest.raises(KeyboardInterrupt):
         build(episodes, output, list(SETS), RELEASED)
-    monkeypatch.setattr(module, "_build_episode", lambda e, *rest: (written.append(e.name), original(e, *rest)))
+    monkeypatch.setattr(module, "_build_episode", lambda e, *arguments: (names.append(e.name), original(e, *arguments)))
     build(episodes, output, list(SETS), RELEASED)
-    assert Counter(written) == Counter(e.name for e in episodes), "no episode is built twice"
+    assert Counter(names) == Counter(e.name for e in episodes), "no episode is built twice"
     files = sorted(p.relative_to(built) for p in built.rglob("*") if p.is_file())
     assert files == sorted(p.relative_to(output) for p in output.rglob("*") if p.is_file())
     # Encoders may differ in the last bits of such tiny images, and so may the sums of their files; that the videos
@@ -152,7 +152,7 @@ def test_another_build_is_not_overwritten(built, h5):
         build([*open_input(h5), *open_input(h5)], built, list(SETS), RELEASED)
 
 
-def test_a_dataset_that_does_not_tell_its_tasks_is_asked_for_them(tmp_path):
+def test_a_dataset_that_does_not_tell_its_tasks_is_requested_them(tmp_path):
     from mme_vla.data.lerobot_files import SAMPLE
 
     copy = shutil.copytree(SAMPLE, tmp_path / "dataset")
@@ -164,11 +164,11 @@ def test_a_dataset_that_does_not_tell_its_tasks_is_asked_for_them(tmp_path):
     assert [episode.name for episode in open_input(copy, tmp_path / "tasks.json")][2] == "PickXtimes_ep2"
 
 
-def test_noise_keeps_to_its_range_and_to_the_picture_and_is_drawn_for_each_row():
+def test_noise_keeps_to_its_range_and_to_the_image_and_is_sampled_for_each_row():
     labels = made_up(length=2000, changes=(0,))
     rows = episode_rows("grounded", labels, RowOptions()).rows
-    drawn = np.array([point for row in rows for point in row["objects"]["bbox"]])
-    assert set(drawn[:, 0] - 10) == {-2, -1, 0, 1} == set(drawn[:, 1] - 250)
+    points = np.array([point for row in rows for point in row["objects"]["bbox"]])
+    assert set(points[:, 0] - 10) == {-2, -1, 0, 1} == set(points[:, 1] - 250)
     assert len({str(row["objects"]["bbox"][0]) for row in rows}) > 4
     edge = made_up(length=2000, changes=(0,))
     edge.grounded[:] = ["at <0, 255>"] * 2000
@@ -178,7 +178,7 @@ def test_noise_keeps_to_its_range_and_to_the_picture_and_is_drawn_for_each_row()
     assert rows != episode_rows("grounded", labels, RowOptions(seed=1)).rows
 
 
-def test_a_second_keyframe_in_one_window_is_found_unless_the_defect_is_wanted():
+def test_a_second_keyframe_in_one_window_is_detected_unless_the_defect_is_requested():
     labels = made_up(length=80, changes=(0, 20, 28, 50))
     repaired = windows(labels, keyframes(labels))
     assert [w.positions for w in repaired] == [[1], [], [2, 6], [], [1], []]
@@ -195,7 +195,7 @@ def test_extra_keyframes_belong_to_their_tasks():
     assert keyframes(made_up("PickHighlight", 90, bounds)) == [0, 15, 30, 60]
 
 
-def test_the_arm_at_rest_is_a_keyframe_where_the_path_is_the_task():
+def test_the_arm_standing_still_is_a_keyframe_where_the_path_is_the_task():
     labels = made_up("RouteStick", 60, (0,))
     for t in (20, 23, 40):
         labels.targets[t] = labels.joints[t] + 1e-5
@@ -204,7 +204,7 @@ def test_the_arm_at_rest_is_a_keyframe_where_the_path_is_the_task():
     assert keyframes(made_up("BinFill", 60, (0,))) == [0]
 
 
-def test_a_short_segment_has_a_row_only_if_wanted():
+def test_a_short_segment_has_a_row_only_if_requested():
     labels = made_up(length=64, changes=(0, 5, 40))
     assert selected_steps(labels)[0] == [5, 22, 40, 63]
     assert selected_steps(labels, short_segments=True)[0] == [0, 5, 22, 40, 63]
@@ -215,17 +215,17 @@ def test_complete_is_no_subgoal():
     assert labels.simple == ["a", "a"] and labels.grounded == ["a at <1, 2>"] * 2
 
 
-def test_videos_are_looked_at_evenly_and_never_beyond_their_limits():
+def test_videos_are_sampled_evenly_and_never_beyond_their_limits():
     assert sample_video(300).tolist() == np.linspace(0, 299, 10).round().tolist()
     assert len(sample_video(66)) == 4 and len(sample_video(105)) == 6 and len(sample_video(3)) == 2
     assert sample_video(1).tolist() == [0]
 
 
 def test_the_argument_file_of_ms_swift_is_the_papers_recipe(tmp_path):
-    found = json.loads(write_arguments(tmp_path, "simple").read_text())
-    recipe = [found[key] for key in ("lora_rank", "lora_alpha", "learning_rate", "warmup_ratio")]
+    options = json.loads(write_arguments(tmp_path, "simple").read_text())
+    recipe = [options[key] for key in ("lora_rank", "lora_alpha", "learning_rate", "warmup_ratio")]
     assert recipe == [16, 32, 1e-4, 0.05]
-    assert found["per_device_train_batch_size"] * found["gradient_accumulation_steps"] * 4 == 64
+    assert options["per_device_train_batch_size"] * options["gradient_accumulation_steps"] * 4 == 64
     page = (REPOSITORY / "docs" / "subgoal-training.md").read_text().replace(" \\\n ", "")
     assert command("grounded") in page and command("grounded").endswith("swift sft swift_grounded.json")
 
@@ -235,7 +235,7 @@ def test_settings_that_cannot_work_are_named(tmp_path):
 
     listed = tmp_path / "list.json"
     listed.write_text("[1]")
-    for word, said in (
+    for word, message in (
         ("episodes=2", "episodes=2 must be a list, each a whole number, 0 or more"),
         ("episodes=[a]", "must be a list, each a whole number"),
         ("noise=[a,b]", "must be a list of 2 values: a whole number"),
@@ -245,7 +245,7 @@ def test_settings_that_cannot_work_are_named(tmp_path):
         ("sets=[simpel]", "sets=.*simpel.* must be a list, each simple or grounded"),
         ("seed=-1", "seed=-1"),
     ):
-        with pytest.raises(UserError, match=said):
+        with pytest.raises(UserError, match=message):
             subgoal_build.main(compose("subgoal_build", ["input=sample", f"output={tmp_path / 'out'}", word]))
     for tasks in (tmp_path / "missing.json", tmp_path, listed):
         with pytest.raises(UserError, match="tasks="):

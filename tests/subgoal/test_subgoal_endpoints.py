@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from helpers.chat_server import Answer, chat_server, failure, says
+from helpers.chat_server import Reply, chat_server, failure, says
 from helpers.rollout_fakes import quick_policy
 from mme_vla.cli.evaluate import choose_subgoals, report_usage
 from mme_vla.config.composition import compose
@@ -21,7 +21,7 @@ SECRET = "sk-not-a-real-key"
 PLAN = {"description": "x", "subgoal": "press the button", "notes": [{"kind": "count", "name": "pressed", "value": 0}]}
 
 
-def answering(request: dict[str, Any]) -> Answer:
+def answering(request: dict[str, Any]) -> Reply:
     """A plan, or what the notebook's monitor asks."""
     asks_whether = request["messages"][0]["content"] == MONITOR
     return says(json.dumps({"why": "", "done": False} if asks_whether else PLAN))
@@ -40,16 +40,16 @@ def heard(policy: MMEPolicy, name: str, *words: str) -> tuple[list[str | None], 
     assert isinstance(section, dict)
     predictor = choose_subgoals(policy, {str(key): value for key, value in section.items()})
     assert predictor is not None
-    episode, found = predictor.start_episode("press it", None, "StopCube"), []
+    episode, subgoals = predictor.start_episode("press it", None, "StopCube"), []
     for step in range(2):
         # The first question of a late task is asked again after its step alone; the notebook's monitor at every one.
         episode.observe(np.full((1 if step == 0 else 100, 32, 32, 3), step, np.uint8))
-        found.append(predictor.predict([episode])[0].text)
-    return found, predictor
+        subgoals.append(predictor.predict([episode])[0].text)
+    return subgoals, predictor
 
 
 @pytest.mark.parametrize("name", ["openai", "notebook"])
-def test_an_endpoint_is_tried_again_its_cost_is_told_and_its_answers_are_replayed(
+def test_an_endpoint_is_tried_again_its_cost_is_reported_and_its_replies_are_replayed(
     name: str,
     policy: MMEPolicy,
     tmp_path: Path,
@@ -59,7 +59,7 @@ def test_an_endpoint_is_tried_again_its_cost_is_told_and_its_answers_are_replaye
     monkeypatch.setenv("OPENAI_API_KEY", SECRET)
     cache, failures = f"subgoal.cache={tmp_path}", [failure(503, f"busy, key={SECRET}"), failure(429, "slowly")]
     with chat_server() as server, caplog.at_level(logging.INFO):
-        server.answer = lambda request: failures.pop() if failures else answering(request)
+        server.respond = lambda request: failures.pop() if failures else answering(request)
         subgoals, predictor = heard(policy, name, f"subgoal.base_url={server.url}", cache)
         assert subgoals == ["press the button"] * 2
         assert set(server.keys) == {f"Bearer {SECRET}"}

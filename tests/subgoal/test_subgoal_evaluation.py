@@ -41,23 +41,23 @@ def lines(path: Path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_every_subgoal_is_written_down_with_its_time_and_picture(tmp_path: Path) -> None:
+def test_every_subgoal_is_recorded_with_its_time_and_image(tmp_path: Path) -> None:
     policy, envs = quick_policy("groundsg"), InlineEnvs()
     (tmp_path / "VideoUnmask_ep0").mkdir()
     (tmp_path / "VideoUnmask_ep0" / "99999.jpg").touch()  # of a try that was cut off
     (record,) = roll(policy, [UNMASK], envs, Shifted(), subgoal_folder=tmp_path)
-    written = lines(tmp_path / "VideoUnmask_ep0.jsonl")
-    assert [line["step"] for line in written] == [0, 16, 32]
-    assert [line["text"] for line in written] == ["Push at <3, 13>.", "Push at <19, 13>.", "pull"]
-    assert [line["oracle"] for line in written] == ["push at <0, 9>", "push at <16, 9>", "push at <32, 9>"]
-    assert [line["answer"] for line in written] == ["answer 0", "answer 16", "answer 32"]
-    assert [line["asked_step"] for line in written] == [0, 16, 32]
-    assert all(line["asked"] and line["latency_s"] >= 0 for line in written)
-    assert 0 < written[0]["seconds"] < written[1]["seconds"] < written[2]["seconds"] < record.seconds.total
-    for line in written:
-        picture = np.asarray(Image.open(tmp_path / line["image"]), np.int64)
-        shown = envs.made[UNMASK].frames[21 + line["step"]]  # 21 frames of video come before
-        assert np.abs(picture - shown).mean() < 2
+    records = lines(tmp_path / "VideoUnmask_ep0.jsonl")
+    assert [line["step"] for line in records] == [0, 16, 32]
+    assert [line["text"] for line in records] == ["Push at <3, 13>.", "Push at <19, 13>.", "pull"]
+    assert [line["oracle"] for line in records] == ["push at <0, 9>", "push at <16, 9>", "push at <32, 9>"]
+    assert [line["answer"] for line in records] == ["answer 0", "answer 16", "answer 32"]
+    assert [line["asked_step"] for line in records] == [0, 16, 32]
+    assert all(line["asked"] and line["latency_s"] >= 0 for line in records)
+    assert 0 < records[0]["seconds"] < records[1]["seconds"] < records[2]["seconds"] < record.seconds.total
+    for line in records:
+        image = np.asarray(Image.open(tmp_path / line["image"]), np.int64)
+        frame = envs.made[UNMASK].frames[21 + line["step"]]  # 21 frames of video come before
+        assert np.abs(image - frame).mean() < 2
     assert len(list((tmp_path / "VideoUnmask_ep0").iterdir())) == 3
     assert record.extra["subgoals"] == {
         "chunks": 3, "judged": 3, "right": 2, "points": 2, "distance": 10.0, "asked": 3, "problems": {"malformed": 1},
@@ -80,8 +80,8 @@ def test_a_policy_without_predictor_has_no_score() -> None:
 def test_words_are_compared_without_points_case_and_full_stop() -> None:
     assert point_distances("Pick up the cube at <3, 4>.", "pick up  the cube at <0, 0>") == [5.0]
     assert point_distances("press the button", "press the button") == []
-    for said in (None, "press the button", "pick up the cube", "pick up the cube at <3, 4> at <1, 1>"):
-        assert point_distances(said, "pick up the cube at <0, 0>") is None
+    for text in (None, "press the button", "pick up the cube", "pick up the cube at <3, 4> at <1, 1>"):
+        assert point_distances(text, "pick up the cube at <0, 0>") is None
 
 
 def test_what_the_environment_does_not_name_is_not_judged() -> None:
@@ -120,21 +120,21 @@ class Slow(SubgoalPredictor):
 
     def __init__(self, interval: int = 1) -> None:
         super().__init__("simple", interval)
-        self.go, self.asked = threading.Semaphore(0), []
+        self.go, self.queries = threading.Semaphore(0), []
         self.error: Exception | None = None
-        self.seen: list[int] = []
+        self.observed: list[int] = []
 
     def start_episode(self, goal, video=None, task=""):
         episode = super().start_episode(goal, video, task)
         observe = episode.observe
         episode.observe = lambda frames, info=None: (
-            self.seen.extend(frames[:, 0, 0, 0].tolist()),
+            self.observed.extend(frames[:, 0, 0, 0].tolist()),
             observe(frames, info),
         )
         return episode
 
     def predict_due(self, episodes):
-        self.asked.append([(episode.goal, episode.step) for episode in episodes])
+        self.queries.append([(episode.goal, episode.step) for episode in episodes])
         assert self.go.acquire(timeout=30)
         if self.error:
             raise self.error
@@ -168,12 +168,12 @@ def test_in_the_background_only_the_first_subgoal_is_waited_for() -> None:
     assert predictor.predict([episode]) == [Subgoal("go 16", queried=True)], "the answer to the question at step 16"
     slow.go.release()
     settle(predictor)
-    assert slow.asked == [[("go", 0)], [("go", 16)], [("go", 48)]]
-    assert slow.seen == list(range(49)), "every frame reached the predictor once, in order"
+    assert slow.queries == [[("go", 0)], [("go", 16)], [("go", 48)]]
+    assert slow.observed == list(range(49)), "every frame reached the predictor once, in order"
     predictor.close()
 
 
-def test_a_question_that_came_due_while_the_thread_was_busy_is_asked_once_it_is_free() -> None:
+def test_a_question_that_came_due_while_the_thread_was_busy_is_queried_once_it_is_free() -> None:
     slow = Slow(interval=48)
     predictor = BackgroundPredictor(slow)
     first, second = predictor.start_episode("A"), predictor.start_episode("B")
@@ -191,12 +191,12 @@ def test_a_question_that_came_due_while_the_thread_was_busy_is_asked_once_it_is_
     settle(predictor)
     predictor.predict([second])
     settle(predictor)
-    assert slow.asked == [[("a", 0), ("b", 0)], [("a", 48)], [("b", 64)]]
+    assert slow.queries == [[("a", 0), ("b", 0)], [("a", 48)], [("b", 64)]]
     assert predictor.predict([second]) == [Subgoal("b 64", queried=True)] and second.query_step == 64
     predictor.close()
 
 
-def test_what_waits_for_the_thread_is_asked_in_one_batch() -> None:
+def test_what_waits_for_the_thread_is_queried_in_one_batch() -> None:
     slow = Slow()
     predictor = BackgroundPredictor(slow)
     first, second = predictor.start_episode("A"), predictor.start_episode("B")
@@ -213,8 +213,8 @@ def test_what_waits_for_the_thread_is_asked_in_one_batch() -> None:
     third = predictor.start_episode("C")
     third.observe(frames(0, 1))
     answers = predictor.predict([first, second, third])
-    assert slow.asked == [[("a", 0), ("b", 0)], [("a", 16)], [("a", 32), ("b", 16), ("c", 0)]]
-    assert [answer.text for answer in answers] == ["a 32", "b 16", "c 0"]
+    assert slow.queries == [[("a", 0), ("b", 0)], [("a", 16)], [("a", 32), ("b", 16), ("c", 0)]]
+    assert [reply.text for reply in answers] == ["a 32", "b 16", "c 0"]
     predictor.close()
 
 
@@ -275,9 +275,9 @@ def test_the_command_drives_groundsg_by_a_predictor_on_two_tasks(words: list[str
     assert "right subgoals" in done.stdout and "points off by" in done.stdout
     for record in records:
         name = f"{record.task}_ep0"
-        written = lines(tmp_path / "subgoals" / f"{name}.jsonl")
-        assert [line["step"] for line in written] == [0, 16] and all(line["oracle"] for line in written)
-        assert Image.open(tmp_path / "subgoals" / written[0]["image"]).size == (256, 256)
+        entries = lines(tmp_path / "subgoals" / f"{name}.jsonl")
+        assert [line["step"] for line in entries] == [0, 16] and all(line["oracle"] for line in entries)
+        assert Image.open(tmp_path / "subgoals" / entries[0]["image"]).size == (256, 256)
         assert (tmp_path / "videos" / record.extra["video"]).stat().st_size > 1000
     if words[0] == "subgoal=oracle":
         assert score.accuracy == 100

@@ -32,29 +32,29 @@ def test_questions_come_at_their_steps_and_late_tasks_wait():
 
 def test_a_conversation_shows_all_that_happened_since():
     predictor, client = predictor_of(says("Press <500, 250>"), says("move <1000, 0> then <1, 999>"))
-    said, _ = play(predictor, started(predictor, video=10), 4)
-    assert said[0].text == "press <128, 64>" and said[0].points == ((128, 64),)
-    assert said[3].text == "move <256, 0> then <0, 255>"
-    (first, config), (second, _) = client.asked
+    subgoals, _ = play(predictor, started(predictor, video=10), 4)
+    assert subgoals[0].text == "press <128, 64>" and subgoals[0].points == ((128, 64),)
+    assert subgoals[3].text == "move <256, 0> then <0, 255>"
+    (first, config), (second, _) = client.requests
     assert kinds(first[0]["parts"]) == ["video/mp4", "image/png", "text"]
     assert "stop the cube" in first[0]["parts"][2]["text"] and "<y, x>" in config["system_instruction"]
-    assert [turn["role"] for turn in second] == ["user", "model", "user"]
+    assert [message["role"] for message in second] == ["user", "model", "user"]
     assert kinds(second[2]["parts"]) == ["video/mp4", "text"]
 
 
-def test_few_new_frames_are_one_picture():
+def test_few_new_frames_are_one_image():
     predictor, client = predictor_of(says("a"), says("b"), interval=3)
     episode = started(predictor)
     predictor.predict([episode])
     episode.observe(frames(3, 1))
     predictor.predict([episode])
-    assert kinds(client.asked[1][0][2]["parts"]) == ["image/png", "text"]
+    assert kinds(client.requests[1][0][2]["parts"]) == ["image/png", "text"]
 
 
 def test_a_report_of_completion_is_no_subgoal():
     predictor, _ = predictor_of(says("press the button"), says("the task is complete"))
-    said, _ = play(predictor, started(predictor), 4)
-    assert said[3].text == "press the button" and not said[3].problem
+    subgoals, _ = play(predictor, started(predictor), 4)
+    assert subgoals[3].text == "press the button" and not subgoals[3].problem
 
 
 @pytest.mark.parametrize(
@@ -72,14 +72,16 @@ def test_a_report_of_completion_is_no_subgoal():
 def test_what_goes_wrong_is_counted_and_never_ends_the_episode(outcome, problem, tries):
     predictor, client = predictor_of(says("press"), *[outcome] * tries, says("lift"), retries=2)
     episode = started(predictor)
-    said, asked = play(predictor, episode, 4)
-    assert (said[3].text, said[3].problem) == ("press", problem)
-    assert predictor.usage.problems == {problem: 1} and len(client.asked) == 1 + tries
+    subgoals, queries = play(predictor, episode, 4)
+    assert (subgoals[3].text, subgoals[3].problem) == ("press", problem)
+    assert predictor.usage.problems == {problem: 1} and len(client.requests) == 1 + tries
     assert predictor.usage.retries == tries - 1
     steps = 1 if problem != "malformed" else 3
-    said, asked = play(predictor, episode, steps)
-    assert said[-1].text == "lift" and asked == [64 if steps == 1 else 96], "asked again at once if nothing was said"
-    assert len(client.asked[-1][0]) == (3 if steps == 1 else 5), "a question without an answer leaves no turn"
+    subgoals, queries = play(predictor, episode, steps)
+    assert subgoals[-1].text == "lift" and queries == [64 if steps == 1 else 96], (
+        "asked again at once if nothing was said"
+    )
+    assert len(client.requests[-1][0]) == (3 if steps == 1 else 5), "a question without an answer leaves no turn"
 
 
 def test_frames_that_a_failed_question_did_not_show_go_with_the_next():
@@ -87,8 +89,8 @@ def test_frames_that_a_failed_question_did_not_show_go_with_the_next():
     episode = started(predictor)
     play(predictor, episode, 1)
     predictor.predict([episode])
-    assert kinds(client.asked[1][0][0]["parts"]) == ["image/png", "text", "video/mp4", "text"]
-    assert len(client.asked[1][0]) == 1, "the question that failed is not part of the conversation"
+    assert kinds(client.requests[1][0][0]["parts"]) == ["image/png", "text", "video/mp4", "text"]
+    assert len(client.requests[1][0]) == 1, "the question that failed is not part of the conversation"
 
 
 def test_a_passing_error_is_tried_again_with_growing_pauses():
@@ -99,7 +101,7 @@ def test_a_passing_error_is_tried_again_with_growing_pauses():
     assert slept == [2, 4] and api.usage.retries == 2 and api.usage.calls == 1
 
 
-def test_a_slow_answer_is_given_up():
+def test_a_slow_reply_is_abandoned():
     over = threading.Event()
     client = Client(lambda: over.wait(30), says("press"))
     api = Api(Settings(timeout=0.05, backoff=0, requests_per_minute=None), Usage(), client)
@@ -127,7 +129,7 @@ def test_a_key_that_is_not_accepted_ends_it_at_once(error):
     predictor, client = predictor_of(error)
     with pytest.raises(UserError, match="GEMINI_API_KEY"):
         predictor.predict([started(predictor)])
-    assert len(client.asked) == 1
+    assert len(client.requests) == 1
 
 
 def test_the_key_stands_in_no_log_and_no_message(caplog, tmp_path):
@@ -139,20 +141,20 @@ def test_the_key_stands_in_no_log_and_no_message(caplog, tmp_path):
         predictor.predict([episode])
     with pytest.raises(UserError) as caught:
         predictor_of(ApiError(403, leak))[0].api.ask("s", [("user", ["q"])])
-    kept = "".join(path.read_text() for path in tmp_path.rglob("*.json"))
-    assert caplog.text and kept and all(SECRET not in text for text in (caplog.text, str(caught.value), kept))
+    content = "".join(path.read_text() for path in tmp_path.rglob("*.json"))
+    assert caplog.text and content and all(SECRET not in text for text in (caplog.text, str(caught.value), content))
     assert "***" in caplog.text
 
 
-def test_answers_are_kept_on_disk_and_cost_nothing_the_second_time(tmp_path):
+def test_replies_are_cached_on_disk_and_cost_nothing_the_second_time(tmp_path):
     first, _ = predictor_of(says("press"), says("lift"), cache=str(tmp_path))
-    said, _ = play(first, started(first), 4)
+    subgoals, _ = play(first, started(first), 4)
     again, client = predictor_of(cache=str(tmp_path))
-    assert [s.text for s in play(again, started(again), 4)[0]] == [s.text for s in said]
-    assert client.asked == [] and again.usage.cached == 2 and again.usage.cost == 0
+    assert [s.text for s in play(again, started(again), 4)[0]] == [s.text for s in subgoals]
+    assert client.requests == [] and again.usage.cached == 2 and again.usage.cost == 0
     other, client = predictor_of(says("x"), cache=str(tmp_path), model="gemini-2.5-flash")
     other.predict([started(other)])
-    assert len(client.asked) == 1, "another model's answers are others"
+    assert len(client.requests) == 1, "another model's answers are others"
 
 
 def test_tokens_and_cost_are_counted_thoughts_included():
@@ -164,14 +166,14 @@ def test_tokens_and_cost_are_counted_thoughts_included():
     assert json.dumps(usage)
 
 
-def test_episodes_are_asked_side_by_side():
-    all_are_asked = threading.Barrier(4, timeout=30)
+def test_episodes_are_queried_side_by_side():
+    all_requested = threading.Barrier(4, timeout=30)
 
-    def answer():
-        all_are_asked.wait()
+    def respond():
+        all_requested.wait()
         return says("a")
 
-    predictor, _ = predictor_of(*[answer] * 4)
+    predictor, _ = predictor_of(*[respond] * 4)
     assert [s.text for s in predictor.predict([started(predictor) for _ in range(4)])] == ["a"] * 4
     assert predictor.usage.calls == 4
 

@@ -70,14 +70,14 @@ def test_a_conversation_over_http(server: Server, caplog: pytest.LogCaptureFixtu
     ]
     predictor = Gemini(backoff=0, retries=1, interval=16, requests_per_minute=None)
     episode = predictor.start_episode("press", np.zeros((8, 64, 64, 3), np.uint8), "StopCube")
-    said = []
+    subgoals = []
     episode.observe(np.zeros((1, 64, 64, 3), np.uint8))
     with caplog.at_level(logging.DEBUG):
         for _ in range(4):
-            said.append(predictor.predict([episode])[0])
+            subgoals.append(predictor.predict([episode])[0])
             episode.observe(np.zeros((16, 64, 64, 3), np.uint8))
-    assert [s.problem for s in said] == ["", "refused", "failed", ""]
-    assert [s.text for s in said] == ["press the button at <128, 64>"] * 3 + ["put it down"]
+    assert [s.problem for s in subgoals] == ["", "refused", "failed", ""]
+    assert [s.text for s in subgoals] == ["press the button at <128, 64>"] * 3 + ["put it down"]
     usage = predictor.usage
     assert (usage.calls, usage.retries, usage.input_tokens, usage.output_tokens) == (3, 2, 900, 300)
     first = server.requests[0]["contents"][0]["parts"]
@@ -87,7 +87,7 @@ def test_a_conversation_over_http(server: Server, caplog: pytest.LogCaptureFixtu
     assert SECRET not in caplog.text
 
 
-def test_a_wrong_key_is_told_at_once(server: Server) -> None:
+def test_a_wrong_key_is_reported_at_once(server: Server) -> None:
     server.answers = [failure(400, "API key not valid. Please pass a valid API key.")]
     predictor = Gemini(requests_per_minute=None)
     episode = predictor.start_episode("press")

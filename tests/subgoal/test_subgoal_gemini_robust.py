@@ -14,17 +14,17 @@ from mme_vla.subgoal.models.api import side_by_side
 
 def test_late_tasks_leave_out_what_came_due_before_their_step():
     predictor, _ = predictor_of(*[says("wait")] * 4)
-    episode, asked = started(predictor, "BinFill"), []
+    episode, queries = started(predictor, "BinFill"), []
     for _ in range(7):
-        asked += [episode.step] if predictor.predict([episode])[0].queried else []
+        queries += [episode.step] if predictor.predict([episode])[0].queried else []
         episode.observe(frames(20, episode.n_observed_frames))
-    assert asked == [0, 100], "the question of step 48 is left out, the one of step 96 is asked at 100"
+    assert queries == [0, 100], "the question of step 48 is left out, the one of step 96 is asked at 100"
 
 
 def test_a_point_that_cannot_be_read_is_counted_and_survived():
     predictor, _ = predictor_of(says("press"), says(f"move to <{'9' * 5000}, 3>"))
-    said, _ = play(predictor, started(predictor), 4)
-    assert (said[3].text, said[3].problem) == ("press", "malformed")
+    subgoals, _ = play(predictor, started(predictor), 4)
+    assert (subgoals[3].text, subgoals[3].problem) == ("press", "malformed")
 
 
 @pytest.mark.parametrize(
@@ -38,15 +38,15 @@ def test_settings_that_cannot_work_are_named(key, value):
 
 
 @pytest.mark.parametrize("damage", ["", "{", "[]", '{"text": "a"}', '{"text": "a", "input_tokens": "x"}'])
-def test_a_damaged_answer_on_disk_is_asked_for_again(damage, tmp_path):
+def test_a_damaged_reply_on_disk_is_requested_again(damage, tmp_path):
     first, _ = predictor_of(says("press"), cache=str(tmp_path))
     first.predict([started(first)])
-    (kept,) = tmp_path.rglob("*.json")
-    whole = kept.read_text()
-    kept.write_text(damage)
+    (cached,) = tmp_path.rglob("*.json")
+    content = cached.read_text()
+    cached.write_text(damage)
     again, client = predictor_of(says("press"), cache=str(tmp_path))
     assert again.predict([started(again)])[0].text == "press"
-    assert len(client.asked) == 1 and again.usage.cached == 0 and kept.read_text() == whole
+    assert len(client.requests) == 1 and again.usage.cached == 0 and cached.read_text() == content
     assert [path.suffix for path in tmp_path.rglob("*.*")] == [".json"]
 
 
@@ -60,9 +60,9 @@ def test_a_clip_is_encoded_once_however_many_questions_show_it(monkeypatch):
     monkeypatch.setattr("mme_vla.subgoal.models.connection.video_bytes", count)
     predictor, client = predictor_of(*[says("a")] * 4)
     play(predictor, started(predictor, video=10), 10)
-    assert len(client.asked) == 4 and [shape[0] for shape in encoded] == [10, 48, 48, 48]
-    last = client.asked[-1][0]
-    assert [turn["role"] for turn in last] == ["user", "model"] * 3 + ["user"]
+    assert len(client.requests) == 4 and [shape[0] for shape in encoded] == [10, 48, 48, 48]
+    last = client.requests[-1][0]
+    assert [message["role"] for message in last] == ["user", "model"] * 3 + ["user"]
     assert kinds(last[2]["parts"]) == kinds(last[4]["parts"]) == ["video/mp4", "text"]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from helpers.chat_server import Answer, ChatServer, chat_server, failure, says
+from helpers.chat_server import ChatServer, Reply, chat_server, failure, says
 from mme_vla.errors import UserError
 from mme_vla.subgoal import NotebookPredictor, build_predictor
 from mme_vla.subgoal.notebook import MONITOR, Count, Identity, Notebook, Route, read_notes
@@ -25,13 +25,13 @@ def frames(count: int, first: int = 0) -> np.ndarray:
 # Notes --------------------------------------------------------------------------------------------------------------
 
 
-def test_notes_of_every_kind_are_read_and_told_in_words() -> None:
-    given = [
+def test_notes_of_every_kind_are_read_and_reported_in_words() -> None:
+    notes = [
         COUNT,
         {"kind": "identity", "name": "red cube's container", "words": "the left\n one"},
         {"kind": "route", "name": "pattern", "steps": ["left", "forward"], "done": 1},
     ]
-    book = Notebook().with_entries(read_notes(given), None)
+    book = Notebook().with_entries(read_notes(notes), None)
     assert book.notes == {
         "placed": Count(0), "red cube's container": Identity("the left one"), "pattern": Route(("left", "forward"), 1),
     }  # fmt: skip
@@ -98,16 +98,16 @@ class Model:
     """Sees a subgoal complete where the newest image is bright, and counts; keeps what it was asked."""
 
     def __init__(self, server: ChatServer) -> None:
-        self.asked: list[str] = []
+        self.queries: list[str] = []
         self.done = False
         self.value = 0
-        server.answer = self.answer
+        server.respond = self.respond
 
-    def answer(self, request: dict[str, Any]) -> Answer:
-        system, turn = request["messages"]
+    def respond(self, request: dict[str, Any]) -> Reply:
+        system, message = request["messages"]
         monitor = system["content"] == MONITOR
-        self.asked.append("monitor" if monitor else "planner")
-        self.said = turn["content"][-1]["text"]
+        self.queries.append("monitor" if monitor else "planner")
+        self.message = message["content"][-1]["text"]
         if monitor:
             return says(json.dumps({"why": "", "done": self.done}))
         note = {**COUNT, "value": self.value}
@@ -123,46 +123,48 @@ def server() -> Iterator[ChatServer]:
 
 def predictor_for(server: ChatServer | None, **options: Any) -> NotebookPredictor:
     where = {} if server is None else {"base_url": server.url}
-    given = {"name": "notebook", "key_variable": None, **where, **QUICK, **options}
-    built = build_predictor(given)
+    options_ = {"name": "notebook", "key_variable": None, **where, **QUICK, **options}
+    built = build_predictor(options_)
     assert isinstance(built, NotebookPredictor)
     return built
 
 
-def test_nothing_is_written_and_no_subgoal_given_before_the_monitor_agrees(server: ChatServer) -> None:
+def test_nothing_is_noted_and_no_subgoal_returned_before_the_monitor_confirms(server: ChatServer) -> None:
     model, predictor = Model(server), predictor_for(server, kind="grounded")
     episode = predictor.start_episode("Pick it up twice", frames(20), "PickXtimes")
     episode.observe(frames(1))
     first = predictor.predict([episode])[0]
-    assert first.text == "pick up the red cube at <25, 128>" and model.asked == ["planner"]
+    assert first.text == "pick up the red cube at <25, 128>" and model.queries == ["planner"]
     assert episode.notebook.notes == {"placed": Count(0)} and episode.notebook.finished == ()
     model.value = 7  # which would be refused, if it were asked for
     for _ in range(3):
         episode.observe(frames(16))
         assert predictor.predict([episode])[0].text == first.text
-    assert model.asked[1:] == ["monitor"] * 3 and episode.notebook.notes == {"placed": Count(0)}
+    assert model.queries[1:] == ["monitor"] * 3 and episode.notebook.notes == {"placed": Count(0)}
     model.done, model.value = True, 1
     episode.observe(frames(16))
     assert predictor.predict([episode])[0].text == "pick up the red cube at <25, 128>"
-    assert model.asked[4:] == ["monitor", "planner"]
+    assert model.queries[4:] == ["monitor", "planner"]
     assert episode.notebook.notes == {"placed": Count(1)} and episode.notebook.finished == (first.text,)
-    assert "- count, placed: 0" in model.said and f"The subgoal {first.text!r} is complete" in model.said
+    assert "- count, placed: 0" in model.message and f"The subgoal {first.text!r} is complete" in model.message
     assert predictor.usage.problems == {}
 
 
-def test_a_note_that_cannot_be_leaves_notebook_and_subgoal_and_is_asked_for_again(server: ChatServer) -> None:
+def test_a_note_that_cannot_be_leaves_notebook_and_subgoal_and_is_requested_again(server: ChatServer) -> None:
     model, predictor = Model(server), predictor_for(server)
     episode = predictor.start_episode("go", None, "PickXtimes")
     episode.observe(frames(1))
     first = predictor.predict([episode])[0]
     model.done, model.value = True, 5
     episode.observe(frames(16))
-    kept = predictor.predict([episode])[0]
-    assert (kept.text, kept.problem) == (first.text, "malformed") and episode.notebook.notes == {"placed": Count(0)}
+    subgoal = predictor.predict([episode])[0]
+    assert (subgoal.text, subgoal.problem) == (first.text, "malformed") and episode.notebook.notes == {
+        "placed": Count(0)
+    }
     model.value = 1
     episode.observe(frames(16))
     assert predictor.predict([episode])[0].problem == "" and episode.notebook.notes == {"placed": Count(1)}
-    assert model.asked == ["planner", "monitor", "planner", "planner"], "the monitor had agreed already"
+    assert model.queries == ["planner", "monitor", "planner", "planner"], "the monitor had agreed already"
 
 
 def test_whatever_goes_wrong_keeps_the_subgoal_and_is_counted(server: ChatServer) -> None:
@@ -170,42 +172,44 @@ def test_whatever_goes_wrong_keeps_the_subgoal_and_is_counted(server: ChatServer
     episode = predictor.start_episode("go")
     episode.observe(frames(1))
     first = predictor.predict([episode])[0].text
-    for answer in (
+    for reply in (
         says("perhaps"),
         says('{"done": "yes"}'),
         says(None),
         failure(503, "busy"),
         says("", "content_filter"),
     ):
-        server.answer = lambda request, answer=answer: answer
+        server.respond = lambda request, reply=reply: reply
         episode.observe(frames(16))
         assert predictor.predict([episode])[0].text == first
     assert predictor.usage.problems == {"malformed": 2, "empty": 1, "failed": 1, "refused": 1}
-    server.answer, model.done, model.value = model.answer, True, 1
+    server.respond, model.done, model.value = model.respond, True, 1
     episode.observe(frames(16))
     assert predictor.predict([episode])[0].problem == "" and len(episode.since) == 0
 
 
-def test_a_whole_episode_is_replayed_from_its_cache_without_key_and_server(tmp_path: Path) -> None:
+def test_a_full_episode_is_replayed_from_its_cache_without_key_and_server(tmp_path: Path) -> None:
     pytest.importorskip("openai", reason="needs the extra openai")
 
-    def whole(server: ChatServer | None, model: Model | None = None) -> tuple[list[Any], NotebookPredictor, Notebook]:
+    def episode_run(
+        server: ChatServer | None, model: Model | None = None
+    ) -> tuple[list[Any], NotebookPredictor, Notebook]:
         key = {} if server is not None else {"key_variable": "A_KEY_THAT_IS_NOT_SET"}
         predictor = predictor_for(server, cache=str(tmp_path), **key)
         episodes = [predictor.start_episode("go", frames(9), "BinFill"), predictor.start_episode("run", None)]
-        heard = []
+        subgoals = []
         for step in range(4):
             if model is not None:
                 model.done, model.value = step in (2, 3), max(step - 1, 0)
             for i, episode in enumerate(episodes):
                 episode.observe(frames(1 if step == 0 else 16, first=50 * i + 16 * step))
-            heard += [subgoal.text for subgoal in predictor.predict(episodes)]
-        return heard, predictor, episodes[0].notebook
+            subgoals += [subgoal.text for subgoal in predictor.predict(episodes)]
+        return subgoals, predictor, episodes[0].notebook
 
     with chat_server() as server:
-        heard, first, notes = whole(server, Model(server))
-    again, second, same = whole(None)
-    assert again == heard and same == notes and notes.notes == {"placed": Count(2)}
+        subgoals, first, notes = episode_run(server, Model(server))
+    again, second, same = episode_run(None)
+    assert again == subgoals and same == notes and notes.notes == {"placed": Count(2)}
     assert (first.usage.calls, second.usage.calls, second.usage.cached) == (12, 0, 12)
 
 

@@ -51,25 +51,25 @@ def test_a_conversation_over_http(server: ChatServer, caplog: pytest.LogCaptureF
     predictor = OpenAI(base_url=server.url, retries=1, interval=16, input_price=1.0, output_price=2.0, **QUICK)
     episode = predictor.start_episode("press", frames(30), "StopCube")
     episode.observe(frames(1))
-    heard = []
+    subgoals = []
     with caplog.at_level(logging.DEBUG):
         for _ in range(4):
-            heard.append(predictor.predict([episode])[0])
+            subgoals.append(predictor.predict([episode])[0])
             episode.observe(frames(16))
-    assert [s.problem for s in heard] == ["", "refused", "failed", ""]
-    assert [s.text for s in heard] == ["press the button at <128, 64>"] * 3 + ["put it down"]
+    assert [s.problem for s in subgoals] == ["", "refused", "failed", ""]
+    assert [s.text for s in subgoals] == ["press the button at <128, 64>"] * 3 + ["put it down"]
     usage = predictor.usage
     assert (usage.calls, usage.retries, usage.input_tokens, usage.output_tokens) == (3, 2, 900, 300)
     assert usage.cost == pytest.approx((900 * 1.0 + 300 * 2.0) / 1e6)
     assert set(server.keys) == {f"Bearer {SECRET}"} and SECRET not in caplog.text
-    system, *turns = server.requests[-1]["messages"]
+    system, *messages = server.requests[-1]["messages"]
     assert system["role"] == "system" and "subgoal" in system["content"]
-    assert [turn["role"] for turn in turns] == ["user", "assistant", "user"]
-    assert isinstance(turns[1]["content"], str), "a model's own words go back as a text"
+    assert [turn["role"] for turn in messages] == ["user", "assistant", "user"]
+    assert isinstance(messages[1]["content"], str), "a model's own words go back as a text"
     assert "temperature" not in server.requests[0]
 
 
-def test_a_video_is_shown_as_pictures_out_of_it(server: ChatServer) -> None:
+def test_a_video_is_sent_as_sampled_images(server: ChatServer) -> None:
     server.answers = [subgoal("press")]
     predictor = OpenAI(base_url=server.url, video_frames=4, temperature=0.0, **QUICK)
     episode = predictor.start_episode("press", frames(31), "StopCube")
@@ -79,7 +79,7 @@ def test_a_video_is_shown_as_pictures_out_of_it(server: ChatServer) -> None:
     urls = [part["image_url"]["url"] for part in content if part["type"] == "image_url"]
     assert "A video of 31 frames; 4 of them in order:" in content[0]["text"]
     pixels = [np.asarray(Image.open(io.BytesIO(base64.b64decode(url.split(",")[1])))) for url in urls]
-    assert [int(picture[0, 0, 0]) for picture in pixels] == [0, 10, 20, 30, 200]
+    assert [int(image[0, 0, 0]) for image in pixels] == [0, 10, 20, 30, 200]
     assert server.requests[0]["temperature"] == 0.0
 
 
@@ -105,7 +105,7 @@ def test_answers_are_replayed_from_the_cache_without_a_key_or_a_server(
     assert first_subgoal(base_url=server.url, model="another")[0] == "another model's"
 
 
-def test_an_endpoint_that_asks_for_no_key_is_given_none(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endpoint_without_a_key_gets_none(server: ChatServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OPENAI_API_KEY")
     server.answers = [subgoal("press")]
     config = {"name": "openai", "base_url": server.url, "key_variable": None, **QUICK}
@@ -152,9 +152,9 @@ def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_player_speaks_to_the_same_endpoints(server: ChatServer) -> None:
     options = (SimpleNamespace(label="a", action="press", needs_point=True),)
-    picture = np.zeros((256, 256, 3), np.uint8)
+    image = np.zeros((256, 256, 3), np.uint8)
     session: Any = SimpleNamespace(
-        goal="press", options=options, decisions=[], frame=picture, reveals=[SimpleNamespace(frames=[picture] * 6)]
+        goal="press", options=options, decisions=[], frame=image, reveals=[SimpleNamespace(frames=[image] * 6)]
     )
     server.answers = [says("I see it."), says('{"choice": "a", "point": [500, 250]}')]
     player = OpenAIPlayer(base_url=server.url, **QUICK)

@@ -71,7 +71,7 @@ def test_the_oracle_says_what_the_environment_reports_and_keeps_it_at_the_end():
         oracle.predict([episode])
 
 
-def test_questions_carry_goal_history_points_picture_and_video():
+def test_questions_carry_goal_history_points_image_and_video():
     vlm = Scripted("pick at <|box_start|>(390,706)<|box_end|>", "put it down")
     predictor = QwenVL("grounded", vlm=vlm)
     episode = at_start(predictor, video=40)
@@ -85,15 +85,20 @@ def test_questions_carry_goal_history_points_picture_and_video():
     assert "grounded language subgoals" in second.system
 
 
-def test_many_episodes_are_asked_in_one_batch_and_only_those_that_are_due():
+def test_many_episodes_are_queried_in_one_batch_and_only_those_that_are_due():
     vlm = Scripted("press the button", "pick it up", "put it down")
     predictor = QwenVL("simple", vlm=vlm)
-    held, other = at_start(predictor, task="ButtonUnmask"), at_start(predictor)
-    assert [s.text for s in predictor.predict([held, other])] == ["press the button", "pick it up"]
-    advance(held)
+    waiting, other = at_start(predictor, task="ButtonUnmask"), at_start(predictor)
+    assert [s.text for s in predictor.predict([waiting, other])] == ["press the button", "pick it up"]
+    advance(waiting)
     advance(other)
-    kept, new = predictor.predict([held, other])
-    assert (kept.text, kept.queried, new.text, new.queried) == ("press the button", False, "put it down", True)
+    unchanged, new = predictor.predict([waiting, other])
+    assert (unchanged.text, unchanged.queried, new.text, new.queried) == (
+        "press the button",
+        False,
+        "put it down",
+        True,
+    )
     assert [len(batch) for batch in vlm.batches] == [2, 1]
     assert predictor.usage.calls == 3 and predictor.usage.input_tokens == 300 and predictor.usage.output_tokens == 21
 
@@ -102,26 +107,26 @@ def test_holding_ends_after_its_time():
     vlm = Scripted("press the first button", "press the second button", *["pick up the container"] * 4)
     predictor = QwenVL("simple", vlm=vlm)
     episode = at_start(predictor, task="ButtonUnmaskSwap")
-    asked_at = []
+    query_steps = []
     for _ in range(20):
         if predictor.predict([episode])[0].queried:
-            asked_at.append(episode.step)
+            query_steps.append(episode.step)
         advance(episode)
-    assert asked_at[:3] == [0, 112, 256], "held up to step 100, then up to step 250"
+    assert query_steps[:3] == [0, 112, 256], "held up to step 100, then up to step 250"
 
 
-def test_the_interval_says_how_often_to_ask():
+def test_the_interval_says_how_frequently_to_ask():
     predictor = QwenVL("simple", interval=32, vlm=Scripted("a", "b"))
     episode = at_start(predictor)
-    asked = []
+    queries = []
     for _ in range(4):
-        asked.append(predictor.predict([episode])[0].queried)
+        queries.append(predictor.predict([episode])[0].queried)
         advance(episode)
-    assert asked == [True, False, True, False]
+    assert queries == [True, False, True, False]
 
 
 @pytest.mark.parametrize(("answer", "problem"), [("", "empty"), ("pick <|box_start|>(1", "malformed")])
-def test_an_unusable_answer_keeps_the_last_subgoal_and_is_counted(answer, problem, caplog):
+def test_an_unusable_reply_keeps_the_last_subgoal_and_is_counted(answer, problem, caplog):
     predictor = QwenVL("grounded", vlm=Scripted(answer, "press", answer))
     episode = at_start(predictor)
     assert predictor.predict([episode])[0].text is None, "there is none to keep"
@@ -146,20 +151,20 @@ def test_memer_shows_recent_frames_and_the_keyframes_it_chose():
     vlm = Scripted(*answers)
     predictor = Memer("grounded", vlm=vlm)
     episode = at_start(predictor, video=30)
-    said, shown = [], []
+    subgoals, frames = [], []
     for _ in answers:
-        said.append(predictor.predict([episode])[0])
-        shown.append([int(image[0, 0, 0]) for image in vlm.batches[-1][0].images])
+        subgoals.append(predictor.predict([episode])[0])
+        frames.append([int(image[0, 0, 0]) for image in vlm.batches[-1][0].images])
         advance(episode)
-    assert shown == [
+    assert frames == [
         [0],
         [0, *range(2, 17, 2)],
         [8, *range(18, 33, 2)],
         [8, *range(34, 49, 2)],
         [8, 34, 48, *range(50, 65, 2)],
     ], "0 and 8 are so near that only the later of the two stays"
-    assert [s.text for s in said] == ["pick", "pick at <128, 128>", "pick at <128, 128>", "put", "put"]
-    assert [s.problem for s in said] == ["", "", "malformed", "", ""]
+    assert [s.text for s in subgoals] == ["pick", "pick at <128, 128>", "pick at <128, 128>", "put", "put"]
+    assert [s.problem for s in subgoals] == ["", "", "malformed", "", ""]
     assert vlm.batches[1][0].user.count("<image>") == 9 and "setup: <video>" in vlm.batches[1][0].user
 
 
@@ -171,7 +176,7 @@ def test_an_episode_without_a_frame_is_refused():
             predictor.start_episode("goal").observe(np.zeros((1, 8, 8, 3)))
 
 
-def test_a_tiny_model_reads_conversations_as_qwen_writes_them(tiny):
+def test_a_tiny_model_reads_conversations_in_qwens_format(tiny):
     question = Question(
         "be brief", "<video>go\n<image>at <|box_start|>(1,2)<|box_end|>", [frames(1)[0]], [Clip.of(frames(66))]
     )
@@ -187,11 +192,11 @@ def test_a_tiny_model_reads_conversations_as_qwen_writes_them(tiny):
     assert tiny.processor.tokenizer.decode(large["input_ids"][0]).count("<|image_pad|>") <= 256
 
 
-def test_answers_do_not_depend_on_what_is_asked_beside(tiny):
+def test_replies_do_not_depend_on_what_is_queried_beside(tiny):
     questions = [Question("s", "<image>" + "pick up the red cube " * n, [frames(1, 9 * n)[0]]) for n in (1, 7, 3)]
     together = tiny.generate(questions, 12)
     assert together == [tiny.generate([question], 12)[0] for question in questions]
-    assert all(answer.output_tokens <= 12 for answer in together)
+    assert all(reply.output_tokens <= 12 for reply in together)
 
 
 def test_marks_of_points_survive_decoding(tiny):
@@ -243,11 +248,11 @@ def test_every_key_of_the_yaml_files_is_an_option_and_every_option_a_key():
 
 def steps_asked(predictor, execute, chunks, task=""):
     episode = at_start(predictor, task=task)
-    asked = []
+    steps = []
     for _ in range(chunks):
-        asked += [episode.step] if predictor.predict([episode])[0].queried else []
+        steps += [episode.step] if predictor.predict([episode])[0].queried else []
         advance(episode, execute)
-    return asked
+    return steps
 
 
 @pytest.mark.parametrize(
@@ -264,21 +269,21 @@ def test_no_question_is_dropped_whatever_the_length_of_a_chunk(interval, execute
     assert steps_asked(predictor, execute, -(-160 // execute) + (execute == 20)) == expected
 
 
-def test_what_came_due_while_a_subgoal_was_held_is_left_out():
+def test_what_came_due_while_a_subgoal_was_fixed_is_left_out():
     predictor = QwenVL("simple", interval=48, vlm=Scripted("press", "pick", "put"))
     assert steps_asked(predictor, 16, 12, "ButtonUnmask") == [0, 96, 144]
     predictor = QwenVL("simple", interval=32, vlm=Scripted(*["press the first button"] * 3))
     assert steps_asked(predictor, 16, 9, "ButtonUnmaskSwap") == [0, 128], "112 would answer what came due at 96"
 
 
-def test_an_episode_that_is_joined_late_is_asked_at_once():
+def test_an_episode_that_is_joined_late_is_queried_at_once():
     predictor = QwenVL("simple", interval=48, vlm=Scripted("a"))
     episode = predictor.start_episode("goal")
     episode.observe(frames(21))
     assert predictor.predict([episode])[0].queried and episode.query_step == 20
 
 
-def test_a_predictor_knows_the_plain_options_it_was_built_from():
+def test_a_predictor_knows_the_options_it_was_built_from():
     section = {"name": "memer", "kind": "simple", "recent": 4, "vlm": Scripted()}
     assert build_predictor(section).settings == {"kind": "simple", "recent": 4}
     assert Oracle().settings == {}

@@ -18,7 +18,7 @@ def facts_of(predictor) -> dict:
     return run_settings(quick_policy("simplesg"), FACTS, RolloutSettings(), predictor)["subgoal"]
 
 
-def test_whatever_decides_what_a_predictor_says_is_part_of_the_run() -> None:
+def test_whatever_decides_what_a_predictor_says_belongs_to_the_run() -> None:
     base = {"name": "gemini", "client": object(), "model": "a", "wait": 75, "temperature": 0.0, "interval": 48}
     facts = facts_of(build_predictor(base))
     assert facts["model"] == "a" and "client" not in facts
@@ -42,7 +42,7 @@ def test_a_model_of_subgoals_is_known_by_the_end_of_its_path() -> None:
     assert facts_of(oracle) != facts_of(there)
 
 
-def test_a_checkpoint_written_as_text_is_the_same_number(tmp_path: Path) -> None:
+def test_a_checkpoint_saved_as_text_is_the_same_number(tmp_path: Path) -> None:
     from mme_vla.evaluation.rollout.evaluation import _done
 
     facts = FACTS.__class__("tiny", "80000", 42)
@@ -63,14 +63,16 @@ def test_subgoals_and_policies_must_go_together(caplog: pytest.LogCaptureFixture
 def test_a_predictor_on_auto_runs_on_the_policys_device(monkeypatch: pytest.MonkeyPatch) -> None:
     import mme_vla.subgoal as module
 
-    seen = []
-    monkeypatch.setattr(module, "build_predictor", lambda section: seen.append(section["device"]) or Oracle("simple"))
+    devices = []
+    monkeypatch.setattr(
+        module, "build_predictor", lambda section: devices.append(section["device"]) or Oracle("simple")
+    )
     for name in ("auto", "cpu"):
         choose_subgoals(quick_policy("simplesg"), {"name": "qwenvl", "device": name}, device=torch.device("cuda", 3))
-    assert seen == ["cuda:3", "cpu"]
+    assert devices == ["cuda:3", "cpu"]
 
 
-def test_what_a_predictor_did_is_told_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
+def test_what_a_predictor_did_is_reported_in_one_line(caplog: pytest.LogCaptureFixture) -> None:
     usage = Usage(calls=1200, retries=2, input_tokens=34567, cost=1.5)
     usage.problems["malformed"] = 3
     with caplog.at_level("INFO"):

@@ -39,11 +39,11 @@ def figures(shared):
     listings = re.findall(
         r"Example Prompt for [^\n]*\n.*?\\begin\{lstlisting\}.*?\n(.*?)\\end\{lstlisting\}", source, re.S
     )
-    found = []
+    rows = []
     for text in listings[:3]:
         without_trailing_commas = re.sub(r",(\s*[\]}])", r"\1", text)
-        found.append([message["content"] for message in json.loads(without_trailing_commas)["messages"]])
-    return dict(zip(("simple", "grounded", "memer"), found, strict=True))
+        rows.append([message["content"] for message in json.loads(without_trailing_commas)["messages"]])
+    return dict(zip(("simple", "grounded", "memer"), rows, strict=True))
 
 
 @pytest.mark.parametrize("kind", ["simple", "grounded"])
@@ -58,14 +58,14 @@ def test_prompts_are_the_papers(figures, kind):
 
 
 def test_memer_prompts_are_the_papers(figures):
-    system, user, answer = figures["memer"]
+    system, user, reply = figures["memer"]
     goal = re.search(r"The task goal is: (.*)\n", user)[1]
     assert memer_system() == system
     assert memer_user(goal, 4, 8, video=True) == user
-    assert memer_reply("pick up the correct cube at <bbox> for the third time", [4]) == answer
+    assert memer_reply("pick up the correct cube at <bbox> for the third time", [4]) == reply
 
 
-def test_a_first_turn_has_no_history_and_no_video_mark():
+def test_a_first_message_has_no_history_and_no_video_mark():
     text = subgoal_user("simple", "press the button", [], video=False)
     assert text.startswith("The task goal is: press the button\nThis is the initial turn for prediction\n<image>")
     assert split_media(text)[1] == "<image>"
@@ -106,8 +106,8 @@ def test_prompted_answers_are_read_as_released(golden):
 
 def test_labels_give_up_their_points_as_released(golden):
     inputs = ["pick at <12, 200>", "press", "from <1, 2> at <3, 4> at <5, 6>"]
-    for text, (marked, points) in zip(inputs, golden["training_grounded_preprocess"], strict=True):
-        assert mark_points(text) == (marked, [tuple(p) for p in points])
+    for text, (stripped, points) in zip(inputs, golden["training_grounded_preprocess"], strict=True):
+        assert mark_points(text) == (stripped, [tuple(p) for p in points])
 
 
 @pytest.mark.parametrize(
@@ -120,17 +120,17 @@ def test_labels_give_up_their_points_as_released(golden):
         "at <|box_start|>(1,1001)<|box_end|>",
     ],
 )
-def test_a_damaged_answer_is_named_so(answer):
+def test_a_damaged_reply_is_named_so(answer):
     with pytest.raises(MalformedReply):
         parse_subgoal(answer)
 
 
 def test_memer_answers():
     box = "<|box_start|>(500,250)<|box_end|>"
-    answer = f'```json\n{{"current_subtask": "pick at {box}", "keyframe_positions": [9, 3, 3, 0]}}```'
-    parsed, positions = parse_memer(answer, 8)
+    reply = f'```json\n{{"current_subtask": "pick at {box}", "keyframe_positions": [9, 3, 3, 0]}}```'
+    parsed, positions = parse_memer(reply, 8)
     assert (parsed.text, parsed.points, positions) == ("pick at <128, 64>", ((128, 64),), [3])
-    for answer in (
+    for reply in (
         "no",
         "{",
         '{"keyframe_positions": []}',
@@ -138,10 +138,10 @@ def test_memer_answers():
         "[1]",
     ):
         with pytest.raises(MalformedReply):
-            parse_memer(answer, 8)
+            parse_memer(reply, 8)
 
 
-def test_a_prompted_answer_may_carry_what_it_likes_around_it():
+def test_a_prompted_reply_may_carry_what_it_likes_around_it():
     assert parse_gemini('Sure!\n{"subgoal_sequence": ["a", "b"],\n "subgoal": "press the button"}\nGood luck') == (
         "press the button"
     )

@@ -41,12 +41,12 @@ def tiny():
 
 
 def settings(data, output, **words):
-    given = {
+    options = {
         "rows": data / "grounded.jsonl", "output": output, "vlm": "tiny", "steps": 14, "batch": 2, "lr": 1e-2,
         "per_device_batch": 1, "workers": 0, "log_every": 1, "save_every": 7, "report_to": "null", "device": "cpu",
         "gradient_checkpointing": "false", **words,
     }  # fmt: skip
-    return compose("subgoal_train", [f"{key}={value}" for key, value in given.items()])
+    return compose("subgoal_train", [f"{key}={value}" for key, value in options.items()])
 
 
 def losses(output):
@@ -54,7 +54,7 @@ def losses(output):
     return [entry["loss"] for entry in state["log_history"] if "loss" in entry]
 
 
-def test_points_of_a_row_go_to_the_question_first_and_to_the_answer_then():
+def test_points_of_a_row_go_to_the_question_first_and_to_the_reply_then():
     row = {
         "messages": [{"content": "s"}, {"content": "1. at <bbox>"}, {"content": "at <bbox>"}],
         "objects": {"ref": [], "bbox": [[128, 64], [0, 255]]},
@@ -64,7 +64,7 @@ def test_points_of_a_row_go_to_the_question_first_and_to_the_answer_then():
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_only_the_answer_is_learnt(name, data, tiny):
+def test_only_the_reply_is_learnt(name, data, tiny):
     collate = Collator(tiny)
     rows = read_rows(data / f"{name}.jsonl")
     questions = [question_of(rows[i], data) for i in (0, len(rows) - 1)]
@@ -84,9 +84,9 @@ def test_training_and_prediction_ask_in_the_same_words(data, tiny):
     video = np.zeros((question.videos[0].length, *question.images[0].shape), np.uint8)
     episode = predictor.start_episode(goal, video)
     episode.observe(question.images[0][None])
-    asked = predictor.question(episode)
-    assert (asked.system, asked.user) == (question.system, question.user)
-    prompt, learnt = tiny.encode([asked])["input_ids"][0], Collator(tiny)([question])
+    query = predictor.question(episode)
+    assert (query.system, query.user) == (question.system, question.user)
+    prompt, learnt = tiny.encode([query])["input_ids"][0], Collator(tiny)([question])
     start = int((learnt["labels"][0] != IGNORED).nonzero()[0])
     assert prompt.tolist() == learnt["input_ids"][0][:start].tolist()
 
@@ -97,8 +97,8 @@ def test_rows_that_are_too_long_are_left_out(data, tiny):
     everything = RowDataset(file, tokenizer)
     assert len(everything) == len(lengths) and everything.left_out == 0
     limit = int(np.median(lengths))
-    kept = RowDataset(file, tokenizer, limit)
-    assert 0 < len(kept) <= sum(n <= limit for n in lengths) and kept.left_out > 0
+    rows = RowDataset(file, tokenizer, limit)
+    assert 0 < len(rows) <= sum(n <= limit for n in lengths) and rows.left_out > 0
     with pytest.raises(UserError, match="max_length=10"):
         RowDataset(file, tokenizer, 10)
 
@@ -114,7 +114,7 @@ def test_rows_are_a_hugging_face_dataset(data):
     assert np.array_equal(np.asarray(one["images"][0].convert("RGB")), read_image(data / rows[-1]["images"][0]))
 
 
-def test_damaged_rows_and_missing_pictures_are_named(tmp_path, data):
+def test_damaged_rows_and_missing_images_are_named(tmp_path, data):
     (tmp_path / "rows.jsonl").write_text('{"messages": []}\n')
     with pytest.raises(UserError, match="line 1"):
         read_rows(tmp_path / "rows.jsonl")
@@ -124,10 +124,10 @@ def test_damaged_rows_and_missing_pictures_are_named(tmp_path, data):
         question_of(read_rows(data / "simple.jsonl")[0], tmp_path)
 
 
-def test_the_whole_path_learns_resumes_and_predicts(data, tmp_path):
+def test_the_full_path_learns_resumes_and_predicts(data, tmp_path):
     straight = fine_tune(settings(data, tmp_path / "straight"))
-    found = losses(tmp_path / "straight")
-    assert np.mean(found[-5:]) < 0.5 * found[0], found
+    values = losses(tmp_path / "straight")
+    assert np.mean(values[-5:]) < 0.5 * values[0], values
     with pytest.raises(UserError, match="resume=auto"):
         fine_tune(settings(data, tmp_path / "straight"))
 
@@ -137,7 +137,7 @@ def test_the_whole_path_learns_resumes_and_predicts(data, tmp_path):
     halved.mkdir()
     (tmp_path / "checkpoint-7").rename(halved / "checkpoint-7")
     fine_tune(settings(data, halved, resume="auto"))
-    assert losses(halved) == pytest.approx(found, rel=1e-4), "the resumed run ends as the straight one"
+    assert losses(halved) == pytest.approx(values, rel=1e-4), "the resumed run ends as the straight one"
 
     subgoals = {}
     for adapter in (None, str(straight)):
@@ -151,7 +151,7 @@ def test_the_whole_path_learns_resumes_and_predicts(data, tmp_path):
     assert "pick up" in subgoals[str(straight)].reply or "container" in subgoals[str(straight)].reply
 
 
-def test_the_effective_batch_is_what_was_asked_for():
+def test_the_effective_batch_is_what_was_requested():
     assert accumulation(64, 4, 4) == 4 and accumulation(48, 4, 4) == 3 and accumulation(64, 4, 1) == 16
     with pytest.raises(UserError, match="no multiple"):
         accumulation(64, 4, 3)

@@ -28,14 +28,14 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_a_run_and_latest_stand_for_their_newest_checkpoint(runs: Path, tmp_path: Path) -> None:
-    given = MMEPolicy.from_pretrained(runs / "first" / "checkpoints" / "step_000002").state_dict()
+    state = MMEPolicy.from_pretrained(runs / "first" / "checkpoints" / "step_000002").state_dict()
     for place in (runs / "latest", runs / "first", runs / "first" / "checkpoints"):
         assert open_source(place).folder.name == "step_000002", place
     loaded = MMEPolicy.from_pretrained(str(runs / "latest"))
-    assert all(torch.equal(value, given[name]) for name, value in loaded.state_dict().items())
+    assert all(torch.equal(value, state[name]) for name, value in loaded.state_dict().items())
     convert(runs / "latest", tmp_path / "converted")
     again = MMEPolicy.from_pretrained(tmp_path / "converted")
-    assert all(torch.equal(value, given[name]) for name, value in again.state_dict().items())
+    assert all(torch.equal(value, state[name]) for name, value in again.state_dict().items())
 
 
 def test_latest_of_nothing_is_no_checkpoint_and_no_repository(tmp_path: Path) -> None:
@@ -51,8 +51,8 @@ def test_a_list_of_memories_in_a_file_says_where_its_keys_are(tmp_path: Path) ->
     (tmp_path / "model" / "both.yaml").write_text(head + "name: both\nmemory: [framesamp, ttt]\n")
     keyed = "  - /memory: joined\nname: keyed\nmemory: {members: [framesamp, ttt]}\n"
     (tmp_path / "model" / "keyed.yaml").write_text(head + keyed)
-    plain = compose("policy", ["model=both"], extra_dirs=[tmp_path]).memory
-    assert plain == compose("policy", ["model=keyed"], extra_dirs=[tmp_path]).memory
+    single = compose("policy", ["model=both"], extra_dirs=[tmp_path]).memory
+    assert single == compose("policy", ["model=keyed"], extra_dirs=[tmp_path]).memory
     with pytest.raises(UserError, match=r"'memory.budget=256'.*list \[framesamp, ttt\].*`/memory: joined`.*memory=\["):
         compose("policy", ["model=both", "memory.budget=256"], extra_dirs=[tmp_path])
     for words in (["model=keyed"], ["model=framesamp_ttt_modul"], ["memory=[framesamp,ttt]"]):
@@ -67,8 +67,8 @@ def test_a_joined_memory_takes_the_member_that_a_released_run_holds(released: st
     joined = small_policy("framesamp_ttt_modul", seed=2, memory={"members": members})
     before = {name: value.clone() for name, value in joined.state_dict().items()}
     start = transfer(joined, tmp_path)
-    after, theirs = joined.state_dict(), alone.memory.state_dict()
-    for name, value in theirs.items():
+    after, other_state = joined.state_dict(), alone.memory.state_dict()
+    for name, value in other_state.items():
         assert torch.equal(after[f"memory.members.{place}.{name}"], value), name
     other = [name for name in after if name.startswith(f"memory.members.{1 - place}.")]
     assert other and all(torch.equal(after[name], before[name]) for name in other), "the other one stays as it was"

@@ -66,17 +66,17 @@ def test_average_is_exchanged_in_and_out() -> None:
 
 def test_every_epoch_sees_each_sample_once_in_a_new_order() -> None:
     order = BatchOrder(12, 4, seed=0, steps=range(6))
-    seen = [order.batch(step) for step in range(6)]
-    first, second = ([i for batch in epoch for i in batch] for epoch in (seen[:3], seen[3:]))
+    batches = [order.batch(step) for step in range(6)]
+    first, second = ([i for batch in epoch for i in batch] for epoch in (batches[:3], batches[3:]))
     assert sorted(first) == sorted(second) == list(range(12))
     assert first != second
-    assert [BatchOrder(12, 4, 0, range(5, 6)).batch(5)] == seen[5:]
+    assert [BatchOrder(12, 4, 0, range(5, 6)).batch(5)] == batches[5:]
 
 
 def test_pieces_and_processes_share_out_the_same_batch() -> None:
-    whole = list(BatchOrder(16, 8, 0, range(2)))
+    full = list(BatchOrder(16, 8, 0, range(2)))
     shares = [list(BatchOrder(16, 8, 0, range(2), accumulate=2, process=p, processes=2)) for p in range(2)]
-    assert [shares[0][0] + shares[1][0] + shares[0][1] + shares[1][1]] == whole[:1]
+    assert [shares[0][0] + shares[1][0] + shares[0][1] + shares[1][1]] == full[:1]
 
 
 def test_impossible_batches_are_refused() -> None:

@@ -32,9 +32,9 @@ def test_nothing_to_do_says_nothing(capsys, total: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_memory_of_a_run_is_its_own_and_not_that_of_the_process_it_was_started_by() -> None:
-    held = np.ones(60_000_000)  # 460 MiB, which a child's getrusage would begin with
+def test_the_memory_of_a_run_excludes_that_of_its_parent_process() -> None:
+    ballast = np.ones(60_000_000)  # 460 MiB, which a child's getrusage would begin with
     code = "from mme_vla.training.logging import resident_gib; print(resident_gib())"
     alone = float(subprocess.check_output([sys.executable, "-c", code]))
     assert 0 < alone < resident_gib() - 0.3
-    del held
+    del ballast

@@ -66,16 +66,16 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 
 @pytest.mark.slow
 def test_a_killed_run_resumes_with_the_same_losses(runs: tuple[Path, str]) -> None:
-    whole, killed = runs[0] / "whole", runs[0] / "killed"
+    straight, killed = runs[0] / "whole", runs[0] / "killed"
     # The killed run may have come further than one checkpoint: continue from the first.
     for late in sorted((killed / "checkpoints").glob("step_*"))[1:]:
         late.rename(runs[0] / f"late_{late.name}")
     printed = finish(start(runs[0], f"resume={killed}", "output=unused"))
     assert f"continuing from {killed / 'checkpoints' / f'step_{SAVE_EVERY:06d}'}" in printed
-    assert numbers(killed) == numbers(whole)
+    assert numbers(killed) == numbers(straight)
     assert not (runs[0] / "unused").exists()
-    ours, theirs = (json.loads((folder / "summary.json").read_text()) for folder in (killed, whole))
-    assert ours["open_loop"] == theirs["open_loop"]
+    resumed_run, straight_run = (json.loads((folder / "summary.json").read_text()) for folder in (killed, straight))
+    assert resumed_run["open_loop"] == straight_run["open_loop"]
 
 
 @pytest.mark.slow

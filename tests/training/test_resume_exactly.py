@@ -21,16 +21,16 @@ WORDS = [
 
 
 def test_weights_and_moments_after_resuming_are_equal_to_the_last_bit(tmp_path: Path) -> None:
-    run, whole = tmp_path / "run", tmp_path / "whole"
+    run, straight = tmp_path / "run", tmp_path / "whole"
     words = [*WORDS, f"data.cache.root={tmp_path}", f"output={run}"]
     main(compose("train", words))
-    shutil.copytree(run, whole)
+    shutil.copytree(run, straight)
     for step in (2, 3):
         shutil.rmtree(run / "checkpoints" / f"step_{step:06d}")
     main(compose("train", words))
     last = Path("checkpoints") / "step_000003"
     for name in ("raw.safetensors", "optimizer.safetensors", "model.safetensors", "training_state.json"):
-        assert (run / last / name).read_bytes() == (whole / last / name).read_bytes(), name
+        assert (run / last / name).read_bytes() == (straight / last / name).read_bytes(), name
 
 
 def test_tensors_of_a_file_get_memory_that_torch_allots(tmp_path: Path) -> None:

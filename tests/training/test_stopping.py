@@ -45,7 +45,7 @@ def test_a_stop_signal_saves_and_leaves(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_all_processes_stop_after_the_same_update_when_one_is_asked(tmp_path: Path) -> None:
+def test_all_processes_stop_after_the_same_update_when_one_is_queried(tmp_path: Path) -> None:
     (tmp_path / "asked.py").write_text(ASKED_ONCE)
     words = (str(tmp_path / "asked.py"), str(tmp_path / "meeting"))
     started = [commands.start(*words, str(rank)) for rank in range(2)]
@@ -53,15 +53,15 @@ def test_all_processes_stop_after_the_same_update_when_one_is_asked(tmp_path: Pa
 
 
 @pytest.fixture
-def usual_interrupt() -> Iterator[None]:
+def default_interrupt() -> Iterator[None]:
     """Ctrl-C as Python has it: a process that a script starts in its background ignores it from the start."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.usefixtures("usual_interrupt")
-def test_a_second_signal_ends_the_process_as_usual() -> None:
+@pytest.mark.usefixtures("default_interrupt")
+def test_a_second_signal_ends_the_process_by_the_default_handler() -> None:
     with pytest.raises(KeyboardInterrupt), stop_requests() as stop:
         signal.raise_signal(signal.SIGINT)
         assert stop()

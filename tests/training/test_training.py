@@ -46,24 +46,24 @@ def test_the_same_seed_trains_the_same_policy(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_resumed_run_equals_an_uninterrupted_one(tmp_path: Path, workers: int) -> None:
-    whole = train(tmp_path / "whole", workers=workers)
+    straight = train(tmp_path / "whole", workers=workers)
     train(tmp_path / "parts", steps=3)
     checkpoint = resolve_checkpoint(tmp_path / "parts")
     assert checkpoint.name == "step_000003"
     resumed = train(tmp_path, built=policy(seed=9), run=Run(tmp_path / "parts", checkpoint, 3), workers=workers)
     assert losses(tmp_path / "parts") == losses(tmp_path / "whole")
-    for name, weight in whole.policy.state_dict().items():
+    for name, weight in straight.policy.state_dict().items():
         assert torch.equal(weight, resumed.policy.state_dict()[name]), name
-    for name, average in whole.ema.tensors().items():
+    for name, average in straight.ema.tensors().items():
         assert torch.equal(average, resumed.ema.tensors()[name]), name
 
 
 def test_computing_a_batch_in_pieces_gives_the_same_update(tmp_path: Path) -> None:
-    plain = policy(policy={"augment": False})
-    whole = train(tmp_path / "a", built=plain, steps=2, val_every=9)
+    built = policy(policy={"augment": False})
+    straight = train(tmp_path / "a", built=built, steps=2, val_every=9)
     pieces = train(tmp_path / "b", built=policy(policy={"augment": False}), steps=2, val_every=9, accumulate=2)
     assert losses(tmp_path / "a") == pytest.approx(losses(tmp_path / "b"), rel=1e-5)
-    for name, weight in whole.policy.state_dict().items():
+    for name, weight in straight.policy.state_dict().items():
         torch.testing.assert_close(weight, pieces.policy.state_dict()[name], rtol=1e-3, atol=1e-4)
 
 
@@ -93,7 +93,7 @@ def test_only_the_checkpoints_of_the_rule_stay(tmp_path: Path) -> None:
     assert not list((tmp_path / "checkpoints").glob(".*"))
 
 
-def test_a_half_written_checkpoint_is_not_one(tmp_path: Path) -> None:
+def test_a_half_saved_checkpoint_is_not_one(tmp_path: Path) -> None:
     train(tmp_path, steps=2)
     (tmp_path / "checkpoints" / ".step_000004.partial").mkdir()
     assert resolve_checkpoint(tmp_path).name == "step_000002"
@@ -105,7 +105,7 @@ def test_a_loss_that_is_no_number_stops_the_run_and_saves_nothing(tmp_path: Path
     assert not (tmp_path / "checkpoints").exists()
 
 
-def test_validation_loss_does_not_depend_on_when_it_is_asked() -> None:
+def test_validation_loss_does_not_depend_on_when_it_is_queried() -> None:
     built = policy()
     validation = Validation(Samples(built, 5), collate, 3, 2, seed=1)
     first = validation.loss(built)
@@ -116,7 +116,7 @@ def test_validation_loss_does_not_depend_on_when_it_is_asked() -> None:
     assert Validation(Samples(built, 5), collate, 3, 3, seed=1).loss(built) == pytest.approx(first, rel=1e-5)
 
 
-def test_without_a_terminal_progress_is_plain_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_terminal_progress_is_text_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     line = ProgressLine(6, 0)
     line.console.file = io.StringIO()
     with line:
@@ -194,7 +194,7 @@ def test_a_checkpoint_of_another_model_does_not_fit(tmp_path: Path) -> None:
         trainer(tmp_path, built=policy("tokendrop_expert"), run=Run(tmp_path, resolve_checkpoint(tmp_path), 2))
 
 
-def test_no_checkpoint_there_says_what_one_looks_like(tmp_path: Path) -> None:
+def test_a_missing_checkpoint_is_reported_with_its_layout(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="No checkpoint at"):
         resolve_checkpoint(tmp_path)
 
@@ -237,7 +237,7 @@ def test_the_tower_under_a_memory_stays_frozen() -> None:
         check_frozen(policy("tokendrop_expert"), freeze_vision=False)
 
 
-def test_too_small_a_disk_is_found_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_small_a_disk_is_detected_before_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shutil.disk_usage", lambda path: os.terminal_size((0, 0)) and type("Usage", (), {"free": 10}))
     with pytest.raises(UserError, match="free"):
         check_disk(tmp_path / "not" / "there", policy(), KeepRule())
@@ -338,7 +338,7 @@ def test_the_papers_recipe_is_the_papers() -> None:
     assert config.name == "framesamp_modul"
 
 
-def test_weights_to_be_replaced_are_not_drawn_but_a_memory_is_fresh(tmp_path: Path) -> None:
+def test_weights_to_be_replaced_are_not_rendered_but_a_memory_is_fresh(tmp_path: Path) -> None:
     base = policy(seed=5)
     base.save_pretrained(tmp_path)
     words = ["model=framesamp_expert", "memory.budget=64", *(f"backbone.{k}={v}" for k, v in (("depth", 1),))]

@@ -143,7 +143,7 @@ def test_names_of_folders_hold_no_paths() -> None:
             safe_name(name)
 
 
-def test_a_flipped_bit_is_found_by_its_sum(tmp_path: Path) -> None:
+def test_a_flipped_bit_is_detected_by_its_sum(tmp_path: Path) -> None:
     (tmp_path / "weights").write_bytes(b"\0" * 64)
     (tmp_path / "config").write_text("{}")
     assert not check_sums(tmp_path)

@@ -38,22 +38,22 @@ def decoded(path: Path) -> list[np.ndarray]:
 class ThreeCameras:
     """An environment that shows one frame of three cameras, and succeeds at once."""
 
-    def _seen(self, count: int) -> dict[str, list[np.ndarray]]:
+    def _observation(self, count: int) -> dict[str, list[np.ndarray]]:
         views = {"front": plain(GREEN), "wrist": plain(BLUE), "side": plain(YELLOW, 48)}
         joints = {"joint_state_list": [np.zeros(7)] * count, "gripper_state_list": [np.zeros(2)] * count}
         return joints | {f"{name}_rgb_list": [view] * count for name, view in views.items()}
 
     def reset(self) -> tuple:
-        return self._seen(2), {"status": "ongoing", "task_goal": ["go"]}
+        return self._observation(2), {"status": "ongoing", "task_goal": ["go"]}
 
     def step(self, action: np.ndarray) -> tuple:
-        return self._seen(1), 0.0, True, False, {"status": "success"}
+        return self._observation(1), 0.0, True, False, {"status": "success"}
 
     def close(self) -> None: ...
 
 
 @pytest.mark.parametrize("names", [("side", "front", "wrist"), ("side", "wrist")])
-def test_an_episodes_film_shows_every_camera_of_the_robot(tmp_path: Path, names: tuple[str, ...]) -> None:
+def test_an_episodes_video_shows_every_camera_of_the_robot(tmp_path: Path, names: tuple[str, ...]) -> None:
     robot = replace(ROBOMME_JOINT, cameras=tuple(map(Camera, names)), memory_camera="side")
     env = ChunkEnv(ThreeCameras, video=EpisodeVideo(lambda outcome, goal: tmp_path / "a.mp4"), robot=robot)
     env.reset()
@@ -77,12 +77,12 @@ def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
     assert (framed[changed] == RED).all()
 
 
-def test_a_caption_that_is_too_long_ends_within_the_picture() -> None:
-    told = video_frame([plain(GREEN)], "pick up the red cube and place it on the target " * 5)
-    assert told[64:, :58].max() > 200 and told[64:, -4:].max() == 0
+def test_a_caption_that_is_too_long_ends_within_the_image() -> None:
+    captioned = video_frame([plain(GREEN)], "pick up the red cube and place it on the target " * 5)
+    assert captioned[64:, :58].max() > 200 and captioned[64:, -4:].max() == 0
 
 
-def test_a_film_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
+def test_a_video_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "a.mp4"
 
     def frames():
@@ -99,23 +99,25 @@ def test_a_film_has_its_name_only_when_it_is_whole(tmp_path: Path) -> None:
     assert len(decoded(path)) == 3, "the old video stays"
 
 
-def test_equal_frames_make_equal_bytes_and_odd_sides_are_kept(tmp_path: Path) -> None:
+def test_equal_frames_make_equal_bytes_and_odd_sides_survive(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (4, 33, 45, 3), dtype=np.uint8)
-    held = [np.ones(size, np.uint8) for size in range(1000, 200_000, 5000)]  # the encoder's memory is not always clean
-    assert len({video_bytes(noise) for _ in range(40) if held.pop() is not None}) == 1
+    ballast = [
+        np.ones(size, np.uint8) for size in range(1000, 200_000, 5000)
+    ]  # the encoder's memory is not always clean
+    assert len({video_bytes(noise) for _ in range(40) if ballast.pop() is not None}) == 1
     assert len(video_bytes(noise, crf=10)) > len(video_bytes(noise, crf=30))
     (tmp_path / "odd.mp4").write_bytes(video_bytes(noise))
     assert [frame.shape for frame in decoded(tmp_path / "odd.mp4")] == [(33, 45, 3)] * 4
 
 
-def test_a_film_ends_with_its_block(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "a.mp4", fps=7) as film:
-        film.add(plain(BLUE))
+def test_a_video_ends_with_its_block(tmp_path: Path) -> None:
+    with VideoWriter(tmp_path / "a.mp4", fps=7) as video:
+        video.add(plain(BLUE))
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].average_rate == 7
 
 
-def test_a_contact_sheet_holds_every_tile_and_outlines_the_marked_ones() -> None:
+def test_a_contact_sheet_holds_every_tile_and_outlines_the_highlighted_ones() -> None:
     tiles = [Tile(plain(GREEN), "one"), Tile(plain(BLUE), "two", RED), Tile(plain(YELLOW), "three")]
     sheet = np.asarray(contact_sheet(tiles, columns=2, title="all"))
     for tile in tiles:
@@ -123,5 +125,5 @@ def test_a_contact_sheet_holds_every_tile_and_outlines_the_marked_ones() -> None
     assert 0 < (sheet == RED).all(-1).sum() < 4 * 2 * 170
 
 
-def test_places_are_spread_from_the_first_to_the_last() -> None:
+def test_places_are_distributed_from_the_first_to_the_last() -> None:
     assert evenly_spaced(9, 3) == [0, 4, 8] and evenly_spaced(2, 5) == [0, 1]

@@ -45,7 +45,7 @@ def same(one: MMEPolicy, other: MMEPolicy) -> bool:
 
 
 @pytest.mark.parametrize("named", [lambda folder: folder, lambda folder: folder / "79999.zip"], ids=["folder", "zip"])
-def test_an_archive_is_loaded_whole_with_its_statistics(
+def test_an_archive_is_loaded_completely_with_its_statistics(
     policy: MMEPolicy, published: Path, named: Callable[[Path], Path]
 ) -> None:
     loaded = build_policy("tokendrop_modul", seed=1)
@@ -56,7 +56,9 @@ def test_an_archive_is_loaded_whole_with_its_statistics(
     assert stats.actions.q99.tolist() == unit_stats().actions.q99.tolist()
 
 
-def test_the_variant_is_told_from_the_name_of_the_folder(policy: MMEPolicy, published: Path, tmp_path: Path) -> None:
+def test_the_variant_is_recognised_from_the_name_of_the_folder(
+    policy: MMEPolicy, published: Path, tmp_path: Path
+) -> None:
     assert open_source(published / "79999.zip").model == "tokendrop_modul"
     convert(published, tmp_path / "ours", ["backbone=tiny"])
     assert same(MMEPolicy.from_pretrained(tmp_path / "ours"), policy)
@@ -74,17 +76,17 @@ def test_a_file_in_the_archive_tells_it_before_the_folder_does(published: Path, 
 def test_a_folder_on_the_hub_is_fetched_alone(
     policy: MMEPolicy, published: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = []
+    requests = []
 
     def snapshot(repository: str, revision: str | None, token: str | None, allow_patterns: list[str]) -> str:
-        asked.append((repository, revision, allow_patterns))
+        requests.append((repository, revision, allow_patterns))
         return str(published.parent)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", snapshot)
     fresh = small_policy("tokendrop_modul", seed=1)
-    said = start_from(fresh, f"Yinpei/mme_vla_suite/{VARIANT}")
-    assert same(fresh, policy) and " 0 new" in said
-    assert asked == [("Yinpei/mme_vla_suite", None, [VARIANT, f"{VARIANT}/*"])]
+    report = start_from(fresh, f"Yinpei/mme_vla_suite/{VARIANT}")
+    assert same(fresh, policy) and " 0 new" in report
+    assert requests == [("Yinpei/mme_vla_suite", None, [VARIANT, f"{VARIANT}/*"])]
     with pytest.raises(UserError, match="has no 'perceptual-nothing'"):
         start_from(fresh, "Yinpei/mme_vla_suite/perceptual-nothing")
 
@@ -114,12 +116,12 @@ def test_what_no_checkpoint_holds_is_refused(tmp_path: Path, contents: dict[str,
 
 
 def test_a_cut_archive_is_damaged(published: Path, tmp_path: Path) -> None:
-    whole = (published / "79999.zip").read_bytes()
-    (tmp_path / "79999.zip").write_bytes(whole[: len(whole) // 2])
+    content = (published / "79999.zip").read_bytes()
+    (tmp_path / "79999.zip").write_bytes(content[: len(content) // 2])
     with pytest.raises(UserError, match="is damaged: it cannot be read as a zip archive"):
         open_source(tmp_path / "79999.zip")
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 0xFF
+    flipped = bytearray(content)
+    flipped[len(content) // 2] ^= 0xFF
     (tmp_path / "79999.zip").write_bytes(flipped)
     with pytest.raises(UserError, match="damaged"):
         load_weights(build_policy("tokendrop_modul"), tmp_path / "79999.zip")

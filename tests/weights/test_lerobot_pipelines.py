@@ -32,25 +32,27 @@ def exportable() -> MMEPolicy:
 @pytest.fixture
 def fetched(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """LeRobot's tokenizers come from the hub; here the shipped one means whatever is asked for."""
-    import lerobot.processor.tokenizer_processor as theirs
+    import lerobot.processor.tokenizer_processor as lerobot_tokenizers
 
     names: list[str] = []
-    ours = Tokenizer.load("sample")
+    sample_tokenizer = Tokenizer.load("sample")
 
     def tokenize(texts: list[str], max_length: int, **_: Any) -> dict[str, torch.Tensor]:
         ids = torch.zeros(len(texts), max_length, dtype=torch.int64)
         mask = torch.zeros_like(ids)
         for i, text in enumerate(texts):
             # PaliGemma's newline is a piece of its own; the small tokenizer has to be told so.
-            found = ours.encode(text.removesuffix("\n")) + ours.encode("\n", bos=False) * text.endswith("\n")
-            ids[i, : len(found)], mask[i, : len(found)] = torch.tensor(found), 1
+            encoded = sample_tokenizer.encode(text.removesuffix("\n")) + sample_tokenizer.encode(
+                "\n", bos=False
+            ) * text.endswith("\n")
+            ids[i, : len(encoded)], mask[i, : len(encoded)] = torch.tensor(encoded), 1
         return {"input_ids": ids, "attention_mask": mask}
 
     def load(name: str) -> Any:
         names.append(name)
         return tokenize
 
-    monkeypatch.setattr(theirs, "AutoTokenizer", SimpleNamespace(from_pretrained=load))
+    monkeypatch.setattr(lerobot_tokenizers, "AutoTokenizer", SimpleNamespace(from_pretrained=load))
     return names
 
 
@@ -59,14 +61,14 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fetched: list[str]
 ) -> None:
     policy = exportable()
-    theirs = reduce_sizes(monkeypatch, policy.backbone.config)
+    lerobot_module = reduce_sizes(monkeypatch, policy.backbone.config)
     from lerobot.policies import make_pre_post_processors
 
     policy.save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
-    config = theirs.PreTrainedConfig.from_pretrained(tmp_path / "lerobot")
+    config = lerobot_module.PreTrainedConfig.from_pretrained(tmp_path / "lerobot")
     config.device = "cpu"
-    loaded = theirs.PI05Policy.from_pretrained(tmp_path / "lerobot", config=config).eval()
+    loaded = lerobot_module.PI05Policy.from_pretrained(tmp_path / "lerobot", config=config).eval()
     before, after = make_pre_post_processors(config, pretrained_path=str(tmp_path / "lerobot"))
     assert fetched == ["google/paligemma-3b-pt-224"]
     assert config.n_action_steps == 1  # LeRobot's loop cannot anchor later ones
@@ -79,11 +81,11 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
     noise = policy.start_episode(GOAL, seed=4).draw()["noise"]
     views = torch.from_numpy(frames).permute(0, 3, 1, 2) / 255
     names = ("observation.images.image", "observation.images.wrist_image")
-    seen = before(
+    inputs = before(
         {**dict(zip(names, views.split(1), strict=True)), "observation.state": torch.from_numpy(state)[None],
          "task": [GOAL]}
     )  # fmt: skip
-    chunk = after(loaded.predict_action_chunk(seen, noise=noise[None]))
+    chunk = after(loaded.predict_action_chunk(inputs, noise=noise[None]))
     assert np.abs(expected - state).max() > 0.1
     np.testing.assert_allclose(chunk[0].numpy(), expected, atol=2e-4)
 
@@ -95,7 +97,7 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
         ({"prompt": "state"}, "no step that writes"),
     ],
 )
-def test_what_lerobot_has_no_step_for_is_said(tmp_path: Path, changes: dict[str, str], said: str) -> None:
+def test_what_lerobot_has_no_step_for_is_reported(tmp_path: Path, changes: dict[str, str], said: str) -> None:
     policy = exportable()
     policy.config["processor"] |= changes
     policy.save_pretrained(tmp_path / "ours")
@@ -120,5 +122,5 @@ def test_lerobots_short_window_memory_is_named_and_its_weights_are_a_start(tmp_p
     fresh = small_policy("framesamp_modul", seed=1)
     start = transfer(fresh, tmp_path)
     assert start.left == sorted(name.removeprefix("model.") for name in tensors if "proprio_history_proj" in name)
-    given, found = policy.state_dict(), fresh.state_dict()
-    assert all(torch.equal(found[name], tensor) for name, tensor in given.items())
+    original, loaded = policy.state_dict(), fresh.state_dict()
+    assert all(torch.equal(loaded[name], tensor) for name, tensor in original.items())

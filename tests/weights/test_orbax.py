@@ -34,7 +34,7 @@ def test_every_leaf_is_what_orbax_wrote() -> None:
     )
 
 
-def test_plain_layout_reads_with_and_without_outer_names() -> None:
+def test_unboxed_layout_reads_with_and_without_outer_names() -> None:
     tree = read_orbax(PLAIN)
     assert set(tree) == {"PaliGemma/img/embedding/bias", "time_mlp_in/kernel", "scale"}
     assert tree["PaliGemma/img/embedding/bias"].tolist() == [0, 1, 2, 3, 4, 5]
@@ -88,7 +88,7 @@ def test_a_checkpoint_of_orbax_reproduces_the_golden_outputs(parity: Path) -> No
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.complex64, torch.int32])
-def test_what_is_written_reads_back(dtype: torch.dtype, tmp_path: Path) -> None:
+def test_what_is_saved_reads_back(dtype: torch.dtype, tmp_path: Path) -> None:
     tree = {"a/b": torch.arange(6).reshape(2, 3).to(dtype), "c": torch.tensor(3).to(dtype)}
     write_orbax(tree, tmp_path / "params")
     back = read_orbax(tmp_path / "params")

@@ -82,7 +82,7 @@ def test_every_spelling_loads_the_same_policy(spelling: str, pi05: MMEPolicy, tm
     assert same(load_weights(empty_pi05(), folder / "model.safetensors"), pi05)
 
 
-def test_format_is_told_from_names_and_config(pi05: MMEPolicy, tmp_path: Path) -> None:
+def test_format_is_recognised_from_names_and_config(pi05: MMEPolicy, tmp_path: Path) -> None:
     assert detect_format(saved(to_lerobot(pi05, pi05.state_dict()), tmp_path / "prefixed")) == "lerobot"
     bare = saved(to_openpi(pi05, pi05.state_dict()), tmp_path / "bare")
     assert detect_format(bare) == "openpi"
@@ -110,23 +110,23 @@ def test_full_size_names_and_shapes_are_those_of_both_ports(shared: Path) -> Non
         (to_openpi, "state_dict_openpi_pytorch_pi05.json"),
     ):
         expected = json.loads((shared / "spec" / listing).read_text())["tensors"]
-        written = write(policy, policy.state_dict())
-        assert {name: list(tensor.shape) for name, tensor in written.items()} == {
+        exported = write(policy, policy.state_dict())
+        assert {name: list(tensor.shape) for name, tensor in exported.items()} == {
             name: about["shape"] for name, about in expected.items()
         }
 
 
 @torch.no_grad()
-def test_lerobots_own_policy_loads_our_export_and_answers_the_same(
+def test_lerobots_policy_loads_our_export_and_replies_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pi05 = small_policy("pi05", backbone={"num_heads": 8})  # a number that LeRobot's attention has written in
-    theirs = reduce_sizes(monkeypatch, pi05.backbone.config)
+    lerobot_module = reduce_sizes(monkeypatch, pi05.backbone.config)
     pi05.save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
-    config = theirs.PreTrainedConfig.from_pretrained(tmp_path / "lerobot")
+    config = lerobot_module.PreTrainedConfig.from_pretrained(tmp_path / "lerobot")
     config.device = "cpu"
-    loaded = theirs.PI05Policy.from_pretrained(tmp_path / "lerobot", config=config).eval()
+    loaded = lerobot_module.PI05Policy.from_pretrained(tmp_path / "lerobot", config=config).eval()
     assert "All keys loaded successfully" in capsys.readouterr().out  # it only prints what went wrong
 
     batch = random_batch(pi05)
@@ -134,10 +134,10 @@ def test_lerobots_own_policy_loads_our_export_and_answers_the_same(
     noise = torch.randn(batch.actions.shape, generator=torch.Generator().manual_seed(3))
     time = torch.tensor([0.2, 0.8])
     views = list((batch.images.float() / 127.5 - 1).unbind(1))
-    seen = list(batch.image_mask.unbind(1))
-    loss = loaded.model.forward(views, seen, batch.prompt, batch.prompt_mask, batch.actions, noise, time).mean()
+    masks = list(batch.image_mask.unbind(1))
+    loss = loaded.model.forward(views, masks, batch.prompt, batch.prompt_mask, batch.actions, noise, time).mean()
     assert abs(float(loss - pi05(batch, noise, time)[0])) < 1e-5
-    chunk = loaded.model.sample_actions(views, seen, batch.prompt, batch.prompt_mask, noise=noise, num_steps=10)
+    chunk = loaded.model.sample_actions(views, masks, batch.prompt, batch.prompt_mask, noise=noise, num_steps=10)
     assert (chunk - pi05.sample_actions(batch, noise)).abs().max() < 1e-4
 
     saved(loaded.state_dict(), tmp_path / "back")
@@ -162,10 +162,10 @@ def test_all_that_does_not_fit_is_listed_together(pi05: MMEPolicy, tmp_path: Pat
     tensors["surprise"] = torch.zeros(1)
     with pytest.raises(UserError) as caught:
         load_weights(empty_pi05(), saved(tensors, tmp_path / "bad"))
-    said = str(caught.value)
-    assert re.search(r"2 missing:\s+action_in_proj.weight, time_mlp_in.bias", said)
-    assert re.search(r"1 unexpected:\s+surprise", said)
-    assert "action_out_proj.bias: (7,) instead of (32,)" in said
+    message = str(caught.value)
+    assert re.search(r"2 missing:\s+action_in_proj.weight, time_mlp_in.bias", message)
+    assert re.search(r"1 unexpected:\s+surprise", message)
+    assert "action_out_proj.bias: (7,) instead of (32,)" in message
 
 
 def test_another_size_is_refused(pi05: MMEPolicy, tmp_path: Path) -> None:
@@ -174,12 +174,12 @@ def test_another_size_is_refused(pi05: MMEPolicy, tmp_path: Path) -> None:
         load_weights(empty_pi05(backbone={"vlm": {"width": 128}}), folder)
 
 
-def test_pi0_is_told_from_pi05_by_its_tensors(pi05: MMEPolicy, tmp_path: Path) -> None:
+def test_pi0_is_recognised_from_pi05_by_its_tensors(pi05: MMEPolicy, tmp_path: Path) -> None:
     # The folder's name says pi05 and means nothing.
     tensors = to_openpi(pi05, pi05.state_dict())
-    plain = {n.replace(".dense.weight", ".weight"): t for n, t in tensors.items() if not n.endswith(".dense.bias")}
+    renamed = {n.replace(".dense.weight", ".weight"): t for n, t in tensors.items() if not n.endswith(".dense.bias")}
     with pytest.raises(UserError, match="no time-conditioned norms, as π0"):
-        load_weights(empty_pi05(), saved(plain, tmp_path / "pi05_plain"))
+        load_weights(empty_pi05(), saved(renamed, tmp_path / "pi05_plain"))
     with pytest.raises(UserError, match="a state projection, as π0"):
         load_weights(empty_pi05(), saved({**tensors, "state_proj.bias": torch.zeros(4)}, tmp_path / "pi05_state"))
 

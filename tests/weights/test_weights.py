@@ -44,7 +44,7 @@ def equal(one: MMEPolicy, other: MMEPolicy) -> bool:
 
 
 @pytest.mark.parametrize("fmt", FORMATS)
-def test_every_format_is_told_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path], base: MMEPolicy) -> None:
+def test_every_format_is_reported_and_fills_a_policy_on_meta(fmt: str, bases: dict[str, Path], base: MMEPolicy) -> None:
     assert detect_format(bases[fmt]) == fmt
     loaded = load_weights(build_policy("pi05", device="meta"), bases[fmt])
     assert equal(loaded, base)
@@ -60,7 +60,7 @@ def test_statistics_of_one_dataset_come_with_the_weights(fmt: str, bases: dict[s
 
 @pytest.mark.parametrize("fmt", FORMATS)
 @pytest.mark.parametrize("variant", PERCEPTUAL)
-def test_only_the_memorys_own_parameters_are_new_when_starting_from_pi05(
+def test_only_the_memorys_parameters_are_new_when_starting_from_pi05(
     variant: str, fmt: str, bases: dict[str, Path], base: MMEPolicy
 ) -> None:
     policy, loaded = build_policy(variant), base.state_dict()
@@ -72,7 +72,7 @@ def test_only_the_memorys_own_parameters_are_new_when_starting_from_pi05(
         assert torch.equal(tensor, before[name] if name in new else loaded[name]), name
 
 
-def test_another_variants_memory_is_left_behind_and_said(tmp_path: Path) -> None:
+def test_another_variants_memory_is_left_behind_and_reported(tmp_path: Path) -> None:
     small_policy("framesamp_expert").save_pretrained(tmp_path / "expert")
     convert(tmp_path / "expert", tmp_path / "released", to="released")
     for source in ("expert", "released"):
@@ -86,7 +86,7 @@ def test_another_variants_memory_is_left_behind_and_said(tmp_path: Path) -> None
         )
 
 
-def test_the_same_variant_starts_whole(tmp_path: Path) -> None:
+def test_the_same_variant_starts_completely(tmp_path: Path) -> None:
     small_policy("framesamp_modul", seed=5).save_pretrained(tmp_path / "ours")
     convert(tmp_path / "ours", tmp_path / "released", to="released")
     for source in ("ours", "released"):
@@ -132,7 +132,7 @@ def test_conversion_there_and_back_keeps_every_bit(variant: str, tmp_path: Path)
     assert back.require_processor().stats is not None
 
 
-def test_a_destination_is_never_written_over_and_a_failure_leaves_nothing(
+def test_a_destination_is_never_overwritten_and_a_failure_leaves_nothing(
     bases: dict[str, Path], tmp_path: Path
 ) -> None:
     (tmp_path / "there").mkdir()
@@ -156,7 +156,7 @@ def test_the_variant_a_run_names_cannot_be_overruled(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_command_prints_the_mapping_and_writes_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
+def test_the_command_prints_the_mapping_and_saves_nothing(bases: dict[str, Path], tmp_path: Path) -> None:
     command = ["mme_vla", "weights", str(bases["lerobot"]), str(tmp_path / "new")]
     done = commands.run(*command, "backbone=tiny", "--dry-run")
     assert done.returncode == 0, done.stderr
@@ -182,8 +182,8 @@ def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tm
     save_file({"layer.weight": torch.zeros(2)}, tmp_path / "other.safetensors")
     with pytest.raises(UserError, match=r"no policy of a known kind.*layer\.weight"):
         load_weights(policy, tmp_path / "other.safetensors")
-    whole = (bases["lerobot"] / "model.safetensors").read_bytes()
-    (tmp_path / "cut.safetensors").write_bytes(whole[: len(whole) // 2])
+    content = (bases["lerobot"] / "model.safetensors").read_bytes()
+    (tmp_path / "cut.safetensors").write_bytes(content[: len(content) // 2])
     with pytest.raises(UserError, match="damaged"):
         load_weights(policy, tmp_path / "cut.safetensors")
     (tmp_path / "adapter_model.safetensors").write_bytes(b"")
@@ -197,7 +197,7 @@ def test_foreign_and_broken_sources_say_what_is_wrong(bases: dict[str, Path], tm
         load_weights(policy, tmp_path)
 
 
-def test_a_memory_of_ones_own_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
+def test_a_memory_of_the_user_starts_from_a_released_base(bases: dict[str, Path], monkeypatch: Any) -> None:
     policy = build_policy("framesamp_context")
     monkeypatch.setattr("mme_vla.weights.names.jax_memory.released_names", lambda memory: {})
     with pytest.raises(UserError, match="no released names"):
@@ -208,7 +208,7 @@ def test_a_memory_of_ones_own_starts_from_a_released_base(bases: dict[str, Path]
 # Statistics
 
 
-def test_of_several_datasets_statistics_none_is_taken_and_it_is_said(bases: dict[str, Path], tmp_path: Path) -> None:
+def test_of_several_datasets_statistics_none_is_taken_with_a_report(bases: dict[str, Path], tmp_path: Path) -> None:
     folder = tmp_path / "base"
     shutil.copytree(bases["openpi"], folder)
     (folder / "assets" / "droid").mkdir(parents=True)
@@ -228,9 +228,9 @@ def test_statistics_of_openpi_and_of_several_datasets(tmp_path: Path) -> None:
         read_stats(tmp_path)
     with pytest.raises(UserError, match="none of 'libero'"):
         read_stats(tmp_path, "libero")
-    chosen = read_stats(tmp_path, "robomme")
-    assert chosen is not None
-    assert chosen.to_dict() == unit_stats().to_dict()
+    statistics = read_stats(tmp_path, "robomme")
+    assert statistics is not None
+    assert statistics.to_dict() == unit_stats().to_dict()
 
 
 def test_statistics_of_a_lerobot_processor_come_from_the_file_its_json_names(tmp_path: Path) -> None:

@@ -70,20 +70,20 @@ def views(count: int, seed: int = 0) -> dict[str, np.ndarray]:
 
 
 def test_it_trains_on_the_sample_and_resumes_to_the_bit(tmp_path: Path) -> None:
-    whole = run(tmp_path / "whole", 3, chunks=1)
+    straight = run(tmp_path / "whole", 3, chunks=1)
     run(tmp_path / "parts", 2)
     resumed = load_tensors(run(tmp_path / "unused", 3, resume=tmp_path / "parts"))
-    for name, tensor in load_tensors(whole).items():
+    for name, tensor in load_tensors(straight).items():
         assert torch.equal(tensor, resumed[name]), name
-    again = Policy.from_pretrained(whole)
+    again = Policy.from_pretrained(straight)
     assert isinstance(again, DiffusionPolicy) and again.require_processor().stats is not None
     assert again.embodiment.action.execute == 8
     console = Console(record=True, width=200)
-    show_checkpoint(whole, console)
-    shown = console.export_text()
-    assert all(word in shown for word in ("encoder", "text", "action", "hashed", "11,305,900"))
+    show_checkpoint(straight, console)
+    output = console.export_text()
+    assert all(word in output for word in ("encoder", "text", "action", "hashed", "11,305,900"))
     with pytest.raises(UserError, match=r"holds a 'diffusion_policy' policy.*Policy.from_pretrained"):
-        MMEPolicy.from_pretrained(whole)
+        MMEPolicy.from_pretrained(straight)
 
 
 def test_weights_go_to_the_authors_format_and_back(policy: DiffusionPolicy, tmp_path: Path) -> None:
@@ -101,8 +101,8 @@ def test_weights_go_to_the_authors_format_and_back(policy: DiffusionPolicy, tmp_
     assert torch.equal(
         back.state_dict()["backbone.unet.final_conv.1.weight"], saved["model"]["policy.final_conv.1.weight"]
     )
-    kept, given = (each.require_processor().require_stats() for each in (back, policy))
-    np.testing.assert_array_equal(kept.actions.max, given.actions.max)
+    loaded, original = (each.require_processor().require_stats() for each in (back, policy))
+    np.testing.assert_array_equal(loaded.actions.max, original.actions.max)
 
 
 def test_a_pth_of_objects_is_not_run(policy: DiffusionPolicy, tmp_path: Path) -> None:
@@ -119,29 +119,29 @@ def test_an_episode_sees_what_training_shows() -> None:
     _, number, frame = item["place"]
     start = int(source.exec_starts[number])
     frames = np.arange(start, frame + 1)
-    seen = {name: source.frames(number, frames, name) for name in policy.embodiment.camera_names}
+    views = {name: source.frames(number, frames, name) for name in policy.embodiment.camera_names}
     episode = policy.start_episode(item["goal"])
-    episode.observe(seen, source.states(number, start, frame + 1))
+    episode.observe(views, source.states(number, start, frame + 1))
     images, states = episode.window
     assert torch.equal(images, item["images"])
     assert torch.equal(policy.require_processor().states(states), item["state"])
     assert torch.equal(episode.prompt, item["text"])
 
 
-def test_the_window_holds_consecutive_frames_or_those_it_was_asked_at() -> None:
-    policy, pictures, states = ready("diffusion_policy_obs2"), views(9), np.linspace(0, 1, 9, dtype=np.float32)
+def test_the_window_holds_consecutive_frames_or_those_it_was_requested_at() -> None:
+    policy, images, states = ready("diffusion_policy_obs2"), views(9), np.linspace(0, 1, 9, dtype=np.float32)
     states = np.repeat(states[:, None], 8, 1)
     processor = policy.require_processor()
-    found = {}
+    batches = {}
     for consecutive in (True, False):
         processor.samples = replace(processor.samples, consecutive=consecutive)
         episode = policy.start_episode("push the button")
-        episode.observe({name: of[:3] for name, of in pictures.items()}, states[:3], np.array([True, True, False]))
+        episode.observe({name: of[:3] for name, of in images.items()}, states[:3], np.array([True, True, False]))
         first = episode.window[1]
         assert torch.equal(first[0], first[1]), "the video is no part of it: the first frame means those before"
-        episode.observe({name: of[3:] for name, of in pictures.items()}, states[3:])
-        found[consecutive] = episode.window[1][:, 0].tolist()
-    assert found == {True: [states[7, 0], states[8, 0]], False: [states[2, 0], states[8, 0]]}
+        episode.observe({name: of[3:] for name, of in images.items()}, states[3:])
+        batches[consecutive] = episode.window[1][:, 0].tolist()
+    assert batches == {True: [states[7, 0], states[8, 0]], False: [states[2, 0], states[8, 0]]}
     assert policy.act(episode).shape == (policy.horizon - 1, 8), "a chunk begins a frame before the current one"
 
 
@@ -206,7 +206,7 @@ def test_a_missing_package_is_named_with_its_extra(module: str, monkeypatch: pyt
         (["processor.window=0"], "processor.window=0"),
     ],
 )
-def test_what_cannot_be_is_said(words: list[str], says: str) -> None:
+def test_what_cannot_be_is_reported(words: list[str], says: str) -> None:
     from mme_vla.policy.build import build_from_config
 
     with pytest.raises(UserError, match=says):

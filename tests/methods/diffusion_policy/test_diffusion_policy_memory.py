@@ -36,18 +36,18 @@ def policy() -> DiffusionPolicy:
 
 
 def history(policy: DiffusionPolicy, seed: int) -> HistoryTokens:
-    found = full_history(policy.require_memory(), policy.sizes.memory_width)
+    full = full_history(policy.require_memory(), policy.sizes.memory_width)
     generator = torch.Generator().manual_seed(seed)
-    return HistoryTokens(torch.randn(found.features.shape, generator=generator), found.positions, found.mask)
+    return HistoryTokens(torch.randn(full.features.shape, generator=generator), full.positions, full.mask)
 
 
 @pytest.mark.parametrize("memory", ["framesamp", "tokendrop", "rmt", "ttt"])
 def test_any_memory_joins_the_condition(memory: str) -> None:
     policy = with_memory(memory)
     batch = policy.full_batch()
-    plain = build_policy("diffusion_policy", backbone=SMALL)
+    baseline = build_policy("diffusion_policy", backbone=SMALL)
     with torch.no_grad():
-        widths = [each.backbone.unet.mid_modules[0].cond_encoder[1].in_features for each in (policy, plain)]
+        widths = [each.backbone.unet.mid_modules[0].cond_encoder[1].in_features for each in (policy, baseline)]
         assert widths[0] == widths[1] + policy.integration.feature_width
         assert policy.condition(batch, policy.encode_memory(batch.history)).shape == (
             1,
@@ -56,7 +56,7 @@ def test_any_memory_joins_the_condition(memory: str) -> None:
     assert policy.config["name"] == f"diffusion_policy_{memory}_film"
 
 
-def test_what_is_remembered_changes_the_answer_and_learns(policy: DiffusionPolicy) -> None:
+def test_what_is_stored_changes_the_reply_and_learns(policy: DiffusionPolicy) -> None:
     batch = policy.full_batch()
     draws = {name: value[None] for name, value in policy.sampling_noise(torch.Generator().manual_seed(0)).items()}
     chunks = []
@@ -76,23 +76,23 @@ def test_padding_of_a_short_memory_counts_for_nothing(policy: DiffusionPolicy) -
     full = history(policy, 0)
     mask = torch.zeros_like(full.mask)
     mask[:, :32] = True
-    found = []
+    outputs = []
     for filling in (0.0, 7.0):
         features = full.features.masked_fill(~mask[..., None], filling)
         tokens = policy.encode_memory(HistoryTokens(features, full.positions, mask))
-        found.append(policy.integration.feature(tokens))
-    assert torch.allclose(found[0], found[1], atol=1e-6)
+        outputs.append(policy.integration.feature(tokens))
+    assert torch.allclose(outputs[0], outputs[1], atol=1e-6)
 
 
 def test_an_episode_remembers(policy: DiffusionPolicy) -> None:
-    def answer(seed: int) -> np.ndarray:
+    def act(seed: int) -> np.ndarray:
         episode = policy.start_episode("find the cube")
         past = moving_frames(8, seed=seed)
         episode.add_frames(past, np.arange(8) < 7)
         episode.set_view({"front": moving_frames(1)[0], "wrist": moving_frames(1)[0]}, np.zeros(8, np.float32))
         return policy.act(episode, 2)
 
-    same, again, other = answer(0), answer(0), answer(5)
+    same, again, other = act(0), act(0), act(5)
     np.testing.assert_array_equal(same, again)
     assert not np.allclose(same, other, atol=1e-6)
 
@@ -119,7 +119,7 @@ def test_its_tower_stays_as_it_is_and_the_cameras_encoder_learns(policy: Diffusi
     apply_finetuning(policy, freeze_vision=False)
 
 
-def test_what_does_not_fit_is_said() -> None:
+def test_what_does_not_fit_is_reported() -> None:
     with pytest.raises(UserError, match=r"one vector\. Choose integration=video"):
         build_policy("diffusion_policy", memory="framesamp", integration="modulator")
     with pytest.raises(UserError, match="name both, or neither"):

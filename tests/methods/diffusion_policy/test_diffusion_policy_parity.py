@@ -45,28 +45,28 @@ def models(folder: Path) -> list[str]:
     return sorted(path.stem for path in folder.glob("model_obs*.json"))
 
 
-def close(found: Tensor, expected: Tensor, tolerance: float = SINGLE) -> None:
-    assert relative_error(found, expected) <= tolerance
+def close(actual: Tensor, expected: Tensor, tolerance: float = SINGLE) -> None:
+    assert relative_error(actual, expected) <= tolerance
 
 
 def built(about: dict[str, Any]) -> DiffusionPolicy:
     """The policy of a golden case, its sizes from the case's description and its weights by rule."""
-    given = about["config"]
-    shape, (state,), (action,) = (given["shape_meta"][name]["shape"] for name in ("image", "state", "action"))
+    options = about["config"]
+    shape, (state,), (action,) = (options["shape_meta"][name]["shape"] for name in ("image", "state", "action"))
     policy = build_policy(
         "diffusion_policy",
         backbone={
             "picture": shape[1:],
-            "crop": given["image_aug"]["crop_ratio"],
-            "keypoints": given["obs_encoder"]["num_kp"],
-            "text_dim": given["text_embed_dim"],
-            "text_hidden": given["text_mlp_hidden"],
-            "text_width": given["text_proj_dim"],
-            "widths": given["down_dims"],
-            "kernel": given["kernel_size"],
-            "groups": given["n_groups"],
-            "step_width": given["diffusion_step_embed_dim"],
-            "diffusion_steps": given["noise_scheduler"]["num_train_timesteps"],
+            "crop": options["image_aug"]["crop_ratio"],
+            "keypoints": options["obs_encoder"]["num_kp"],
+            "text_dim": options["text_embed_dim"],
+            "text_hidden": options["text_mlp_hidden"],
+            "text_width": options["text_proj_dim"],
+            "widths": options["down_dims"],
+            "kernel": options["kernel_size"],
+            "groups": options["n_groups"],
+            "step_width": options["diffusion_step_embed_dim"],
+            "diffusion_steps": options["noise_scheduler"]["num_train_timesteps"],
         },
         embodiment={
             "state": {"width": state},
@@ -74,16 +74,16 @@ def built(about: dict[str, Any]) -> DiffusionPolicy:
                 "width": action,
                 "names": None,
                 "units": None,
-                "horizon": given["action_pred_horizon"],
-                "execute": given["action_exec_horizon"],
+                "horizon": options["action_pred_horizon"],
+                "execute": options["action_exec_horizon"],
             },
         },
-        processor={"window": given["obs_horizon"]},
+        processor={"window": options["obs_horizon"]},
     )
     assert isinstance(policy, DiffusionPolicy)
-    theirs = {name: rule_weight(name, tuple(of), about["weight_seed"]) for name, of in about["parameters"].items()}
+    weights = {name: rule_weight(name, tuple(of), about["weight_seed"]) for name, of in about["parameters"].items()}
     adapter = diffusion_adapter(policy)
-    policy.load_state_dict(adapter.translate(theirs, policy.state_dict(), "the golden case"))
+    policy.load_state_dict(adapter.translate(weights, policy.state_dict(), "the golden case"))
     return policy
 
 
@@ -95,12 +95,12 @@ def batch_of(arrays: dict[str, Tensor], policy: DiffusionPolicy) -> DiffusionBat
 
 @pytest.fixture(scope="module")
 def golden(folder: Path) -> dict[str, tuple[DiffusionPolicy, dict[str, Tensor], dict[str, Any]]]:
-    found = {}
+    cases = {}
     for name in models(folder):
         arrays, about = case(folder, name)
-        found[name] = (built(about), arrays, about)
-    assert found
-    return found
+        cases[name] = (built(about), arrays, about)
+    assert cases
+    return cases
 
 
 def test_the_condition_and_the_loss_of_every_golden_model(golden: Any) -> None:
@@ -122,10 +122,10 @@ def test_the_condition_and_the_loss_of_every_golden_model(golden: Any) -> None:
 def test_what_lies_between_in_every_golden_model(golden: Any) -> None:
     for policy, arrays, about in golden.values():
         network, unet = policy.backbone, policy.backbone.unet
-        kept: dict[str, Tensor] = {}
+        captured: dict[str, Tensor] = {}
 
-        def keep(name: str, kept: dict[str, Tensor] = kept) -> Any:
-            return lambda module, given, out: kept.__setitem__(name, out.detach())
+        def keep(name: str, captured: dict[str, Tensor] = captured) -> Any:
+            return lambda module, inputs, out: captured.__setitem__(name, out.detach())
 
         hooked = {
             "feature_map": network.image_encoder,
@@ -145,11 +145,11 @@ def test_what_lies_between_in_every_golden_model(golden: Any) -> None:
         policy(batch_of(arrays, policy), draws, tuple(about["crop_top_left"]))
         for handle in handles:
             handle.remove()
-        for name, found in kept.items():
+        for name, actual in captured.items():
             expected = arrays[f"out/{name}"]
-            if name == "text_feature" and len(found) < len(expected):  # they repeat it for every step of the window
-                found = found.repeat_interleave(len(expected) // len(found), 0)
-            close(found, expected.reshape(found.shape) if name == "text_feature" else expected)
+            if name == "text_feature" and len(actual) < len(expected):  # they repeat it for every step of the window
+                actual = actual.repeat_interleave(len(expected) // len(actual), 0)
+            close(actual, expected.reshape(actual.shape) if name == "text_feature" else expected)
 
 
 def test_the_gradient_of_every_parameter(golden: Any) -> None:
@@ -157,12 +157,12 @@ def test_the_gradient_of_every_parameter(golden: Any) -> None:
         policy.zero_grad()
         draws = {"noise": arrays["in/noise"], "step": torch.tensor(about["timesteps"])}
         policy(batch_of(arrays, policy), draws, tuple(about["crop_top_left"]))[0].backward()
-        names = {ours: pieces[0].path for ours, pieces in diffusion_adapter(policy).table.items()}
+        names = {target: pieces[0].path for target, pieces in diffusion_adapter(policy).table.items()}
         largest, ratios = max(about["grad_l2"].values()), []
-        for ours, parameter in policy.named_parameters():
-            expected = about["grad_l2"][names[ours]]
-            found = 0.0 if parameter.grad is None else parameter.grad.norm().item()
-            ratios.append(1 + (found - expected) / max(expected, 1e-4 * largest))
+        for target, parameter in policy.named_parameters():
+            expected = about["grad_l2"][names[target]]
+            actual = 0.0 if parameter.grad is None else parameter.grad.norm().item()
+            ratios.append(1 + (actual - expected) / max(expected, 1e-4 * largest))
         close(torch.tensor(ratios), torch.ones(len(ratios)), GRADIENTS)
 
 
@@ -208,7 +208,7 @@ def test_the_schedule_and_single_steps_of_it(folder: Path) -> None:
         close(schedule.step(eps, step, x).pred_original_sample, arrays[f"ddpm/x0_at_{step}"])
 
 
-def test_a_film_unit_with_and_without_a_shortcut(folder: Path) -> None:
+def test_a_conditioning_unit_with_and_without_a_shortcut(folder: Path) -> None:
     arrays, _ = case(folder, "units")
     for kind in sorted({name.split("/")[0] for name in arrays if name.startswith("film")}):
         weights = {n.removeprefix(f"{kind}/param/"): x for n, x in arrays.items() if n.startswith(f"{kind}/param/")}
@@ -235,9 +235,9 @@ def test_keypoints_and_the_embedded_step(folder: Path) -> None:
 
 def statistics_of(arrays: dict[str, Tensor], kind: str) -> QuantileStats:
     values = {name: arrays[f"stats/{kind}/{name}"].tolist() for name in ("min", "max")}
-    given = {name: arrays.get(f"stats/{kind}/{name}") for name in ("mean", "std", "q01", "q99")}
-    plain = {name: values["min"] if x is None else x.tolist() for name, x in given.items()}
-    return QuantileStats.from_dict({**plain, "q99": values["max"] if given["q99"] is None else plain["q99"], **values})
+    fields = {name: arrays.get(f"stats/{kind}/{name}") for name in ("mean", "std", "q01", "q99")}
+    lists = {name: values["min"] if x is None else x.tolist() for name, x in fields.items()}
+    return QuantileStats.from_dict({**lists, "q99": values["max"] if fields["q99"] is None else lists["q99"], **values})
 
 
 def test_statistics_and_normalisation_by_extremes(folder: Path) -> None:
@@ -245,10 +245,10 @@ def test_statistics_and_normalisation_by_extremes(folder: Path) -> None:
     running = RunningStats()
     for name in sorted(name for name in arrays if name.startswith("stats/in")):
         running.update(arrays[name].numpy())
-    found = running.result(extremes=True)
+    statistics = running.result(extremes=True)
     expected = statistics_of(arrays, "state")
     for name in ("min", "max", "mean", "std", "q01", "q99"):
-        close(torch.from_numpy(getattr(found, name)), torch.from_numpy(getattr(expected, name)))
+        close(torch.from_numpy(getattr(statistics, name)), torch.from_numpy(getattr(expected, name)))
     for kind in ("state", "action"):
         stats = statistics_of(arrays, kind)
         close(normalize(arrays[f"minmax/{kind}"].float(), stats, "extremes"), arrays[f"minmax/{kind}_n"].float())
@@ -278,7 +278,7 @@ def test_updates_with_their_optimizer_schedule_and_averages(folder: Path, golden
     )  # fmt: skip
     parameters = dict(policy.named_parameters())
     optimizer, ema = make_optimizer(parameters.values(), settings), EMA(parameters, 0.9999, warmup=True)
-    ours = {pieces[0].path: name for name, pieces in diffusion_adapter(policy).table.items()}
+    targets = {pieces[0].path: name for name, pieces in diffusion_adapter(policy).table.items()}
     for step, update in enumerate(about["updates"]):
         rate = scheduled_rate(step, settings)
         assert rate == pytest.approx(update["lr"], abs=1e-12)
@@ -296,10 +296,10 @@ def test_updates_with_their_optimizer_schedule_and_averages(folder: Path, golden
         ema.update(step)
         averages = ema.tensors()
         for name, expected in arrays.items():
-            kind, _, theirs = name.removeprefix(f"out/step{step}/").partition("/")
+            kind, _, source = name.removeprefix(f"out/step{step}/").partition("/")
             if name.startswith(f"out/step{step}/") and kind in ("param", "ema"):
-                found = (parameters if kind == "param" else averages)[ours[theirs]]
-                close(found.detach(), expected, SAMPLES)
+                actual = (parameters if kind == "param" else averages)[targets[source]]
+                close(actual.detach(), expected, SAMPLES)
 
 
 def test_the_rates_of_the_released_schedule(folder: Path) -> None:
@@ -320,12 +320,12 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
     processor.stats = NormStats(statistics_of(arrays, "state"), statistics_of(arrays, "action"))
     processor.samples = replace(processor.samples, consecutive=False)  # as that server does
     processor.text = lambda goal: arrays["in/text_emb"]
-    seen: list[Tensor] = []
+    requests: list[Tensor] = []
     condition = policy.condition
 
     def watched(batch: DiffusionBatch, memory: Any = None, corner: Any = None) -> Tensor:
-        seen.append(condition(batch, memory, corner))
-        return seen[-1]
+        requests.append(condition(batch, memory, corner))
+        return requests[-1]
 
     monkeypatch.setattr(policy, "condition", watched)
     calls = sorted({name.split("/")[0] for name in arrays if name.startswith("call")})
@@ -338,5 +338,5 @@ def test_a_served_episode(folder: Path, golden: Any, monkeypatch: pytest.MonkeyP
         views = {name: arrays[f"{call}/{name}"].numpy() for name in ROBOMME_JOINT.camera_names}
         episode.set_view(views, arrays[f"{call}/state"].float().numpy())
         actions = policy.act(episode)[: about["action_exec_horizon"]]
-        close(seen[-1], arrays[f"{call}/global_cond"], SAMPLES)
+        close(requests[-1], arrays[f"{call}/global_cond"], SAMPLES)
         close(torch.from_numpy(actions).double(), arrays[f"{call}/actions"].double(), SAMPLES)

@@ -20,9 +20,9 @@ def moments(count: int, tokens: int = 3, width: int = 8, seed: int = 0) -> tuple
 def one_by_one(bank: MemoryBank, tokens: Tensor, times: Tensor) -> tuple[Tensor, BankState]:
     state, fused = bank.init_state(tokens.shape[1]), []
     for moment, time in zip(tokens, times.tolist(), strict=False):
-        answer = bank.read([state], moment[None])[0]
-        state = bank.update(state, moment, answer, time)
-        fused.append(answer)
+        output = bank.read([state], moment[None])[0]
+        state = bank.update(state, moment, output, time)
+        fused.append(output)
     return torch.stack(fused), state
 
 
@@ -39,14 +39,14 @@ def test_groups_side_by_side_equal_streams_one_by_one() -> None:
 
 
 @torch.no_grad()
-def test_banks_of_different_fill_answer_in_one_batch_as_alone() -> None:
+def test_banks_of_different_fill_reply_in_one_batch_as_alone() -> None:
     bank = MemoryBank(8, length=4)
     tokens, times = moments(5)
     states = [one_by_one(bank, tokens[:4], times)[1], bank.init_state(3), one_by_one(bank, tokens[:2], times)[1]]
     now = moments(3, seed=1)[0]
     together = bank.read(states, now)
-    for state, moment, answer in zip(states, now, together, strict=True):
-        torch.testing.assert_close(bank.read([state], moment[None])[0], answer)
+    for state, moment, output in zip(states, now, together, strict=True):
+        torch.testing.assert_close(bank.read([state], moment[None])[0], output)
     torch.testing.assert_close(bank.retrieve(states, now)[1], now[1])
 
 
@@ -88,23 +88,23 @@ def test_a_number_of_ddim_steps_that_no_stride_gives_is_refused() -> None:
 
 
 @torch.no_grad()
-def test_a_fresh_head_does_not_hear_the_perceptual_tokens_until_it_is_told_to() -> None:
+def test_a_fresh_head_does_not_hear_the_perceptual_tokens_until_it_is_reported_to() -> None:
     x, per = torch.randn(2, 5, 4), torch.randn(2, 6, 10)
-    for how, heard in (("zero", False), ("xavier", True)):
+    for how, reads_tokens in (("zero", False), ("xavier", True)):
         torch.manual_seed(0)
         head = Dit(DitConfig(16, 2, 2, how), action_dim=4, horizon=5, d_cognition=8, d_perceptual=10)
         torch.nn.init.normal_(head.output.weight)
         read = [head(x, torch.tensor([1, 2]), torch.ones(2, 1, 8), tokens) for tokens in (per, per + 1)]
-        assert torch.equal(*read) is not heard
+        assert torch.equal(*read) is not reads_tokens
 
 
 def test_guidance_of_one_is_no_guidance() -> None:
     torch.manual_seed(0)
     head = Dit(DitConfig(16, 1, 2), action_dim=4, horizon=5, d_cognition=8, d_perceptual=10)
     torch.nn.init.normal_(head.output.weight)
-    given = torch.randn(2, 5, 4), torch.tensor([1, 2]), torch.randn(2, 1, 8), torch.randn(2, 6, 10)
-    assert torch.equal(head.guided(*given, 1.0), head(*given))
-    assert not torch.allclose(head.guided(*given, 2.0), head(*given))
+    inputs = torch.randn(2, 5, 4), torch.tensor([1, 2]), torch.randn(2, 1, 8), torch.randn(2, 6, 10)
+    assert torch.equal(head.guided(*inputs, 1.0), head(*inputs))
+    assert not torch.allclose(head.guided(*inputs, 2.0), head(*inputs))
 
 
 def test_full_size_parameters_are_the_originals_to_the_number() -> None:
@@ -124,5 +124,5 @@ def test_full_size_parameters_are_the_originals_to_the_number() -> None:
     names = [*(f"vlm.{name}" for name in vlm.state_dict()), *core.state_dict()]
     table = memoryvla_table(names)
     assert set(table) == set(names)
-    theirs = [piece.path for pieces in table.values() for piece in pieces]
-    assert len(set(theirs)) == len(theirs) and "cog_mem_bank.gate_fusion_blocks.proj.weight" in theirs
+    paths = [piece.path for pieces in table.values() for piece in pieces]
+    assert len(set(paths)) == len(paths) and "cog_mem_bank.gate_fusion_blocks.proj.weight" in paths

@@ -81,10 +81,10 @@ def test_any_memory_stands_where_the_banks_stood(memory: str) -> None:
 
 def test_the_loss_depends_on_what_is_remembered_and_teaches_the_memory(policy: MemoryVlaPolicy) -> None:
     batch = policy.full_batch()
-    found = [policy(replace(batch, history=histories(policy, 1, seed)), draws(policy))[0] for seed in (0, 0, 1)]
-    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+    losses = [policy(replace(batch, history=histories(policy, 1, seed)), draws(policy))[0] for seed in (0, 0, 1)]
+    assert torch.equal(losses[0], losses[1]) and not torch.equal(losses[0], losses[2])
     policy.zero_grad()
-    found[0].backward()
+    losses[0].backward()
     component = policy.finetune_spec.component_of
     still = [n for n, p in policy.named_parameters() if component(n) == "memory" and not p.grad.any()]  # type: ignore[union-attr]
     assert all(name.endswith("key.bias") for name in still), still  # a bias of all keys alike changes no weight
@@ -129,19 +129,19 @@ def test_moments_of_a_group_do_not_read_each_other(policy: MemoryVlaPolicy) -> N
     singles = processor.collate(items)
     assert group.history is not None and group.history.features.ndim == 4 and group.valid.sum(1).tolist() == [3, 1]
     assert singles.times.tolist() == [[0], [8], [16]]
-    drawn = draws(policy, 2)
+    draws_ = draws(policy, 2)
     alone = {
         name: torch.cat([value[:1, :, :3].transpose(0, 2).flatten(1, 2), value[1:, :, 0].flatten(0, 0)])[:, :, None]
-        for name, value in drawn.items()
+        for name, value in draws_.items()
     }
-    together = policy(group, drawn)[0]
+    together = policy(group, draws_)[0]
     apart = policy(processor.collate([*items, items[0]]), alone)[0]
     torch.testing.assert_close(together, apart)
     chunk = policy.sample_actions(group.rows(slice(0, 1)), noise(policy), 2)
     torch.testing.assert_close(chunk, policy.sample_actions(processor.collate(items[2:]), noise(policy), 2))
 
 
-def test_each_moment_of_a_group_has_the_history_of_its_own_step(tmp_path: Path) -> None:
+def test_each_frame_of_a_group_has_the_history_of_its_step(tmp_path: Path) -> None:
     policy = recalling("actions", processor={"group_size": 3})  # it keeps next to no frames: a cache at once
     data = OmegaConf.to_container(compose("train", [f"data.cache.root={tmp_path}"]).data, resolve=True)
     samples = prepare_data(policy, data, 42, say=str).train  # type: ignore[arg-type]
@@ -150,7 +150,7 @@ def test_each_moment_of_a_group_has_the_history_of_its_own_step(tmp_path: Path) 
             assert moment["history"].step == time == moment["history"].positions[-1, 0]
 
 
-def test_an_episode_remembers_as_a_sample_does_and_writes_nothing(policy: MemoryVlaPolicy) -> None:
+def test_an_episode_stores_as_a_sample_does_and_saves_nothing(policy: MemoryVlaPolicy) -> None:
     front, still = moving_frames(12), np.zeros((12, 8), np.float32)
     episode = policy.start_episode("press the button", seed=3)
     episode.observe({"front": front, "wrist": front}, still, np.arange(12) < 5)
@@ -160,8 +160,8 @@ def test_an_episode_remembers_as_a_sample_does_and_writes_nothing(policy: Memory
     np.testing.assert_array_equal(policy.act(episode, 2), chunk)
     episode.noise_state = start
     batch = replace(policy.observation([episode]), history=stack_history([episode.gather_selection()]))
-    drawn = {name: value[None] for name, value in episode.draw().items()}
-    expected = policy.require_processor().absolute_actions(policy.sample_actions(batch, drawn, 2), torch.zeros(1, 8))
+    draws_ = {name: value[None] for name, value in episode.draw().items()}
+    expected = policy.require_processor().absolute_actions(policy.sample_actions(batch, draws_, 2), torch.zeros(1, 8))
     np.testing.assert_allclose(chunk, expected[0], atol=1e-5)
     other = policy.start_episode("press the button", seed=4)
     other.observe({"front": moving_frames(12, seed=9), "wrist": front}, still)
@@ -215,14 +215,14 @@ def test_it_is_evaluated_served_probed_and_inspected(trained: Path, tmp_path: Pa
     episode.observe({"front": frames, "wrist": frames}, states, np.arange(5) < 4)
     expected = policy.act(episode, 2)
     with Served(policy) as served, served.client() as client:
-        answer = client.infer(challenge(frames, frames, states, first=True))["actions"]
-    np.testing.assert_allclose(answer, expected[: policy.embodiment.action.execute], rtol=1e-4, atol=1e-5)
+        reply = client.infer(challenge(frames, frames, states, first=True))["actions"]
+    np.testing.assert_allclose(reply, expected[: policy.embodiment.action.execute], rtol=1e-4, atol=1e-5)
 
     recordings = all_recordings(open_sources(["sample"], policy.embodiment))
-    chosen = OfflineSettings(draws=1, moments=1, flow_steps=2)
+    settings = OfflineSettings(draws=1, moments=1, flow_steps=2)
     arms = read_arms(["nodemo", "delay:64"])
-    found = probe_offline(policy, arms, recordings[:1], recordings, tmp_path / "lines.jsonl", chosen)
-    assert all(np.isfinite(line.change) for line in found if isinstance(line, MomentLine))
+    results = probe_offline(policy, arms, recordings[:1], recordings, tmp_path / "lines.jsonl", settings)
+    assert all(np.isfinite(line.change) for line in results if isinstance(line, MomentLine))
 
     console = Console(record=True, width=200, file=io.StringIO())
     show_checkpoint(trained, console)
@@ -248,14 +248,14 @@ def test_the_memory_learns_in_full_beside_adapters(policy: MemoryVlaPolicy) -> N
     apply_finetuning(policy, freeze_vision=False)
 
 
-def test_a_cache_is_of_the_pictures_that_its_tower_saw(policy: MemoryVlaPolicy) -> None:
-    plain = recalling(processor={"jpeg": False})
-    assert torch.equal(policy.vlm.vision.dino.cls_token, plain.vlm.vision.dino.cls_token)
-    assert policy.vision_fingerprint() == recalling().vision_fingerprint() != plain.vision_fingerprint()
+def test_a_cache_is_of_the_images_that_its_tower_saw(policy: MemoryVlaPolicy) -> None:
+    baseline = recalling(processor={"jpeg": False})
+    assert torch.equal(policy.vlm.vision.dino.cls_token, baseline.vlm.vision.dino.cls_token)
+    assert policy.vision_fingerprint() == recalling().vision_fingerprint() != baseline.vision_fingerprint()
 
 
 @pytest.mark.parametrize(("model", "words"), [("memoryvla", {}), ("memoryvla", {"memory": "ttt"}), ("openvla_oft", {})])
-def test_what_a_checkpoint_to_start_from_lacks_is_drawn(model: str, words: dict[str, Any]) -> None:
+def test_what_a_checkpoint_to_start_from_lacks_is_rendered(model: str, words: dict[str, Any]) -> None:
     """Training does not draw what `init_from` will replace: openvla-7b has neither heads nor banks."""
     torch.use_deterministic_algorithms(True)  # memory that nobody has written is nan then
     try:

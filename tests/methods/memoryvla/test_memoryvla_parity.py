@@ -93,19 +93,21 @@ def test_memoryvla_banks_of_every_kind(folder: Path, meta: dict[str, Any], weigh
 
 
 def compare_banks(golden: dict[str, Tensor], kind: str, states: list[BankState]) -> None:
-    held = golden[f"{kind}/bank_times"]
+    stored = golden[f"{kind}/bank_times"]
     for i, state in enumerate(states):
         assert len(state) == int(golden[f"{kind}/count"][i])
-        if int(held[i].min()) >= -1:  # −2: the original keeps no time there, and its record no merges
+        if int(stored[i].min()) >= -1:  # −2: the original keeps no time there, and its record no merges
             assert state.merged == int(golden[f"{kind}/merged_at"][i])
-            assert state.times.tolist() == held[i][: len(state)].tolist()
+            assert state.times.tolist() == stored[i][: len(state)].tolist()
         if f"{kind}/bank_feats" in golden:
             near(state.entries, golden[f"{kind}/bank_feats"][i, : len(state)])
 
 
 @pytest.mark.parametrize("role", ROLES)
 @torch.no_grad()
-def test_memoryvla_episodes_in_turn_do_not_meet(folder: Path, meta: dict[str, Any], weights: Any, role: str) -> None:
+def test_memoryvla_episodes_interleaved_do_not_meet(
+    folder: Path, meta: dict[str, Any], weights: Any, role: str
+) -> None:
     golden, kind = arrays(folder, "bank"), f"{role}/interleaved"
     one = bank(meta["sizes"], role, weights)
     tokens, times, ids = (golden[f"{kind}/{name}"] for name in ("tokens", "times", "ids"))
@@ -128,13 +130,13 @@ def test_memoryvla_groups_of_a_batch_and_their_gradients(
     assert tokens.grad is not None
     near(tokens.grad, golden[f"{kind}/grad_tokens"], LONG)
     word = {"cog": "cognition_bank", "per": "perceptual_bank"}[role]
-    found = {golden_name(f"{word}.{n}").split(".", 1)[1]: p.grad for n, p in one.named_parameters()}
+    gradients_ = {golden_name(f"{word}.{n}").split(".", 1)[1]: p.grad for n, p in one.named_parameters()}
     stored = [name for name in golden if name.startswith(f"{kind}/grad/")]
     assert stored
     for name in stored:
-        near(found[name.removeprefix(f"{kind}/grad/")], golden[name], LONG)  # type: ignore[arg-type]
+        near(gradients_[name.removeprefix(f"{kind}/grad/")], golden[name], LONG)  # type: ignore[arg-type]
     for name, norm in meta["cases"][f"{kind}/grad_l2"].items():
-        assert found[name].norm().item() == pytest.approx(norm, rel=LONG), name  # type: ignore[union-attr]
+        assert gradients_[name].norm().item() == pytest.approx(norm, rel=LONG), name  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -152,8 +154,8 @@ def test_memoryvla_streams_live_across_batches(folder: Path, meta: dict[str, Any
         for run in places:
             if int(ids[run[0]]) != episode:
                 state = one.init_state(tokens.shape[1])
-            answer, (state,) = one.run(tokens[run], times[run], groups_of(len(run), len(run)), [state])
-            fused.append(answer)
+            output, (state,) = one.run(tokens[run], times[run], groups_of(len(run), len(run)), [state])
+            fused.append(output)
             episode = int(ids[run[0]])
         near(torch.cat(fused), golden[f"{role}/{name}/fused"])
         assert golden[f"{role}/{name}/episodes_left"].tolist() == [episode]
@@ -204,13 +206,13 @@ def test_memoryvla_head_loss_and_gradients(folder: Path, meta: dict[str, Any], n
 
 
 def gradients(golden: dict[str, Tensor], stored: str, norms: dict[str, float], network: Any, prefix: str = "") -> None:
-    found = {golden_name(name): p.grad for name, p in network.named_parameters() if p.grad is not None}
+    grads = {golden_name(name): p.grad for name, p in network.named_parameters() if p.grad is not None}
     for name in (name for name in golden if name.startswith(stored)):
-        ours = found[prefix + name.removeprefix(stored)]
-        near(ours.reshape(golden[name].shape), golden[name], LONG)
+        actual = grads[prefix + name.removeprefix(stored)]
+        near(actual.reshape(golden[name].shape), golden[name], LONG)
     for name, norm in norms.items():
-        full = name if name in found else prefix + name
-        assert found[full].norm().item() == pytest.approx(norm, rel=LONG, abs=1e-9), name
+        full = name if name in grads else prefix + name
+        assert grads[full].norm().item() == pytest.approx(norm, rel=LONG, abs=1e-9), name
 
 
 @torch.no_grad()

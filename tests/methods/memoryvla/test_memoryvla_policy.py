@@ -37,7 +37,7 @@ def groups(policy: MemoryVlaPolicy) -> GroupDataset:
     return GroupDataset(open_sources(["sample"], policy.embodiment), policy.require_processor())
 
 
-def test_a_group_is_of_one_episode_in_the_order_of_time_and_drawn_anew_every_epoch() -> None:
+def test_a_group_is_of_one_episode_in_the_order_of_time_and_sampled_anew_every_epoch() -> None:
     policy = tiny()
     data = groups(policy)
     first, again = data[1], data[1]
@@ -52,7 +52,7 @@ def test_a_group_is_of_one_episode_in_the_order_of_time_and_drawn_anew_every_epo
         data[len(data)]
 
 
-def test_the_group_before_a_step_is_where_the_policy_would_have_been_asked() -> None:
+def test_the_group_before_a_step_is_where_the_policy_would_have_been_requested() -> None:
     policy = tiny()
     data = groups(policy)
     _, _, frame = data.locate(30)
@@ -78,15 +78,15 @@ def test_the_loss_repeats_with_its_draws_and_reaches_every_part() -> None:
 
 
 @torch.no_grad()
-def test_pictures_are_changed_by_given_draws_alone_whatever_stands_beside_them() -> None:
+def test_images_are_changed_by_their_draws_alone_whatever_stands_beside_them() -> None:
     policy = tiny().train()
     batch = batch_of(policy)
     draws = policy.training_noise(2, torch.Generator().manual_seed(0))
-    drawn = [draws | policy.augmentation_params(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
-    assert drawn[0]["changes"].shape == (2, 4, 6)
-    first, again, other = (policy(batch, each)[0] for each in drawn)
+    draws_ = [draws | policy.augmentation_params(2, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    assert draws_[0]["changes"].shape == (2, 4, 6)
+    first, again, other = (policy(batch, each)[0] for each in draws_)
     assert torch.equal(first, again) and not torch.equal(first, other)
-    halves = [policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in drawn[0].items()}) for i in range(2)]
+    halves = [policy(batch.rows(slice(i, i + 1)), {k: v[i : i + 1] for k, v in draws_[0].items()}) for i in range(2)]
     apart = sum(loss for loss, _ in halves) / 2  # pixels are rounded, so that a last bit may become a level
     assert abs(apart - first) < abs(other - first) / 20
     assert policy.eval().augmentation_params(2, torch.Generator()) == {}
@@ -106,25 +106,25 @@ def test_groups_of_a_batch_and_their_padding_do_not_meet() -> None:
 
 
 @torch.no_grad()
-def test_actions_repeated_past_the_end_count_only_where_they_are_asked_to(monkeypatch) -> None:
+def test_actions_repeated_past_the_end_count_only_where_they_are_requested(monkeypatch) -> None:
     policy = tiny()
     data, collate = groups(policy), policy.require_processor().collate
-    plain = collate([data[0], data.observation(data.steps - 1)])
+    baseline = collate([data[0], data.observation(data.steps - 1)])
     data.mask_padding = True
     batch = collate([data[0], data.observation(data.steps - 1)])
-    assert plain.action_mask is None and batch.action_mask.shape == batch.actions.shape[:3]
+    assert baseline.action_mask is None and batch.action_mask.shape == batch.actions.shape[:3]
     counted = batch.action_mask[batch.valid].tile(policy.sizes.repeats, 1)
     assert 0 < counted.sum() < counted.numel()
     losses = torch.rand(counted.shape, generator=torch.Generator().manual_seed(0))
     monkeypatch.setattr(policy.core, "copies_error", lambda *_: losses)
-    torch.testing.assert_close(policy(plain)[0], losses.mean())
+    torch.testing.assert_close(policy(baseline)[0], losses.mean())
     expected = torch.stack(
-        [row[seen].mean() if seen.any() else row.new_zeros(()) for row, seen in zip(losses, counted, strict=True)]
+        [row[valid].mean() if valid.any() else row.new_zeros(()) for row, valid in zip(losses, counted, strict=True)]
     )
     torch.testing.assert_close(policy(batch)[0], expected.mean())
 
 
-def test_acting_twice_at_one_frame_writes_once_and_gives_the_same_chunk() -> None:
+def test_acting_twice_at_one_frame_stores_one_entry_and_gives_the_same_chunk() -> None:
     policy = tiny()
     episode = policy.start_episode("press the button", seed=3)
     episode.observe(frames(1), states(1))
@@ -141,20 +141,20 @@ def test_acting_twice_at_one_frame_writes_once_and_gives_the_same_chunk() -> Non
 
 
 @pytest.mark.parametrize(("length", "written"), [(17, 2), (18, 3), (1, 0), (8, 1)])
-def test_every_eighth_frame_of_the_video_is_written_but_not_its_last(length: int, written: int) -> None:
+def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, written: int) -> None:
     """However the frames arrive: at once, or one by one."""
     policy = tiny()
     video, now = frames(length), frames(1, seed=1)
-    whole, parts = (policy.start_episode("press the button") for _ in range(2))
+    straight, parts = (policy.start_episode("press the button") for _ in range(2))
     together = {name: np.concatenate([video[name], now[name]]) for name in video}
-    whole.observe(together, states(length + 1), is_demo=np.arange(length + 1) < length)
+    straight.observe(together, states(length + 1), is_demo=np.arange(length + 1) < length)
     for i in range(length):
         parts.observe({name: video[name][i : i + 1] for name in video}, states(1), is_demo=True)
     parts.observe(now, states(1))
-    for episode in (whole, parts):
+    for episode in (straight, parts):
         assert episode.banks.count == written
-    torch.testing.assert_close(whole.banks.cognition.entries, parts.banks.cognition.entries, rtol=1e-4, atol=1e-5)
-    np.testing.assert_allclose(policy.act(whole), policy.act(parts), atol=1e-4)
+    torch.testing.assert_close(straight.banks.cognition.entries, parts.banks.cognition.entries, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(policy.act(straight), policy.act(parts), atol=1e-4)
 
 
 def test_episodes_in_one_batch_act_as_alone_and_their_past_matters() -> None:
@@ -178,13 +178,13 @@ def test_episodes_in_one_batch_act_as_alone_and_their_past_matters() -> None:
 def test_acting_over_a_stream_equals_a_group_of_its_moments() -> None:
     policy = tiny()
     processor = policy.require_processor()
-    episode, pictures = policy.start_episode("press the button"), frames(3)
+    episode, images = policy.start_episode("press the button"), frames(3)
     for i in range(3):
-        episode.observe({name: pictures[name][i : i + 1] for name in pictures}, states(1))
+        episode.observe({name: images[name][i : i + 1] for name in images}, states(1))
         chunk = policy.act(episode)
     ids, mask = processor.prompt("press the button")
-    shown, valid = processor.resized(pictures["front"])[None], torch.ones(1, 3, dtype=torch.bool)
-    group = GroupBatch(shown, ids.expand(1, 3, -1), mask.expand(1, 3, -1), torch.arange(3)[None], valid)
+    clip, valid = processor.resized(images["front"])[None], torch.ones(1, 3, dtype=torch.bool)
+    group = GroupBatch(clip, ids.expand(1, 3, -1), mask.expand(1, 3, -1), torch.arange(3)[None], valid)
     last = policy.start_episode("press the button")
     draws = [last.draw() for _ in range(3)][-1]
     normalised = policy.sample_actions(group, {"noise": draws["noise"][None]})

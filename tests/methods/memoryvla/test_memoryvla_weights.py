@@ -15,7 +15,7 @@ from mme_vla.weights.source import detect_format
 from mme_vla.weights.writers import check_target, write_policy
 
 
-def test_a_checkpoint_is_written_by_parts_and_read_again(tmp_path: Path) -> None:
+def test_a_checkpoint_is_saved_by_components_and_read_again(tmp_path: Path) -> None:
     policy, other = (build_policy("memoryvla", seed=seed) for seed in (1, 2))
     write_policy(policy, tmp_path, "memoryvla", torch.float32, None)
     file = tmp_path / "model.pt"
@@ -37,8 +37,10 @@ def of_vlm(policy: Policy) -> dict[str, torch.Tensor]:
 def test_openvla_is_a_start_that_has_nothing_of_banks_and_head(tmp_path: Path) -> None:
     """Small files in the layout of `openvla/openvla-7b`, and in that of its Prismatic original."""
     openvla = build_policy("openvla_oft", seed=1, backbone={"vision": {"image_size": 56}})  # as large as memoryvla_tiny
-    theirs = openvla_adapter(openvla).export(openvla.state_dict())
-    base = {name.removeprefix(VLA): tensor.contiguous() for name, tensor in theirs.items() if name.startswith(VLA)}
+    source_names = openvla_adapter(openvla).export(openvla.state_dict())
+    base = {
+        name.removeprefix(VLA): tensor.contiguous() for name, tensor in source_names.items() if name.startswith(VLA)
+    }
     save_file(base, tmp_path / "model.safetensors")
     expected = {
         n.removeprefix("backbone."): t for n, t in openvla.state_dict().items() if n.startswith("backbone.vlm.")
@@ -52,12 +54,12 @@ def test_openvla_is_a_start_that_has_nothing_of_banks_and_head(tmp_path: Path) -
     with pytest.raises(UserError, match="missing"):
         load_weights(policy, tmp_path)
 
-    whole = memoryvla_adapter(policy).export(policy.state_dict())
+    names_ = memoryvla_adapter(policy).export(policy.state_dict())
     model: dict[str, dict[str, torch.Tensor]] = {}
-    for name, tensor in whole.items():
-        part, _, own = name.partition(".")
+    for name, tensor in names_.items():
+        part, _, stem = name.partition(".")
         if part in ("vision_backbone", "projector", "llm_backbone"):
-            model.setdefault(part, {})[own] = tensor
+            model.setdefault(part, {})[stem] = tensor
     torch.save({"model": model}, tmp_path / "prismatic.pt")
     other = build_policy("memoryvla", seed=3)
     took = transfer(other, tmp_path / "prismatic.pt")

@@ -58,8 +58,8 @@ def test_adapters_are_the_published_ones_and_all_that_learns_beside_head_and_sta
 ) -> None:
     with torch.device("meta"):
         learning = apply_finetuning(policy, "lora", freeze_vision=False, **OFT)
-    ours = {name: shape for name, shape in named(policy).items() if ".lora_" in name}
-    assert ours == {f"{VLA}{name.removeprefix(WRAPPER)}": shape for name, shape in published["lora"].items()}
+    shapes = {name: shape for name, shape in named(policy).items() if ".lora_" in name}
+    assert shapes == {f"{VLA}{name.removeprefix(WRAPPER)}": shape for name, shape in published["lora"].items()}
     counts = published["counts"]
     assert learning["vision"] == counts["lora_vision"]
     assert learning["vlm"] == counts["lora_projector"] + counts["lora_llama"]

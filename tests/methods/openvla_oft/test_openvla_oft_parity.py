@@ -66,7 +66,7 @@ def stages(request: pytest.FixtureRequest, folder: Path) -> Stages:
 
 
 @torch.no_grad()
-def test_openvla_oft_tokens_of_pictures_state_and_memory(stages: Stages) -> None:
+def test_openvla_oft_tokens_of_images_state_and_memory(stages: Stages) -> None:
     golden, backbone = stages.golden, stages.backbone
     pixels = golden["in/pixel_values"][:, :6]
     for name, tower, three in (
@@ -93,7 +93,7 @@ def test_openvla_oft_sequence_hidden_states_and_read_out(stages: Stages) -> None
     near(embedded, golden["out/inputs_embeds"] * real[..., None])
     after: list[Tensor] = []
     layers = backbone.vlm.language.model.layers
-    hooks = [layer.register_forward_hook(lambda _layer, _given, out: after.append(out)) for layer in layers]
+    hooks = [layer.register_forward_hook(lambda _layer, _inputs, out: after.append(out)) for layer in layers]
     last = backbone.hidden(sequence)
     for hook in hooks:
         hook.remove()
@@ -107,19 +107,19 @@ def test_openvla_oft_loss_and_gradients(stages: Stages) -> None:
     golden, about, policy = stages.golden, stages.about, stages.policy
     memory = policy.encode_memory(stages.batch.history)
     observation = stages.backbone.blocks_of(stages.batch, fused(stages.backbone, golden))
-    answer = stages.backbone.predict_from(policy.integration.inject(observation, memory).blocks)
-    near(answer.detach(), golden["out/predicted_actions"])
-    errors = absolute_error(answer, golden["in/actions"])
+    output = stages.backbone.predict_from(policy.integration.inject(observation, memory).blocks)
+    near(output.detach(), golden["out/predicted_actions"])
+    errors = absolute_error(output, golden["in/actions"])
     metrics, detached = about["metrics"], errors.detach()
     near(detached.mean(), golden["out/loss"])
     near(detached[:, 0].mean(), torch.tensor(metrics["curr_action_l1_loss"]))
     near(detached[:, 1:].mean(), torch.tensor(metrics["next_actions_l1_loss"]))
     policy.zero_grad()
     errors.mean().backward()
-    found = {golden_name(name): p.grad for name, p in policy.named_parameters() if p.grad is not None}
+    gradients = {golden_name(name): p.grad for name, p in policy.named_parameters() if p.grad is not None}
     for name, norm in about["grad_l2"].items():
-        assert float(found[name].norm()) == pytest.approx(norm, rel=GRADIENT), name
-    assert not set(about["no_gradient"]) & set(found)
+        assert float(gradients[name].norm()) == pytest.approx(norm, rel=GRADIENT), name
+    assert not set(about["no_gradient"]) & set(gradients)
     learning = {golden_name(name) for name, parameter in policy.named_parameters() if parameter.requires_grad}
     assert learning == set(about["trainable"])
 
@@ -129,8 +129,8 @@ def test_openvla_oft_prediction_from_the_prompt_alone(stages: Stages) -> None:
     """One sample at a time in the original; here all in one batch."""
     golden, stats = stages.golden, stages.about["norm_stats"]["proprio"]
     quantiles = ClippedQuantiles.of(SimpleNamespace(**{name: stats[name] for name in ("q01", "q99", "min", "max")}))
-    asked = replace(stages.batch, proprio=quantiles.normalize(golden["in/raw_proprio"].double()).float())
-    observation = stages.backbone.blocks_of(asked, fused(stages.backbone, golden))
+    observation_ = replace(stages.batch, proprio=quantiles.normalize(golden["in/raw_proprio"].double()).float())
+    observation = stages.backbone.blocks_of(observation_, fused(stages.backbone, golden))
     blocks = stages.policy.integration.inject(observation, stages.memory).blocks
     near(stages.backbone.predict_from(blocks), golden["out/predict_normalised"])
 
@@ -149,16 +149,16 @@ def test_openvla_oft_language_model_alone(folder: Path) -> None:
         )
         state = {name: openvla_name(f"backbone.vlm.{name}") for name in vlm.state_dict()}
         values = {
-            ours: rule_weight(theirs, tuple(about["parameters"][theirs]), about["weight_seed"])
-            for ours, theirs in state.items()
-            if theirs in about["parameters"]
+            target: rule_weight(source, tuple(about["parameters"][source]), about["weight_seed"])
+            for target, source in state.items()
+            if source in about["parameters"]
         }
         assert len(values) == len(about["parameters"])
         vlm.load_state_dict(values, strict=False)
         mask = golden["in/mask"]
-        seen = additive_mask(mask[:, None].expand(-1, mask.shape[1], -1), torch.float32)
+        allowed = additive_mask(mask[:, None].expand(-1, mask.shape[1], -1), torch.float32)
         places = torch.arange(mask.shape[1]).expand(len(mask), -1)
-        hidden = vlm.read(golden["in/embeds"], seen, places, every_layer=True)
+        hidden = vlm.read(golden["in/embeds"], allowed, places, every_layer=True)
         assert len(hidden) == sum(name.startswith("out/hidden") for name in golden)
         best[heads] = max(
             float(((state - golden[f"out/hidden{i}"]).abs() * mask[..., None]).max()) for i, state in enumerate(hidden)

@@ -26,12 +26,12 @@ def folder() -> Path:
     return baselines_folder("openvla_oft")
 
 
-def channels_first(picture: Tensor) -> Tensor:
-    return picture.permute(2, 0, 1)[None]
+def channels_first(image: Tensor) -> Tensor:
+    return image.permute(2, 0, 1)[None]
 
 
-def same_levels(ours: Tensor, golden: Tensor) -> None:
-    off = (ours.int() - golden.int()).abs()
+def same_levels(actual: Tensor, golden: Tensor) -> None:
+    off = (actual.int() - golden.int()).abs()
     assert int(off.max()) <= 1 and float((off > 0).float().mean()) <= ONE_LEVEL
 
 
@@ -84,8 +84,8 @@ def statistics(folder: Path) -> tuple[ClippedQuantiles, dict[str, Tensor], np.nd
     golden, about = case(folder, "policy")
     stats = about["norm_stats"]["action"]
     mask = np.array(stats["mask"])
-    given = SimpleNamespace(**{name: np.array(stats[name]) for name in ("q01", "q99", "min", "max")})
-    return ClippedQuantiles.of(given, mask), golden, mask
+    statistics_ = SimpleNamespace(**{name: np.array(stats[name]) for name in ("q01", "q99", "min", "max")})
+    return ClippedQuantiles.of(statistics_, mask), golden, mask
 
 
 def test_openvla_oft_actions_come_back_from_their_quantiles(folder: Path) -> None:
@@ -95,7 +95,7 @@ def test_openvla_oft_actions_come_back_from_their_quantiles(folder: Path) -> Non
     assert error(actions, golden["out/predict_actions"]) <= 1e-5 * float(golden["out/predict_actions"].abs().max())
 
 
-def test_numbers_outside_the_quantiles_are_clipped_and_those_that_never_moved_are_zero() -> None:
+def test_numbers_outside_the_quantiles_are_clipped_and_those_that_never_shifted_are_zero() -> None:
     stats = SimpleNamespace(q01=[0.0, 5.0, 0.0], q99=[2.0, 5.0, 1.0], min=[-1.0, 5.0, 0.0], max=[3.0, 5.0, 1.0])
     quantiles = ClippedQuantiles.of(stats, np.array([True, True, False]))
     x = torch.tensor([[1.0, 5.0, 7.0], [4.0, 5.0, -7.0]], dtype=torch.float64)
@@ -115,7 +115,7 @@ def test_draws_of_changes_stay_in_their_ranges() -> None:
     assert ((high - low) > 0.98 * (expected[1] - expected[0])).all()
 
 
-def test_a_picture_of_the_right_size_is_not_resampled() -> None:
+def test_an_image_of_the_right_size_is_not_resampled() -> None:
     frame = np.random.default_rng(0).integers(0, 256, (2, 8, 8, 3), dtype=np.uint8)
     assert pictures.lanczos(frame, 8) is frame
     assert pictures.lanczos(frame, 6).shape == (2, 6, 6, 3)

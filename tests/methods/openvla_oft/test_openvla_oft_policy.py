@@ -38,7 +38,7 @@ def batch_for(policy: OpenVlaPolicy) -> Batch:
     return replace(batch, proprio=torch.rand(len(batch.prompt), policy.embodiment.state.width) * 2 - 1)
 
 
-def test_it_keeps_a_backbones_promises() -> None:
+def test_it_keeps_a_backbones_contract() -> None:
     check_backbone("openvla", **SMALL)
 
 
@@ -64,10 +64,10 @@ def test_the_state_and_the_memory_reach_the_actions_and_padding_does_not() -> No
     policy = tiny("openvla_oft_framesamp_context")
     batch = batch_for(policy)
     assert batch.proprio is not None and batch.history is not None
-    answer = policy.sample_actions(batch)
+    actions = policy.sample_actions(batch)
 
     def off(other: Batch) -> Tensor:
-        return (policy.sample_actions(other) - answer).abs().max()
+        return (policy.sample_actions(other) - actions).abs().max()
 
     assert off(replace(batch, proprio=-batch.proprio)) > 1e-4
     features, mask = batch.history.features, batch.history.mask[..., None]
@@ -98,7 +98,7 @@ def test_a_prompt_that_is_cut_still_ends_in_the_opening_piece() -> None:
     assert mask.all() and int(ids[-1]) == processor.tokenizer.piece("▁")
 
 
-def test_training_shows_crops_of_their_own_and_acting_the_middle() -> None:
+def test_training_uses_random_crops_and_acting_the_middle() -> None:
     policy = tiny()
     images = torch.randint(0, 256, (2, 2, 3, 32, 32), dtype=torch.uint8)
     batch = replace(batch_for(policy), images=images.repeat(1, 1, 1, 4, 4)[..., :112, :112])

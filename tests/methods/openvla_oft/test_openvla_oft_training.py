@@ -82,7 +82,7 @@ def test_only_steps_with_a_full_chunk_are_learned_from_and_quantiles_are_exact()
     assert item["proprio"].abs().max() <= 1 and item["actions"].abs().max() <= 1
 
 
-def test_the_frozen_base_is_held_in_bfloat16_and_what_learns_in_float32() -> None:
+def test_the_frozen_base_is_grasped_in_bfloat16_and_what_learns_in_float32() -> None:
     policy = build_policy(
         "openvla_oft", policy={"compute_dtype": "bfloat16"}, backbone={"vision": {"image_size": 32, "patch_size": 2}}
     )

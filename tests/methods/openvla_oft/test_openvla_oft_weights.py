@@ -34,7 +34,7 @@ def equal(one: Policy, other: Policy) -> bool:
     return all(torch.equal(value, theirs[name]) for name, value in one.state_dict().items())
 
 
-def test_a_run_is_written_in_the_published_names_and_read_again(tmp_path: Path) -> None:
+def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) -> None:
     policy = built()
     folder = written(policy, tmp_path / "run")
     assert detect_format(folder) == "openvla"
@@ -82,17 +82,17 @@ def test_a_run_that_holds_its_adapters_alone_is_read_beside_its_base(tmp_path: P
     for name, parameter in policy.named_parameters():
         if ".lora_" in name:
             torch.nn.init.normal_(parameter, generator=generator)
-            theirs = str(openvla_name(name)).removeprefix(VLA).replace(".default.", ".")
-            adapters[f"base_model.model.{theirs}"] = parameter.detach().clone()
+            source = str(openvla_name(name)).removeprefix(VLA).replace(".default.", ".")
+            adapters[f"base_model.model.{source}"] = parameter.detach().clone()
     save_file(adapters, run / "lora_adapter" / "adapter_model.safetensors")
-    said = {"r": 2, "lora_alpha": 3.0, "base_model_name_or_path": "openvla/openvla-7b"}
-    (run / "lora_adapter" / "adapter_config.json").write_text(json.dumps(said))
+    config = {"r": 2, "lora_alpha": 3.0, "base_model_name_or_path": "openvla/openvla-7b"}
+    (run / "lora_adapter" / "adapter_config.json").write_text(json.dumps(config))
     merge_adapters(policy)
     read = load_weights(built(seed=2), run, base=base)
-    merged, found, fresh = policy.state_dict(), read.state_dict(), built().state_dict()
+    merged, loaded, fresh = policy.state_dict(), read.state_dict(), built().state_dict()
     for name, tensor in merged.items():
-        torch.testing.assert_close(found[name], tensor, msg=name)
-    assert sum(not torch.equal(tensor, fresh[name]) for name, tensor in found.items()) == len(adapters) // 2
+        torch.testing.assert_close(loaded[name], tensor, msg=name)
+    assert sum(not torch.equal(tensor, fresh[name]) for name, tensor in loaded.items()) == len(adapters) // 2
     with pytest.raises(UserError, match=r"adapters apart .*openvla/openvla-7b.*base="):
         load_weights(built(seed=2), run)
     with pytest.raises(UserError, match="leave it out"):

@@ -20,7 +20,7 @@ def tensor(array: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(array)
 
 
-def test_a_depth_picture_becomes_world_points(golden: dict[str, np.ndarray]) -> None:
+def test_a_depth_image_becomes_world_points(golden: dict[str, np.ndarray]) -> None:
     inputs = [golden[f"unproject/{name}"] for name in ("depth", "intrinsic", "extrinsic_world_to_camera")]
     assert relative_error(unproject(*inputs), golden["unproject/points"]) < TOLERANCE
     # The benchmark writes extrinsics without their last row.
@@ -30,9 +30,9 @@ def test_a_depth_picture_becomes_world_points(golden: dict[str, np.ndarray]) -> 
 def test_points_outside_the_bounds_are_dropped(golden: dict[str, np.ndarray]) -> None:
     cube = Cube.of(golden["bound/bounds"])
     for number, (points, features) in enumerate(zip(golden["bound/points"], golden["bound/features"], strict=True)):
-        kept = cube.inside(tensor(points)).numpy()
-        assert np.array_equal(points[kept], golden[f"bound/kept{number}"])
-        assert np.array_equal(features[kept], golden[f"bound/kept_features{number}"])
+        inside = cube.inside(tensor(points)).numpy()
+        assert np.array_equal(points[inside], golden[f"bound/kept{number}"])
+        assert np.array_equal(features[inside], golden[f"bound/kept_features{number}"])
 
 
 @pytest.mark.parametrize("shape", ["cube", "box"])
@@ -43,7 +43,7 @@ def test_bounds_become_a_cube_and_back(golden: dict[str, np.ndarray], shape: str
     assert relative_error(cube.back(local), golden[f"place/{shape}/back"]) < TOLERANCE
 
 
-def test_a_closer_look_and_back(golden: dict[str, np.ndarray]) -> None:
+def test_a_closer_view_and_back(golden: dict[str, np.ndarray]) -> None:
     centre = tensor(golden["zoom/centre"])
     local = zoom(tensor(golden["zoom/points"]), centre)
     assert relative_error(local, golden["zoom/local"]) < TOLERANCE
@@ -95,20 +95,20 @@ def test_rotations_are_the_bins_of_the_original(golden: dict[str, np.ndarray]) -
 
 
 def test_rotations_go_to_bins_and_back_within_half_a_bin() -> None:
-    drawn = torch.randn(200, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    quaternions = torch.nn.functional.normalize(drawn, dim=1)
+    sampled = torch.randn(200, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    quaternions = torch.nn.functional.normalize(sampled, dim=1)
     back = geometry.from_bins(geometry.to_bins(quaternions, 360), 360)
-    turn = 2 * torch.rad2deg(torch.acos((quaternions * back).sum(1).abs().clamp(max=1)))
-    assert turn.max() < 2  # three angles, each off by half a degree at most
+    angle = 2 * torch.rad2deg(torch.acos((quaternions * back).sum(1).abs().clamp(max=1)))
+    assert angle.max() < 2  # three angles, each off by half a degree at most
 
 
 def test_the_renderer_follows_its_rules_to_the_pixel() -> None:
     golden = load("render")
     points, features, side = tensor(golden["points"]), tensor(golden["features"]), int(golden["resolution"])
-    plain = geometry.z_buffer(points, features, side)
-    splats = geometry.splat(*plain, float(golden["radius"]))
-    for kind, (picture, depth) in {"plain": plain, "splat": splats}.items():
-        assert relative_error(picture, golden[f"{kind}_image"]) < TOLERANCE
+    nearest = geometry.z_buffer(points, features, side)
+    splats = geometry.splat(*nearest, float(golden["radius"]))
+    for kind, (image, depth) in {"plain": nearest, "splat": splats}.items():
+        assert relative_error(image, golden[f"{kind}_image"]) < TOLERANCE
         assert relative_error(depth, golden[f"{kind}_depth"]) < TOLERANCE
     assert (
         relative_error(geometry.render(points, features, side, float(golden["radius"])), golden["output"]) < TOLERANCE
@@ -117,27 +117,27 @@ def test_the_renderer_follows_its_rules_to_the_pixel() -> None:
 
 def test_what_is_behind_a_camera_stands_before_everything() -> None:
     points = torch.tensor([[0.0, 0.0, 0.5], [0.0, 0.0, 1.5]])  # the second is above the eye of the view from the top
-    pictures, depth = geometry.z_buffer(points, torch.tensor([[1.0], [2.0]]), 4)
-    assert pictures[0, 2, 2].item() == 2.0
+    images, depth = geometry.z_buffer(points, torch.tensor([[1.0], [2.0]]), 4)
+    assert images[0, 2, 2].item() == 2.0
     assert depth[0, 2, 2].item() == 0.0
 
 
-def test_points_that_are_no_numbers_or_out_of_sight_leave_no_trace() -> None:
+def test_points_that_are_no_numbers_or_out_of_view_leave_no_trace() -> None:
     points = torch.tensor([[float("nan"), 0.0, 0.0], [3.0, 3.0, 3.0]])
-    pictures, depth = geometry.z_buffer(points, torch.ones(2, 1), 8)
-    assert not pictures.any()
+    images, depth = geometry.z_buffer(points, torch.ones(2, 1), 8)
+    assert not images.any()
     assert (depth == geometry.EMPTY).all()
 
 
-def test_virtual_pictures_have_ten_channels_of_known_meaning() -> None:
+def test_virtual_images_have_ten_channels_of_known_meaning() -> None:
     points = torch.rand(50, 3) - 0.5
-    seen = geometry.virtual_images(points, torch.rand(50, 3), 14)
-    assert seen.shape == (geometry.VIEWS, 10, 14, 14)
-    assert seen[:, 7].flatten(1).unique(dim=1).flatten().tolist() == [-1, 0, 1]
-    assert torch.equal(seen[0, 8, :, 3], torch.linspace(-1, 1, 14))
-    assert torch.equal(seen[2, 9, 5], torch.linspace(-1, 1, 14))
-    filled = seen[:, :3].abs().sum(1) > 0
-    assert torch.allclose(seen[:, 6][filled].mean(), torch.tensor(0.0), atol=1e-5)
+    channels = geometry.virtual_images(points, torch.rand(50, 3), 14)
+    assert channels.shape == (geometry.VIEWS, 10, 14, 14)
+    assert channels[:, 7].flatten(1).unique(dim=1).flatten().tolist() == [-1, 0, 1]
+    assert torch.equal(channels[0, 8, :, 3], torch.linspace(-1, 1, 14))
+    assert torch.equal(channels[2, 9, 5], torch.linspace(-1, 1, 14))
+    filled = channels[:, :3].abs().sum(1) > 0
+    assert torch.allclose(channels[:, 6][filled].mean(), torch.tensor(0.0), atol=1e-5)
 
 
 def test_turning_about_a_point_leaves_it_and_heights_alone() -> None:

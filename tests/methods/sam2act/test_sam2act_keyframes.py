@@ -58,10 +58,10 @@ def test_the_motions_of_video_and_execution_follow_each_other(folder: Path) -> N
 
 
 def test_every_chain_leads_from_its_entry_to_the_last_motion(folder: Path) -> None:
-    kept = EpisodeKeyframes(file_of(folder / "out", 0))
-    decisions = kept.motions.decisions.tolist()
-    assert [chain[0].frame for chain in kept.chains] == list(range(0, LENGTHS[0], 10))
-    for chain in kept.chains:
+    stored = EpisodeKeyframes(file_of(folder / "out", 0))
+    decisions = stored.motions.decisions.tolist()
+    assert [chain[0].frame for chain in stored.chains] == list(range(0, LENGTHS[0], 10))
+    for chain in stored.chains:
         assert [link.place for link in chain] == list(range(len(chain)))
         assert [link.frame for link in chain[1:]] == decisions[-len(chain) + 1 :][: len(chain) - 1]
         assert chain[-1].motion == len(decisions) - 1
@@ -70,18 +70,18 @@ def test_every_chain_leads_from_its_entry_to_the_last_motion(folder: Path) -> No
         assert entry.motion == len(decisions) - 1 or entry.frame < decisions[entry.motion + 1]
 
 
-def test_what_is_kept_is_what_was_recorded(folder: Path) -> None:
+def test_what_is_stored_is_what_was_recorded(folder: Path) -> None:
     ref = list_episodes(find_files([folder]))[0]
-    kept = EpisodeKeyframes(file_of(folder / "out", 0))
+    stored = EpisodeKeyframes(file_of(folder / "out", 0))
     with open_episode(ref) as episode:
-        for frame, shots in zip([0, 12], kept.shots([0, 12]), strict=True):
+        for frame, shots in zip([0, 12], stored.shots([0, 12]), strict=True):
             for shot, camera in zip(shots, ("front", "wrist"), strict=True):
                 recorded = Shot(**episode.shot(frame, camera)).shrunk(128)
                 assert np.array_equal(shot.colours, recorded.colours)
                 assert np.array_equal(shot.depth, recorded.depth)
                 assert np.array_equal(shot.intrinsic, recorded.intrinsic)
                 assert np.array_equal(shot.extrinsic, recorded.extrinsic)
-        assert kept.commanded_open([0, 12]).tolist() == [episode.commanded_open(0), episode.commanded_open(12)]
+        assert stored.commanded_open([0, 12]).tolist() == [episode.commanded_open(0), episode.commanded_open(12)]
 
 
 def test_recordings_without_depth_are_refused_by_name(tmp_path: Path) -> None:
@@ -102,8 +102,8 @@ def test_a_conversion_without_keyframes_is_another_plan_and_has_none(folder: Pat
 
 
 def test_damaged_keyframes_are_named(folder: Path, tmp_path: Path) -> None:
-    whole = file_of(folder / "out", 0).read_bytes()
-    for damaged in (whole[: len(whole) // 2], b"nothing of the kind"):
+    content = file_of(folder / "out", 0).read_bytes()
+    for damaged in (content[: len(content) // 2], b"nothing of the kind"):
         (tmp_path / "kept.npz").write_bytes(damaged)
         with pytest.raises(UserError, match="is damaged"):
             EpisodeKeyframes(tmp_path / "kept.npz").motions  # noqa: B018
@@ -136,9 +136,9 @@ def test_windows_depend_on_seed_epoch_and_place_alone_and_spare_the_last_one(fol
             assert links == again.window(index)[-1]
             assert len(links) == 3
             begins.setdefault(index, set()).add(links[0].place)
-    for index, found in begins.items():
+    for index, start in begins.items():
         length = len(data._items[index][3])
-        assert found == set(range(max(length - 3, 1)))
+        assert start == set(range(max(length - 3, 1)))
 
 
 class ManyTasks:
@@ -162,23 +162,23 @@ def drawn_shares(
     """How often tasks, and places (episode, links of the chain) are drawn."""
     source: Any = ManyTasks(episodes)
 
-    def kept(path: Path) -> Any:
+    def keep(path: Path) -> Any:
         number = int(path.stem.split("_")[1])
         chains = [[Link(place, place, place) for place in range(count)] for count in source.chains[number]]
         return SimpleNamespace(chains=chains)
 
-    monkeypatch.setattr(keyframes, "EpisodeKeyframes", kept)
+    monkeypatch.setattr(keyframes, "EpisodeKeyframes", keep)
     data = KeyframeDataset([source], Plain(), length)
-    found: Counter[str] = Counter()
+    counts: Counter[str] = Counter()
     places: Counter[tuple[int, int]] = Counter()
     for epoch in range(-(-6000 // len(data))):
         data.set_epoch(epoch)
         for index in range(len(data)):
             _, episode, chains, links = data.window(index)
-            found[source.task(episode)] += 1
+            counts[source.task(episode)] += 1
             places[episode, links[0].frame if length == 1 else len(chains.chains)] += 1
-    total = found.total()
-    return {k: n / total for k, n in found.items()}, {k: n / total for k, n in places.items()}
+    total = counts.total()
+    return {k: n / total for k, n in counts.items()}, {k: n / total for k, n in places.items()}
 
 
 def test_the_first_stage_draws_a_task_and_then_one_of_its_transitions(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -196,7 +196,7 @@ def test_the_memorys_stage_draws_task_episode_and_chain_again_where_it_is_too_sh
     assert places[1, 1] == pytest.approx(1 / 3, abs=0.03) and places[2, 3] == pytest.approx(1 / 3, abs=0.03)
 
 
-def test_chains_that_are_too_short_for_any_sample_are_said(folder: Path) -> None:
+def test_chains_that_are_too_short_for_any_sample_are_reported(folder: Path) -> None:
     with pytest.raises(UserError, match="No chain of keyframes in the data has 100 of them; the longest has"):
         KeyframeDataset([source_of(folder)], Plain(), 100)
 
@@ -222,7 +222,7 @@ def test_colours_are_averaged_and_intrinsics_follow() -> None:
 
 def test_a_cloud_outside_of_the_cube_shows_nothing() -> None:
     cube = Cube.of((-1, -1, -1, 1, 1, 1))
-    far = torch.full((1, 5, 3), 2.0)
-    seen = cloud_images(far, torch.ones(1, 5, 3), cube, 14)
-    assert not seen[0, :, :6].any()
-    assert (seen[0, :, 6] == -1).all()
+    outside = torch.full((1, 5, 3), 2.0)
+    images = cloud_images(outside, torch.ones(1, 5, 3), cube, 14)
+    assert not images[0, :, :6].any()
+    assert (images[0, :, 6] == -1).all()

@@ -55,12 +55,12 @@ def batch_of(policy: SAM2ActPolicy, data: Path, count: int = 2) -> KeyframeBatch
 
 def views(count: int, seed: int = 0) -> dict[str, np.ndarray]:
     """What an environment delivers of `count` frames."""
-    rng, found = np.random.default_rng(seed), {}
+    rng, observations = np.random.default_rng(seed), {}
     for camera in ("front", "wrist"):
-        found[camera] = rng.integers(0, 255, (count, 64, 64, 3), np.uint8)
-        found[f"{camera}_depth"] = rng.integers(400, 1000, (count, 64, 64, 1)).astype(np.int16)
-        found[f"{camera}_camera_extrinsic"] = np.tile(DOWN, (count, 1, 1))
-    return found
+        observations[camera] = rng.integers(0, 255, (count, 64, 64, 3), np.uint8)
+        observations[f"{camera}_depth"] = rng.integers(400, 1000, (count, 64, 64, 1)).astype(np.int16)
+        observations[f"{camera}_camera_extrinsic"] = np.tile(DOWN, (count, 1, 1))
+    return observations
 
 
 def states(count: int) -> np.ndarray:
@@ -68,7 +68,7 @@ def states(count: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("stage", ["first", "memory"])
-def test_each_stage_learns_what_it_trains_and_leaves_the_rest(data: Path, stage: str) -> None:
+def test_each_stage_learns_what_it_trains_and_leaves_the_remainder(data: Path, stage: str) -> None:
     policy = built(policy={"stage": stage})
     apply_finetuning(policy, "full")
     before = {name: value.clone() for name, value in policy.named_parameters()}
@@ -89,7 +89,7 @@ def test_each_stage_learns_what_it_trains_and_leaves_the_rest(data: Path, stage:
     assert len(metrics) == {"first": 7, "memory": 2}[stage]
 
 
-def test_augmentation_moves_clouds_and_is_told_by_its_draws_alone(data: Path) -> None:
+def test_augmentation_moves_clouds_and_is_reported_by_its_draws_alone(data: Path) -> None:
     policy = built()
     batch = batch_of(policy, data)
     torch.manual_seed(0)
@@ -100,9 +100,9 @@ def test_augmentation_moves_clouds_and_is_told_by_its_draws_alone(data: Path) ->
     one, other = (policy.training_noise(2, torch.Generator().manual_seed(seed)) for seed in (1, 2))
     with torch.no_grad():
         first, again, second = (policy(batch, draws)[0] for draws in (one, one, other))
-        plain = policy.eval()(batch, one)[0]
+        baseline = policy.eval()(batch, one)[0]
     assert first == again
-    assert len({first.item(), second.item(), plain.item()}) == 3
+    assert len({first.item(), second.item(), baseline.item()}) == 3
 
 
 def test_an_episode_remembers_keyframes_once_they_lie_behind(policy: SAM2ActPolicy) -> None:
@@ -116,19 +116,19 @@ def test_an_episode_remembers_keyframes_once_they_lie_behind(policy: SAM2ActPoli
     assert waypoint.shape == (1, 7)
     assert waypoint[0, 6] in (-1, 1)
     assert np.array_equal(policy.act(episode), waypoint)  # asked again: nothing was added
-    kept = episode.remembered
+    n_entries = episode.remembered
     episode.observe(views(3, seed=1), states(3))
     assert episode.waypoints == 1
-    assert episode.remembered.maps[-1] is not kept.maps[-1]
+    assert episode.remembered.maps[-1] is not n_entries.maps[-1]
 
 
 def test_pieces_of_frames_are_as_good_as_all_of_them(policy: SAM2ActPolicy) -> None:
-    whole, pieces = policy.start_episode("pick the cube"), policy.start_episode("pick the cube")
+    straight, pieces = policy.start_episode("pick the cube"), policy.start_episode("pick the cube")
     frames, demo = views(9), np.arange(9) < 7
-    whole.observe(frames, states(9), demo)
+    straight.observe(frames, states(9), demo)
     for part in (slice(0, 4), slice(4, 7), slice(7, 9)):
         pieces.observe({name: value[part] for name, value in frames.items()}, states(9)[part], demo[part])
-    assert np.array_equal(policy.act(whole), policy.act(pieces))
+    assert np.array_equal(policy.act(straight), policy.act(pieces))
 
 
 def test_what_is_remembered_reaches_the_waypoints_scores(policy: SAM2ActPolicy) -> None:
@@ -137,8 +137,8 @@ def test_what_is_remembered_reaches_the_waypoints_scores(policy: SAM2ActPolicy) 
     experienced.observe(views(4, seed=5), states(4), True)
     for episode in (fresh, experienced):
         episode.observe(frames, states(2))
-    seen = [policy.observation([episode])[0] for episode in (fresh, experienced)]
-    after = [policy.watch(s, e.remembered).maps[-1] for s, e in zip(seen, (fresh, experienced), strict=True)]
+    observations = [policy.observation([episode])[0] for episode in (fresh, experienced)]
+    after = [policy.watch(s, e.remembered).maps[-1] for s, e in zip(observations, (fresh, experienced), strict=True)]
     assert not torch.equal(*after)
 
 
@@ -205,12 +205,12 @@ def run(data: Path, folder: Path, *words: str, resume: str = "null") -> Path:
 
 @pytest.mark.parametrize("optimizer", ["adamw", "lamb"])
 def test_the_command_trains_it_and_resumes_to_the_last_bit(data: Path, tmp_path: Path, optimizer: str) -> None:
-    chosen = f"train.optimizer={optimizer}"
-    whole = run(data, tmp_path / "whole", chosen, "train.steps=2")
-    run(data, tmp_path / "parts", chosen, "train.steps=1")
-    parts = run(data, tmp_path / "new", chosen, "train.steps=2", resume=str(tmp_path / "parts"))
+    setting = f"train.optimizer={optimizer}"
+    straight = run(data, tmp_path / "whole", setting, "train.steps=2")
+    run(data, tmp_path / "parts", setting, "train.steps=1")
+    parts = run(data, tmp_path / "new", setting, "train.steps=2", resume=str(tmp_path / "parts"))
     assert parts.parent.parent == tmp_path / "parts"
     assert [line["step"] for line in read_metrics(tmp_path / "whole") if "train/loss" in line] == [1, 2]
-    ended = [load_tensors(folder) for folder in (whole, parts)]
+    ended = [load_tensors(folder) for folder in (straight, parts)]
     assert all(torch.equal(value, ended[1][name]) for name, value in ended[0].items())
-    assert isinstance(Policy.from_pretrained(whole), SAM2ActPolicy)
+    assert isinstance(Policy.from_pretrained(straight), SAM2ActPolicy)

@@ -53,7 +53,7 @@ def policy() -> SAM2ActPolicy:
     return found
 
 
-def test_every_waypoint_is_asked_for_once_and_counts_its_frames(policy: SAM2ActPolicy) -> None:
+def test_every_waypoint_is_requested_once_and_counts_its_frames(policy: SAM2ActPolicy) -> None:
     jobs = [Job("VideoUnmask", "test", 0), Job("PickXtimes", "test", 1)]
     envs = InlineEnvs(2, base=make_motion_env, robot=policy.embodiment, max_steps=1000)
     records = roll(policy, jobs, envs)

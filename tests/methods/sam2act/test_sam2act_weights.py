@@ -76,14 +76,14 @@ def test_an_unknown_stage_is_named(network: SAM2ActNetwork) -> None:
         select_trained(network, "memroy")
 
 
-def test_every_tensor_has_a_released_name_of_its_own(network: SAM2ActNetwork) -> None:
+def test_every_tensor_has_a_unique_released_name(network: SAM2ActNetwork) -> None:
     table = released_names(network.state_dict(), network.sizes.mask_stages)
-    theirs = [piece.path for pieces in table.values() for piece in pieces]
-    assert len(theirs) == len(set(theirs)) == len(network.state_dict())
-    held = {*theirs, *(gap.path for gap in released_unread()), RATES}
-    copies = released_copies(held)
-    assert len(held) + len(copies) == NAMES
-    assert set(copies.values()) == {name for name in held if name.startswith(IMAGE_PREFIX)}
+    paths = [piece.path for pieces in table.values() for piece in pieces]
+    assert len(paths) == len(set(paths)) == len(network.state_dict())
+    names = {*paths, *(gap.path for gap in released_unread()), RATES}
+    copies = released_copies(names)
+    assert len(names) + len(copies) == NAMES
+    assert set(copies.values()) == {name for name in names if name.startswith(IMAGE_PREFIX)}
 
 
 # Files
@@ -103,41 +103,41 @@ def file(policy: SAM2ActPolicy, tmp_path_factory: pytest.TempPathFactory) -> Pat
     return folder / WEIGHTS
 
 
-def test_a_file_in_the_authors_layout_comes_back_whole(policy: SAM2ActPolicy, file: Path) -> None:
+def test_a_file_in_the_authors_layout_comes_back_completely(policy: SAM2ActPolicy, file: Path) -> None:
     assert detect_format(file) == "sam2act_plus"
     loaded = load_weights(build_policy("sam2act_plus", seed=1), file)
-    ours = policy.state_dict()
-    assert all(torch.equal(value, ours[name]) for name, value in loaded.state_dict().items())
+    state = policy.state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in loaded.state_dict().items())
 
 
 def test_a_policy_on_meta_is_filled_with_its_constants_too(policy: SAM2ActPolicy, file: Path) -> None:
     loaded = load_weights(build_policy("sam2act_plus", device="meta"), file)
     assert isinstance(loaded, SAM2ActPolicy)
     assert not [name for name, value in loaded.state_dict().items() if value.is_meta]
-    mine, theirs = policy.backbone.fine.heads, loaded.backbone.fine.heads
-    assert mine is not None and theirs is not None
-    assert torch.equal(mine.rates, theirs.rates)
+    mine, other_head = policy.backbone.fine.heads, loaded.backbone.fine.heads
+    assert mine is not None and other_head is not None
+    assert torch.equal(mine.rates, other_head.rates)
 
 
 def test_the_file_holds_the_authors_keys_and_every_copy(file: Path) -> None:
-    held = torch.load(file, weights_only=True)
-    assert set(held) == {"epoch", "model_state", "optimizer_state", "lr_sched_state"}
-    state = held["model_state"]
+    content = torch.load(file, weights_only=True)
+    assert set(content) == {"epoch", "model_state", "optimizer_state", "lr_sched_state"}
+    state = content["model_state"]
     for name in ("sam2.maskmem_tpos_enc", "mvt1.sam2.maskmem_tpos_enc", "mvt2.sam2.maskmem_tpos_enc"):
         assert state[name].ndim == 4
     assert state[RATES].shape[0] == 1
 
 
 def test_a_copy_that_is_none_and_a_tensor_that_lacks_are_named(file: Path, tmp_path: Path) -> None:
-    held = torch.load(file, weights_only=True)
+    content = torch.load(file, weights_only=True)
     copy = "mvt1.sam2.maskmem_tpos_enc"
-    held["model_state"][copy] = held["model_state"][copy] + 1
-    torch.save(held, tmp_path / "other.pth")
+    content["model_state"][copy] = content["model_state"][copy] + 1
+    torch.save(content, tmp_path / "other.pth")
     with pytest.raises(UserError, match=r"mvt1.sam2.maskmem_tpos_enc is another tensor"):
         load_weights(build_policy("sam2act_plus"), tmp_path / "other.pth")
-    held = torch.load(file, weights_only=True)
-    del held["model_state"]["mvt2.up0.1.weight"]
-    torch.save(held, tmp_path / "short.pth")
+    content = torch.load(file, weights_only=True)
+    del content["model_state"]["mvt2.up0.1.weight"]
+    torch.save(content, tmp_path / "short.pth")
     with pytest.raises(UserError, match=r"mvt2\.up0\.1\.weight"):
         load_weights(build_policy("sam2act_plus"), tmp_path / "short.pth")
 
