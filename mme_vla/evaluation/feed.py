@@ -214,10 +214,10 @@ class FedPolicy(Policy):
             own.subgoal = episode.subgoal
         return self.inner.observation(inner)
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        return self.inner.answer(batch, [inner_episode(episode) for episode in episodes], draws, steps)
+        return self.inner.predict_chunk(batch, [inner_episode(episode) for episode in episodes], draws, steps)
 
 
 def inner_episode(episode: Episode) -> Episode:

@@ -131,7 +131,7 @@ class Policy(nn.Module):
         was_training = self.training
         self.eval()
         try:
-            chunk = self.answer(batch, episodes, noise, steps).float().cpu()
+            chunk = self.predict_chunk(batch, episodes, noise, steps).float().cpu()
         finally:
             self.train(was_training)
         absolute = processor.absolute_actions(chunk, torch.stack([e.state for e in episodes]))
@@ -145,7 +145,7 @@ class Policy(nn.Module):
         """The current observations of episodes, as a batch of the processor's kind on the policy's device."""
         raise NotImplementedError
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """Sample a normalised chunk [n, h, a] for an `observation`, with the memories of the episodes."""

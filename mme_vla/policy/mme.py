@@ -292,7 +292,7 @@ class MMEPolicy(MMEModel, NetworkPolicy):
         )
         return batch.without_prompt_padding().sent(self.device)
 
-    def answer(
+    def predict_chunk(
         self, batch: Batch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for the batch of `observation`, with the episodes' memories."""

@@ -170,7 +170,7 @@ class Channel:
         """What `answer` takes for an episode that remembers `stores` instead."""
         raise NotImplementedError
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """Normalised chunks [n, h, a] for what `observation` saw of n episodes, through what `as_if` made of them."""
@@ -216,7 +216,7 @@ class SelectionChannel(Channel):
             tokens.features.masked_fill(~mask_3d, 0), positions.masked_fill(~mask_3d, 0), mask, tokens.step
         )
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         batch = replace(batch, history=stack_history(remembering, self._policy.device))
@@ -244,10 +244,10 @@ class WritableChannel(Channel):
         entries = [[(entry.time, entry.content) for entry in store.entries if entry is not None] for store in stores]
         return episode.with_entries(entries)
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        return self._policy.answer(batch, remembering, draws, steps)
+        return self._policy.predict_chunk(batch, remembering, draws, steps)
 
     def commit(self, episode: Episode, remembering: Any) -> None:
         assert isinstance(episode, WritableMemory)
@@ -268,10 +268,10 @@ class NoChannel(Channel):
     def counterfactual(self, episode: Episode, snapshot: MemorySnapshot, stores: Sequence[Remembered]) -> Episode:
         return episode
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, remembering: Sequence[Any], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
-        return self._policy.answer(batch, remembering, draws, steps)
+        return self._policy.predict_chunk(batch, remembering, draws, steps)
 
 
 def channel_of(policy: Policy) -> Channel:

@@ -146,16 +146,16 @@ class ProbedPolicy(FedPolicy):
             episode.inner.subgoal = self.arm.say(episode.subgoal, self.moment(episode))
         return self.inner.observation([_probed(episode).inner for episode in episodes])
 
-    def answer(
+    def predict_chunk(
         self, batch: Any, episodes: Sequence[Episode], draws: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         if not self.arm.edits:
-            return super().answer(batch, episodes, draws, steps)
+            return super().predict_chunk(batch, episodes, draws, steps)
         mine, remembering = [_probed(episode) for episode in episodes], []
         for i, episode in enumerate(mine):
             snapshot, stores = self.snapshot(episode, {name: value[i] for name, value in draws.items()})
             remembering.append(self.channel.counterfactual(episode.inner, snapshot, stores))
-        chunk = self.channel.answer(batch, remembering, draws, steps)
+        chunk = self.channel.predict_chunk(batch, remembering, draws, steps)
         for episode, its in zip(mine, remembering, strict=True):
             self.channel.commit(episode.inner, its)
         return chunk
@@ -217,7 +217,7 @@ class ProbedPolicy(FedPolicy):
             observation = self.inner.observation([episode.inner] * len(part))
             stacked = stack_noise([sampled for _, sampled in part])
             chunks.append(
-                self.channel.answer(observation, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu()
+                self.channel.predict_chunk(observation, [ready[id(v)] for v, _ in part], stacked, steps).float().cpu()
             )
         action = self.embodiment.action
         stacked_chunks = torch.cat(chunks).unflatten(0, (len(variants), len(draws)))

@@ -51,11 +51,11 @@ def batch() -> Batch:
 
 
 def test_own_head_defines_noise_and_loss() -> None:
-    default, own = built({"name": "flow"}), built({"name": "late_times", "scale": 3.0})
-    noise, late = (b.training_noise(2, torch.Generator().manual_seed(1)) for b in (default, own))
+    default, custom = built({"name": "flow"}), built({"name": "late_times", "scale": 3.0})
+    noise, late = (b.training_noise(2, torch.Generator().manual_seed(1)) for b in (default, custom))
     assert torch.equal(late["time"], noise["time"] ** 2)
     injection = Injection(default.embed(batch()), PI05_VISIBILITY)
-    assert torch.allclose(own.loss(batch(), injection, late), 3 * default.loss(batch(), injection, late))
+    assert torch.allclose(custom.loss(batch(), injection, late), 3 * default.loss(batch(), injection, late))
 
 
 def test_clean_flow_reads_the_output_as_the_chunk() -> None:

@@ -22,7 +22,7 @@ SMALL = {
 }  # fmt: skip
 
 
-def own(integration: str = "context", memory: str = "framesamp") -> MMEPolicy:
+def custom(integration: str = "context", memory: str = "framesamp") -> MMEPolicy:
     words = {"backbone": "regression", "memory": memory, "integration": integration}
     return build_policy("pi05", config_dir=EXAMPLE / "configs", **words)
 
@@ -39,19 +39,19 @@ def test_the_page_shows_the_files_that_are_tested() -> None:
 
 
 def test_it_keeps_a_backbones_contract() -> None:
-    own()
+    custom()
     check_backbone("regression", **SMALL)
 
 
 @pytest.mark.parametrize("integration", ["modulator", "expert"])
 def test_an_integration_it_cannot_host_is_refused_in_words(integration: str) -> None:
     with pytest.raises(UserError, match=r"'regression' has no place for .*hosts blocks"):
-        own(integration)
+        custom(integration)
 
 
 @pytest.mark.parametrize("memory", ["framesamp", "ttt"])
 def test_memory_reaches_its_actions_and_it_learns(memory: str) -> None:
-    policy = own(memory=memory)
+    policy = custom(memory=memory)
     batch = random_batch(policy, valid=64)
     before, _ = policy(batch)
     before.backward()

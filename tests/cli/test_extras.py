@@ -170,9 +170,9 @@ def test_the_command_runs_with_this_extra_alone(folder: Path, case: Case) -> Non
         assert "| framesamp_modul" in page and "| planner" in page and (nano / "learning.png").is_file()
         videos = list(nano.glob("films/failure/**/*.mp4"))
         assert len(videos) == 1 and videos[0].name in page
-        written = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
+        saved = {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")}
         assert run(case, folder)[0] == 0
-        assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == written
+        assert {path: path.stat().st_mtime_ns for path in nano.rglob("*.npz")} == saved
         assert len(read_folders(find_records([nano / "framesamp_modul"]))) == 2
 
 

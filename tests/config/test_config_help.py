@@ -72,7 +72,7 @@ def test_help_needs_no_torch() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("module", "words", "said"),
+    ("module", "words", "message"),
     [
         ("mme_vla.train", ["--steps", "10"], "There is no option '--steps'.*write train.steps=10"),
         ("mme_vla.train", ["--learning-rate=1"], "There is no option '--learning-rate=1'"),
@@ -80,13 +80,13 @@ def test_help_needs_no_torch() -> None:
     ],
 )
 def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(
-    module: str, words: list[str], said: str
+    module: str, words: list[str], message: str
 ) -> None:
-    assert re.search(said, ask(module, *words, code=2).replace("\n", " "))
+    assert re.search(message, ask(module, *words, code=2).replace("\n", " "))
 
 
 @pytest.mark.parametrize(
-    ("command", "word", "said"),
+    ("command", "word", "message"),
     [
         ("evaluate", "mode=background", "Did you mean 'subgoal_mode'"),
         ("evaluate", "train.device=cuda", "Did you mean 'device'?"),
@@ -94,8 +94,8 @@ def test_an_option_that_does_not_exist_is_answered_with_the_word_to_type(
         ("serve", "batch=3", "Did you mean 'max_batch'"),
     ],
 )
-def test_a_key_with_another_name_here_is_suggested(command: str, word: str, said: str) -> None:
-    with pytest.raises(UserError, match=re.escape(said)):
+def test_a_key_with_another_name_here_is_suggested(command: str, word: str, message: str) -> None:
+    with pytest.raises(UserError, match=re.escape(message)):
         compose(command, [word])
 
 

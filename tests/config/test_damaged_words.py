@@ -98,10 +98,10 @@ def test_states_well_beyond_the_statistics_are_a_broken_driver() -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"), [(None, "must be a text"), (7, "must be a text"), ("a\ud800", "half a char")]
+    ("text", "message"), [(None, "must be a text"), (7, "must be a text"), ("a\ud800", "half a char")]
 )
-def test_a_prompt_that_is_no_text_is_refused(text: object, said: str) -> None:
-    with pytest.raises(UserError, match=said):
+def test_a_prompt_that_is_no_text_is_refused(text: object, message: str) -> None:
+    with pytest.raises(UserError, match=message):
         checked_text(text, "the goal")
 
 

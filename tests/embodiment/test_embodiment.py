@@ -51,7 +51,7 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ("given", "message"),
+    ("options", "message"),
     [
         (section(cameras={}), "at least one camera"),
         (section(cameras={"front": {"augmnt": "all"}}), "Did you mean 'augment'"),
@@ -72,9 +72,9 @@ def test_every_shipped_robot_survives_json_and_builds_a_policy(name: str) -> Non
         (action(frames=2), "expected 1; null if"),
     ],
 )
-def test_impossible_robots_are_refused_by_the_key(given: dict[str, Any], message: str) -> None:
+def test_impossible_robots_are_refused_by_the_key(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UserError, match=message):
-        Embodiment.from_dict(given)
+        Embodiment.from_dict(options)
 
 
 def test_a_robot_and_a_network_that_do_not_fit_are_refused() -> None:

@@ -49,13 +49,13 @@ def opened_once() -> Iterator[None]:
     """Every run reads the same steps of the same files: open the sample once, and decode each image once."""
     sources = open_sources(["sample"])
     for source in sources:
-        _remember_pictures(source)
+        _keep_images(source)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(training_data, "open_sources", lambda names, robot: sources)
         yield
 
 
-def _remember_pictures(source: EpisodeSource) -> None:
+def _keep_images(source: EpisodeSource) -> None:
     decode = source.frames
 
     @cache

@@ -109,11 +109,11 @@ class _Terminal(io.StringIO):
 
 
 @pytest.mark.parametrize(
-    ("stream", "words", "said"),
+    ("stream", "words", "message"),
     [(_Terminal, [], "Loading PyTorch"), (io.StringIO, [], ""), (_Terminal, ["--help"], "")],
 )
 def test_a_terminal_gets_a_line_before_the_imports(
-    stream: type[io.StringIO], words: list[str], said: str, monkeypatch: pytest.MonkeyPatch
+    stream: type[io.StringIO], words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     standard_error, before = stream(), []
     monkeypatch.setattr(sys, "stderr", standard_error)
@@ -126,7 +126,7 @@ def test_a_terminal_gets_a_line_before_the_imports(
 
     monkeypatch.setattr(cli, "import_module", slow_import)
     cli.run("train")
-    assert before[0].startswith(said) and bool(before[0]) == bool(said)
+    assert before[0].startswith(message) and bool(before[0]) == bool(message)
 
 
 @pytest.mark.slow
@@ -163,8 +163,8 @@ def test_arguments_for_the_constructor_of_memory_are_explained() -> None:
 def test_what_the_tutorials_write_is_ignored_by_git() -> None:
     if not (REPOSITORY / ".git").exists():
         pytest.skip("no clone")
-    written = ("outputs/x", "examples/last_frames/outputs/x", "examples/two_buttons/data/x", "gallery/x", "runs/x")
-    for path in written:
+    saved = ("outputs/x", "examples/last_frames/outputs/x", "examples/two_buttons/data/x", "gallery/x", "runs/x")
+    for path in saved:
         assert subprocess.run(["git", "check-ignore", "-q", path], cwd=REPOSITORY).returncode == 0, path
 
 

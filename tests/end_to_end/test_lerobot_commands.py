@@ -75,8 +75,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_but_for_one_random_number_tha
     }  # fmt: skip
     losses, weights = {}, {}
     for name, words in runs.items():
-        said = run_lerobot(tmp_path / name, [words], plugins={"lerobot_policy_mme_vla": "lerobot_policy_mme_vla"})
-        losses[name] = [part.split()[0] for part in said.split(" loss:")[1:]][-2:]
+        message = run_lerobot(tmp_path / name, [words], plugins={"lerobot_policy_mme_vla": "lerobot_policy_mme_vla"})
+        losses[name] = [part.split()[0] for part in message.split(" loss:")[1:]][-2:]
         weights[name] = last.read_bytes()
     same = "resumed with the random state"
     assert losses[same] == losses["uninterrupted"] and weights[same] == weights["uninterrupted"]

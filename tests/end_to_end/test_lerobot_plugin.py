@@ -193,14 +193,14 @@ def test_a_chunk_matches_the_one_under_way(package: ModuleType, lerobot_folder: 
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"observation.state": None}, "needs the feature 'observation.state' of 8 numbers; there is none"),
         ({"observation.images.image": None}, "No images of the camera 'front'"),
     ],
 )
 def test_what_a_dataset_lacks_is_named(
-    package: ModuleType, our_folder: Path, changed: dict[str, None], said: str
+    package: ModuleType, our_folder: Path, changed: dict[str, None], message: str
 ) -> None:
     from lerobot_policy_mme_vla.modeling_mme_vla import MMEVLAPolicy
 
@@ -208,7 +208,7 @@ def test_what_a_dataset_lacks_is_named(
     images, numbers = package.convert.features_of(policy.embodiment)
     features = {name: feature for name, feature in images.items() if name not in changed}
     config = package.MMEVLAConfig(device="cpu", input_features=features, output_features=numbers)
-    with pytest.raises(UserError, match=said):
+    with pytest.raises(UserError, match=message):
         MMEVLAPolicy(config, model=policy)
 
 

@@ -275,22 +275,22 @@ def test_a_cube_is_hooked_to_a_goal_with_a_peg(cube: tuple[float, float], goal: 
 
 
 @pytest.mark.parametrize("motion", ["insert_peg", "insert_peg_fully"])
-@pytest.mark.parametrize(("held", "side"), [("tail", 1), ("head", 1), ("head", -1)])
-def test_a_peg_is_inserted_from_the_side_that_was_requested(held: str, side: int, motion: str) -> None:
+@pytest.mark.parametrize(("grasped", "side"), [("tail", 1), ("head", 1), ("head", -1)])
+def test_a_peg_is_inserted_from_the_side_that_was_requested(grasped: str, side: int, motion: str) -> None:
     def fill(env: Scene) -> None:
         env.add(build_aperture_box(env, (0.0, 0.0), np.pi / 2))
         env.add(build_peg(env, "peg", 0.05, 0.01, (1, 0, 0), (0, 1, 0), (-0.15, -0.15 * side), 0.4 * side))
 
     env, _, demonstrator = scene(fill)
     peg, box = things(env)["peg"], things(env)["box"]
-    demonstrator.grasp_peg(peg, held)
-    getattr(demonstrator, motion)(peg, held, side, box)
-    free = peg.head if held == "tail" else peg.tail
+    demonstrator.grasp_peg(peg, grasped)
+    getattr(demonstrator, motion)(peg, grasped, side, box)
+    free = peg.head if grasped == "tail" else peg.tail
     assert (env.tcp_pose.p[1] - box.position[1]) * side < 0
     # As in the benchmark, this one motion ends with the peg's end only just in the box.
-    short = (held, side, motion) == ("tail", 1, "insert_peg")
+    short = (grasped, side, motion) == ("tail", 1, "insert_peg")
     assert np.linalg.norm(free.position - box.position) < (0.08 if short else 0.05)
-    demonstrator.insert_peg_fully(peg, held, side, box, begun=True)
+    demonstrator.insert_peg_fully(peg, grasped, side, box, begun=True)
     assert np.linalg.norm(free.position - box.position) < 0.05
 
 

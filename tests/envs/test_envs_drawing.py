@@ -40,7 +40,7 @@ def episode(
     return frames, infos
 
 
-def shown(frames: dict[str, list[Any]], camera: str) -> list[int]:
+def displayed(frames: dict[str, list[Any]], camera: str) -> list[int]:
     return [k for k, image in enumerate(frames[f"{camera}_rgb_list"]) if image is not None]
 
 
@@ -51,14 +51,14 @@ def test_frames_are_rendered_where_they_are_requested(space: str, actions: list[
     # The newest frame of each call: of a motion with a grip at its end the last one, which nobody can count beforehand.
     render_request = RenderRequest({"front": frozenset({2, 3})}, now=("wrist",), grounded=False)
     some, fewer = episode(space, actions, render_request)
-    assert shown(full, "front") == shown(full, "wrist") == list(range(count))
-    assert shown(some, "front") == [2, 3]
-    assert shown(some, "wrist") == (list(range(count)) if space == "joint_angle" else [0, count - 1])
+    assert displayed(full, "front") == displayed(full, "wrist") == list(range(count))
+    assert displayed(some, "front") == [2, 3]
+    assert displayed(some, "wrist") == (list(range(count)) if space == "joint_angle" else [0, count - 1])
     for key in ("joint_state_list", "eef_state_list", "gripper_state_list"):
         assert np.array_equal(full[key], some[key])
     for camera in ("front", "wrist"):
         key = f"{camera}_rgb_list"
-        assert all(np.array_equal(full[key][k], some[key][k]) for k in shown(some, camera))
+        assert all(np.array_equal(full[key][k], some[key][k]) for k in displayed(some, camera))
     assert all("grounded_subgoal_online" not in info for info in fewer)
     assert [info["status"] for info in fewer] == [info["status"] for info in infos]
 
@@ -67,6 +67,6 @@ def test_a_text_with_pixels_renders_its_frame() -> None:
     (_, full), (frames, blind) = (
         episode("joint_angle", [HOLD], render_request) for render_request in (None, RenderRequest(now=()))
     )
-    assert shown(frames, "front") == shown(frames, "wrist") == []
+    assert displayed(frames, "front") == displayed(frames, "wrist") == []
     texts = [info["grounded_subgoal_online"] for info in full]
     assert "<" in texts[0] and texts == [info["grounded_subgoal_online"] for info in blind]

@@ -66,10 +66,10 @@ def test_the_same_path_again_is_success(lock, tip):
     assert results == [(False, False)] * (len(lock.path) - 1) + [(True, False)]
 
 
-@pytest.mark.parametrize(("aside", "z", "moved"), [(0.009, 0.099, 1), (0.011, 0.07, 0), (0, 0.101, 0)])
-def test_a_disc_is_visited_within_a_centimetre_and_below_ten(lock, tip, aside, z, moved):
+@pytest.mark.parametrize(("aside", "z", "motion"), [(0.009, 0.099, 1), (0.011, 0.07, 0), (0, 0.101, 0)])
+def test_a_disc_is_visited_within_a_centimetre_and_below_ten(lock, tip, aside, z, motion):
     tip.put(lock.path[0], z=z, aside=(0, aside))
-    assert lock.progress.index == moved
+    assert lock.progress.index == motion
 
 
 @pytest.mark.parametrize("stage", ["video", "execution"])

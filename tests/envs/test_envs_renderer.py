@@ -18,7 +18,7 @@ def _can_render() -> None:
         pytest.skip(f"cannot render here: {error}")
 
 
-def first_pictures(episode: int) -> np.ndarray:
+def first_images(episode: int) -> np.ndarray:
     """Front and wrist image an episode begins with, [2, 256, 256, 3]; its environment is gone afterwards."""
     env = make_env("PickXtimes", "test", episode)
     observation, _ = env.reset()
@@ -27,17 +27,17 @@ def first_pictures(episode: int) -> np.ndarray:
 
 
 def test_later_episodes_find_the_renderer_of_the_first_and_an_episode_renders_the_same_again() -> None:
-    first = first_pictures(0)
+    first = first_images(0)
     cached = dict(rendering._systems)
     assert cached, "the renderer went with the scene"
-    other = first_pictures(1)
+    other = first_images(1)
     assert rendering._systems == cached
     assert not np.array_equal(first, other)
-    assert np.array_equal(first, first_pictures(0))
+    assert np.array_equal(first, first_images(0))
 
 
 def test_a_renderer_that_takes_no_more_images_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    first_pictures(0)
+    first_images(0)
     assert renderer_works()
 
     def lost(_: object) -> None:

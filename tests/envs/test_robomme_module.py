@@ -34,7 +34,7 @@ def test_the_builder_knows_the_benchmarks_episodes(wrapper: ModuleType) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"env_id": "VideoUnmaks"}, "Did you mean 'VideoUnmask'"),
         ({"env_id": "StopCube", "dataset": "tests"}, "Did you mean 'test'"),
@@ -42,8 +42,8 @@ def test_the_builder_knows_the_benchmarks_episodes(wrapper: ModuleType) -> None:
         ({"env_id": "StopCube", "gui_render": True}, "open no window"),
     ],
 )
-def test_what_cannot_be_is_refused_in_words(wrapper: ModuleType, options: dict, said: str) -> None:
-    with pytest.raises(UserError, match=said):
+def test_what_cannot_be_is_refused_in_words(wrapper: ModuleType, options: dict, message: str) -> None:
+    with pytest.raises(UserError, match=message):
         wrapper.BenchmarkEnvBuilder(**options)
 
 

@@ -234,16 +234,16 @@ def test_wrong_records_are_refused() -> None:
 
 
 def test_own_tasks_form_a_group_beside_the_benchmark() -> None:
-    benchmark, own = records("a", {"BinFill": [1, 0]}), records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]})
-    (alone,) = aggregate(own, Protocol(tasks_of(own), 2, samples=100)).methods
+    benchmark, custom = records("a", {"BinFill": [1, 0]}), records("a", {"TwoButtons": [1, 1], "Stay": [0, 1]})
+    (alone,) = aggregate(custom, Protocol(tasks_of(custom), 2, samples=100)).methods
     assert (alone.average.mean, alone.figures["suite"]["Own tasks"].mean, alone.complete) == (75.0, 75.0, True)
     tasks = ("BinFill", "TwoButtons", "Stay")
-    both = aggregate([*benchmark, *own], Protocol(tasks, 2, samples=100))
+    both = aggregate([*benchmark, *custom], Protocol(tasks, 2, samples=100))
     (method,) = both.methods
     assert (method.average.mean, method.figures["suite"]["Own tasks"].mean) == (50.0, 75.0)
     assert method.figures["task"]["TwoButtons"].mean == 100.0 and method.complete
     assert both.notes == []
-    assert tasks_of([*benchmark, *own]) == (*PAPER_ORDER, "Stay", "TwoButtons")
+    assert tasks_of([*benchmark, *custom]) == (*PAPER_ORDER, "Stay", "TwoButtons")
 
 
 def test_the_command_shows_and_compares_own_tasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -252,8 +252,8 @@ def test_the_command_shows_and_compares_own_tasks(tmp_path: Path, capsys: pytest
             log.append(record)
     page = tmp_path / "page.html"
     main(["--brief", "--episodes", "2", str(tmp_path), "--html", str(page), "--samples", "100"])
-    shown = capsys.readouterr().out
-    assert "Own tasks" in shown and "50.00" in shown and "TwoButtons" in page.read_text()
+    displayed = capsys.readouterr().out
+    assert "Own tasks" in displayed and "50.00" in displayed and "TwoButtons" in page.read_text()
 
 
 # Comparison
@@ -463,7 +463,7 @@ def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "shown"),
+    ("name", "displayed"),
     [
         ("[x](javascript:alert(1))", "[x]\\(javascript:alert(1))"),
         ("![x][y]", "![x]\\[y]"),
@@ -475,8 +475,10 @@ def test_a_name_is_no_formula_of_a_spreadsheet(start: str) -> None:
         ("[+1.0, +2.0]", "[+1.0, +2.0]"),
     ],
 )
-def test_a_name_is_no_link_and_no_html_of_markdown(name: str, shown: str) -> None:
-    assert to_markdown(Table(name, ["method"], [[name]])) == f"### {shown}\n\n| method |\n| :--- |\n| {shown} |\n"
+def test_a_name_is_no_link_and_no_html_of_markdown(name: str, displayed: str) -> None:
+    assert (
+        to_markdown(Table(name, ["method"], [[name]])) == f"### {displayed}\n\n| method |\n| :--- |\n| {displayed} |\n"
+    )
 
 
 def test_training_details_hold_no_link_of_a_name() -> None:

@@ -36,7 +36,7 @@ class Watched:
 
 
 @pytest.fixture(scope="module")
-def plain() -> MMEPolicy:
+def memoryless() -> MMEPolicy:
     return quick_policy("pi05")
 
 

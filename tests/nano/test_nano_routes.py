@@ -32,22 +32,22 @@ def policy(execute: int) -> MMEPolicy:
 
 def demonstration(frames: range | list[int]) -> Demonstration:
     rng = np.random.default_rng(0)
-    pictures = {frame: rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
+    images = {frame: rng.integers(0, 256, (256, 256, 3), dtype=np.uint8) for frame in frames}
     motions = Motions(DECISIONS, rng.uniform(-0.2, 0.2, (5, 7)).astype(np.float32))
     states = rng.uniform(-1, 1, (120, 8)).astype(np.float32)
-    return Demonstration("RouteStick", 3, "easy", "follow the same path", 120, 20, states, motions, {"front": pictures})
+    return Demonstration("RouteStick", 3, "easy", "follow the same path", 120, 20, states, motions, {"front": images})
 
 
-@pytest.mark.parametrize(("execute", "asked"), [(1, [0, 1, 2, 3, 4]), (2, [0, 2, 4]), (14, [0])])
-def test_what_is_executed_without_asking_again_is_no_decision_to_learn(execute: int, asked: list[int]) -> None:
+@pytest.mark.parametrize(("execute", "queries"), [(1, [0, 1, 2, 3, 4]), (2, [0, 2, 4]), (14, [0])])
+def test_what_is_executed_without_asking_again_is_no_decision_to_learn(execute: int, queries: list[int]) -> None:
     routed, made = policy(execute), demonstration(range(120))
     routed.require_processor().stats = statistics([made], routed)
     samples = Decisions.of(routed, [made])
-    batch = samples.collate(range(len(asked)))
-    assert len(samples.batch.prompt) == len(samples.distant) == len(asked)
+    batch = samples.collate(range(len(queries)))
+    assert len(samples.batch.prompt) == len(samples.distant) == len(queries)
     assert batch.state is not None and batch.action_mask is not None
-    assert np.array_equal(batch.state.numpy(), made.states[DECISIONS[asked]])
-    assert batch.action_mask.sum(1).tolist() == [5 - place for place in asked]
+    assert np.array_equal(batch.state.numpy(), made.states[DECISIONS[queries]])
+    assert batch.action_mask.sum(1).tolist() == [5 - place for place in queries]
 
 
 def test_a_route_decided_at_once_needs_the_frames_before_it_alone() -> None:
@@ -90,11 +90,11 @@ def step(number: int, video: int) -> SimpleNamespace:
     return SimpleNamespace(action=actions, info={"is_video_demo": number < video})
 
 
-@pytest.mark.parametrize(("every", "drawn"), [(1, {3, 4, 6, 8}), (2, {3, 6}), (14, {3})])
-def test_only_decisions_that_a_policy_is_requested_are_rendered(every: int, drawn: set[int]) -> None:
+@pytest.mark.parametrize(("every", "rendered"), [(1, {3, 4, 6, 8}), (2, {3, 6}), (14, {3})])
+def test_only_decisions_that_a_policy_is_requested_are_rendered(every: int, rendered: set[int]) -> None:
     steps = [step(number, 3) for number in range(11)]
     selection = FrameChoice(AT_DECISIONS, None, every).render_request(steps)  # type: ignore[arg-type]
-    assert set(selection.frames["front"]) == drawn
+    assert set(selection.frames["front"]) == rendered
 
 
 def test_the_pages_figures_of_routes_follow_from_the_records() -> None:

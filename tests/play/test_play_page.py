@@ -341,8 +341,8 @@ def test_headers_and_bodies_that_never_end_are_not_waited_for(tmp_path, monkeypa
             assert ended(again).startswith(b"HTTP/1.1 200")
         with socket.create_connection(at) as slow:
             slow.sendall(head + b"{")
-            answer = ended(slow)
-        assert answer.startswith(b"HTTP/1.1 400") and b"did not arrive within" in answer
+            reply = ended(slow)
+        assert reply.startswith(b"HTTP/1.1 400") and b"did not arrive within" in reply
         assert page.ask("GET", "/state")[0].status == 200
 
 
@@ -351,5 +351,5 @@ def test_a_body_that_is_not_read_ends_the_connection(tmp_path, method):
     with served(tmp_path) as page, socket.create_connection(("127.0.0.1", page.port)) as endless:
         endless.sendall(method.encode() + b" HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
                         b"Content-Length: 1000000000\r\n\r\n" + bytes(5000))  # fmt: skip
-        answer = ended(endless)
-    assert b"connection: close" in answer.lower().partition(b"\r\n\r\n")[0]
+        reply = ended(endless)
+    assert b"connection: close" in reply.lower().partition(b"\r\n\r\n")[0]

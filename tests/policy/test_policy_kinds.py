@@ -46,8 +46,8 @@ class KeepingPolicy(MMEPolicy):
 
 
 def test_a_subclass_takes_the_options_of_its_parents() -> None:
-    own = build_policy("pi05", policy={"name": "keeping", "augment": False})
-    assert isinstance(own, KeepingPolicy) and (own.augment, own.keep) == (False, 1)
+    custom = build_policy("pi05", policy={"name": "keeping", "augment": False})
+    assert isinstance(custom, KeepingPolicy) and (custom.augment, custom.keep) == (False, 1)
     with pytest.raises(UserError, match=r"policy has no key 'augmnt'\. Did you mean 'augment'"):
         policy_options(KeepingPolicy, {"policy": {"augmnt": False}})
     assert policy_options(KeepingPolicy, {"policy": {"keep": 3, "augment": False}}) == {"keep": 3, "augment": False}

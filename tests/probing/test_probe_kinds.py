@@ -158,19 +158,19 @@ def test_keyframes_are_probed_and_the_bank_goes_on_as_it_was() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "said", "expected"),
+    ("word", "message", "expected"),
     [
         ("subgoal_count", "pick it up for the first time at <1, 2>", "pick it up for the second time at <1, 2>"),
         ("subgoal_count:-1", "press 3 times, then one", "press 2 times, then ten"),
         ("subgoal_delay:1", "the third thing", "the second thing"),
     ],
 )
-def test_subgoals_can_be_wrong_by_one_or_late(word: str, said: str, expected: str) -> None:
+def test_subgoals_can_be_wrong_by_one_or_late(word: str, message: str, expected: str) -> None:
     policy = quick_policy("simplesg")
     probe = ProbedPolicy(policy, read_arm(word))
     episode = probe.start_episode("press the button")
-    episode.subgoals = ["the second thing", said]
-    assert probe.arm.say(said, probe.moment(episode)) == expected
+    episode.subgoals = ["the second thing", message]
+    assert probe.arm.say(message, probe.moment(episode)) == expected
 
 
 def test_a_subgoal_of_another_episode_reaches_the_prompt() -> None:

@@ -80,7 +80,7 @@ def test_float_and_channel_first_images_become_the_same_bytes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("picture", "message"),
+    ("image", "message"),
     [
         (np.zeros((4, 4), np.uint8), "Expected an image"),
         (np.zeros((4, 4, 4), np.uint8), "three channels"),
@@ -89,9 +89,9 @@ def test_float_and_channel_first_images_become_the_same_bytes() -> None:
         (np.zeros((4, 4, 3), np.int64), "int64"),
     ],
 )
-def test_what_is_no_image_is_refused(picture: np.ndarray, message: str) -> None:
+def test_what_is_no_image_is_refused(image: np.ndarray, message: str) -> None:
     with pytest.raises(UserError, match=message):
-        as_uint8_frames(picture)
+        as_uint8_frames(image)
 
 
 def test_resizing_refuses_other_shapes_and_types() -> None:

@@ -52,9 +52,9 @@ def in_process(policy: MMEPolicy) -> np.ndarray:
         episode = policy.start_episode(info["task_goal"][0], seed=42)
         frames = [seen]
         while len(taken) < STEPS:
-            pictures = {name: np.stack([f[f"{name}_rgb_list"][-1] for f in frames]) for name in ("front", "wrist")}
+            images = {name: np.stack([f[f"{name}_rgb_list"][-1] for f in frames]) for name in ("front", "wrist")}
             arms = [[*f["joint_state_list"][-1], f["gripper_state_list"][-1][0]] for f in frames]
-            episode.observe(pictures, np.array(arms, np.float32))
+            episode.observe(images, np.array(arms, np.float32))
             chunk = policy.act(episode)[:16][: STEPS - len(taken)]
             taken += list(chunk)
             frames = [env.step(action)[0] for action in chunk]

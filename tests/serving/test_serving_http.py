@@ -85,7 +85,7 @@ def test_sessions_of_one_address_are_distinguished_by_the_header(policy, served)
 
 
 @pytest.mark.parametrize(
-    ("method", "path", "body", "status", "said"),
+    ("method", "path", "body", "status", "message"),
     [
         ("POST", "/infer", b"", 400, b"empty"),
         ("POST", "/infer", b"garbage", 400, b"msgpack"),
@@ -96,11 +96,11 @@ def test_sessions_of_one_address_are_distinguished_by_the_header(policy, served)
         ("POST", "/infer", b"\0" * 2_000_000, 413, b"limits.message_mib"),
     ],
 )
-def test_wrong_requests_get_a_status_and_a_reason(policy, method, path, body, status, said):
+def test_wrong_requests_get_a_status_and_a_reason(policy, method, path, body, status, message):
     with Served(policy, limits=Limits(message_mib=1)) as served:
         code, kind, reply = ask(served, method, path, body)
         assert (code, kind) == (status, "text/plain; charset=utf-8")
-        assert said in reply and b"Traceback" not in reply
+        assert message in reply and b"Traceback" not in reply
         assert ask(served, "GET", "/healthz")[0] == 200
 
 

@@ -86,7 +86,7 @@ def test_a_prefix_changes_its_episode_alone(policy: MMEPolicy, before: np.ndarra
 
 
 @pytest.mark.parametrize(
-    ("actions", "delay", "said"),
+    ("actions", "delay", "message"),
     [
         (np.zeros((21, 8)), 0, "1 to 20 actions of 8 numbers"),
         (np.zeros((3, 7)), 0, "of 8 numbers"),
@@ -94,8 +94,8 @@ def test_a_prefix_changes_its_episode_alone(policy: MMEPolicy, before: np.ndarra
         (np.zeros((3, 8)), 4, "delay=4 must be a whole number from 0 to 3"),
     ],
 )
-def test_a_prefix_that_cannot_be_is_refused(policy: MMEPolicy, actions: np.ndarray, delay: int, said: str) -> None:
-    with pytest.raises(UserError, match=said):
+def test_a_prefix_that_cannot_be_is_refused(policy: MMEPolicy, actions: np.ndarray, delay: int, message: str) -> None:
+    with pytest.raises(UserError, match=message):
         episode_of(policy).set_action_prefix(actions, delay)
 
 

@@ -22,7 +22,7 @@ CLOSE = 2e-6
 """Largest relative difference of losses that are added up in another order."""
 
 
-def answer(folder: Path, what: str) -> Any:
+def reply(folder: Path, what: str) -> Any:
     return json.loads((folder / f"{what}.json").read_text())
 
 
@@ -38,10 +38,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     folder = tmp_path_factory.mktemp("shared")
     done = commands.run("helpers.sharded_runs", str(folder), env={"OMP_NUM_THREADS": "1"})
-    ended = answer(folder, "ended") if done.returncode == 0 else {}
+    ended = reply(folder, "ended") if done.returncode == 0 else {}
     codes = [(1, -9) if "die" in what else (0,) * processes for processes, what in RUNS]
     assert [tuple(code) for code in ended.values()] == codes, (done.stdout + done.stderr)[-3000:]
-    assert answer(folder, "go_on") == {"parts": 2, "finished": True}
+    assert reply(folder, "go_on") == {"parts": 2, "finished": True}
     return folder
 
 
@@ -57,7 +57,7 @@ def test_two_then_one_then_three_processes_learn_what_one_learns(folder: Path) -
 
 @pytest.mark.slow
 def test_the_averages_are_what_is_validated_and_saved(folder: Path) -> None:
-    shared, alone = answer(folder, "resume"), answer(folder, "whole")
+    shared, alone = reply(folder, "resume"), reply(folder, "whole")
     assert shared == pytest.approx(alone, rel=CLOSE)
     assert abs(shared["raw"] - shared["average"]) > 1e-3
     parts = Policy.from_pretrained(resolve_checkpoint(folder / "run")).state_dict()
@@ -68,12 +68,12 @@ def test_the_averages_are_what_is_validated_and_saved(folder: Path) -> None:
 
 @pytest.mark.slow
 def test_each_process_holds_its_part_alone(folder: Path) -> None:
-    assert answer(folder, "train")["held"] == pytest.approx(1 / 2, rel=0.05)
+    assert reply(folder, "train")["held"] == pytest.approx(1 / 2, rel=0.05)
 
 
 @pytest.mark.slow
 def test_a_stop_signal_to_one_process_saves_what_all_hold(folder: Path) -> None:
-    assert answer(folder, "stop") == {"finished": False, "signal": 15}
+    assert reply(folder, "stop") == {"finished": False, "signal": 15}
     checkpoint = resolve_checkpoint(folder / "stopped")
     assert (checkpoint.name, read_state(checkpoint)["shards"]) == ("step_000001", 2)
     Policy.from_pretrained(checkpoint)
@@ -83,14 +83,14 @@ def test_a_stop_signal_to_one_process_saves_what_all_hold(folder: Path) -> None:
 @pytest.mark.slow
 def test_a_killed_process_ends_the_others(folder: Path) -> None:
     """Of the fixture's two the second killed itself; the first then ended with an error, which it compared."""
-    assert answer(folder, "policies")
+    assert reply(folder, "policies")
     assert not (folder / "die.json").exists()
     assert not checkpoints_in(folder / "killed" / "checkpoints")
 
 
 @pytest.mark.slow
 def test_every_kind_of_policy_learns_and_answers_the_same_shared(folder: Path) -> None:
-    result = answer(folder, "policies")
+    result = reply(folder, "policies")
     assert set(sharded_runs.MODELS) <= set(result)
     for name, one in result.items():
         assert one["shared"] == pytest.approx(one["alone"], rel=2e-5), name

@@ -29,12 +29,14 @@ class Shifted(SubgoalPredictor):
     """Says the scripted environment's grounded subgoal with its point moved, and from the third on other words."""
 
     def predict_due(self, episodes):
-        said = []
+        message = []
         for episode in episodes:
             text = f"Push at <{episode.step + 3}, 13>." if episode.step < 32 else "pull"
             problem = "malformed" if episode.step == 16 else ""
-            said.append(Subgoal(text, points_of(text), queried=True, reply=f"answer {episode.step}", problem=problem))
-        return said
+            message.append(
+                Subgoal(text, points_of(text), queried=True, reply=f"answer {episode.step}", problem=problem)
+            )
+        return message
 
 
 def lines(path: Path) -> list[dict]:

@@ -17,7 +17,7 @@ pytest.importorskip("google.genai", reason="needs the extra gemini")
 SECRET = "AIza-not-a-real-key"
 
 
-def answer(text: str | None, finish: str = "STOP") -> tuple[int, dict]:
+def reply(text: str | None, finish: str = "STOP") -> tuple[int, dict]:
     content = {"role": "model", "parts": [] if text is None else [{"text": text}]}
     used = {"promptTokenCount": 300, "candidatesTokenCount": 20, "thoughtsTokenCount": 80, "totalTokenCount": 400}
     return 200, {"candidates": [{"content": content, "finishReason": finish}], "usageMetadata": used}
@@ -62,11 +62,11 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
 def test_a_conversation_over_http(server: Server, caplog: pytest.LogCaptureFixture) -> None:
     server.answers = [
         failure(503, "overloaded"),
-        answer('{"subgoal_sequence": ["a"], "subgoal": "press the button at <500, 250>"}'),
-        answer(None, finish="SAFETY"),
+        reply('{"subgoal_sequence": ["a"], "subgoal": "press the button at <500, 250>"}'),
+        reply(None, finish="SAFETY"),
         failure(500, f"internal, key={SECRET}"),
         failure(500, "internal"),
-        answer('{"description": "pressed", "subgoal": "put it down"}'),
+        reply('{"description": "pressed", "subgoal": "put it down"}'),
     ]
     predictor = Gemini(backoff=0, retries=1, interval=16, requests_per_minute=None)
     episode = predictor.start_episode("press", np.zeros((8, 64, 64, 3), np.uint8), "StopCube")

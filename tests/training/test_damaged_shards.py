@@ -22,7 +22,7 @@ def policy() -> MMEPolicy:
 
 
 @pytest.fixture(scope="module")
-def written(policy: MMEPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def saved(policy: MMEPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a checkpoint with one shard, as a process of a sharded run writes it."""
     folder = tmp_path_factory.mktemp("checkpoint")
     tensors = {f"{RAW}/{name}": tensor for name, tensor in policy.state_dict().items()}
@@ -35,8 +35,8 @@ def written(policy: MMEPolicy, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.fixture
-def checkpoint(written: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(written, tmp_path / "step_000001"))
+def checkpoint(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "step_000001"))
 
 
 def add_sums(checkpoint: Path) -> None:

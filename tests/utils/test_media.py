@@ -26,7 +26,7 @@ from mme_vla.utils.media import (
 GREEN, BLUE, YELLOW = ((0, 200, 0), (0, 0, 200), (200, 200, 0))
 
 
-def plain(colour: tuple[int, int, int], height: int = 64, width: int = 64) -> np.ndarray:
+def baseline(colour: tuple[int, int, int], height: int = 64, width: int = 64) -> np.ndarray:
     return np.full((height, width, 3), colour, np.uint8)
 
 
@@ -39,7 +39,7 @@ class ThreeCameras:
     """An environment that shows one frame of three cameras, and succeeds at once."""
 
     def _observation(self, count: int) -> dict[str, list[np.ndarray]]:
-        views = {"front": plain(GREEN), "wrist": plain(BLUE), "side": plain(YELLOW, 48)}
+        views = {"front": baseline(GREEN), "wrist": baseline(BLUE), "side": baseline(YELLOW, 48)}
         joints = {"joint_state_list": [np.zeros(7)] * count, "gripper_state_list": [np.zeros(2)] * count}
         return joints | {f"{name}_rgb_list": [view] * count for name, view in views.items()}
 
@@ -69,7 +69,7 @@ def test_an_episodes_video_shows_every_camera_of_the_robot(tmp_path: Path, names
 
 
 def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
-    views = [plain(GREEN), plain(BLUE, 63, 33)]
+    views = [baseline(GREEN), baseline(BLUE, 63, 33)]
     framed, bare = (video_frame(views, video=video) for video in (True, False))
     assert framed.shape == bare.shape == (64 + CAPTION, 98, 3), "sides are even"
     changed = (framed != bare).any(-1)
@@ -78,7 +78,7 @@ def test_the_border_lies_around_all_views_and_nowhere_else() -> None:
 
 
 def test_a_caption_that_is_too_long_ends_within_the_image() -> None:
-    captioned = video_frame([plain(GREEN)], "pick up the red cube and place it on the target " * 5)
+    captioned = video_frame([baseline(GREEN)], "pick up the red cube and place it on the target " * 5)
     assert captioned[64:, :58].max() > 200 and captioned[64:, -4:].max() == 0
 
 
@@ -86,14 +86,14 @@ def test_a_video_has_its_name_only_when_it_is_complete(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "a.mp4"
 
     def frames():
-        yield plain(GREEN)
+        yield baseline(GREEN)
         assert not path.exists()
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         write_video(frames(), path)
     assert list(path.parent.iterdir()) == []
-    assert write_video([plain(GREEN)] * 3, path) == len(decoded(path)) == 3
+    assert write_video([baseline(GREEN)] * 3, path) == len(decoded(path)) == 3
     with pytest.raises(ValueError, match="at least one frame"):
         write_video([], path)
     assert len(decoded(path)) == 3, "the old video stays"
@@ -112,13 +112,13 @@ def test_equal_frames_make_equal_bytes_and_odd_sides_survive(tmp_path: Path) -> 
 
 def test_a_video_ends_with_its_block(tmp_path: Path) -> None:
     with VideoWriter(tmp_path / "a.mp4", fps=7) as video:
-        video.add(plain(BLUE))
+        video.add(baseline(BLUE))
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].average_rate == 7
 
 
 def test_a_contact_sheet_holds_every_tile_and_outlines_the_highlighted_ones() -> None:
-    tiles = [Tile(plain(GREEN), "one"), Tile(plain(BLUE), "two", RED), Tile(plain(YELLOW), "three")]
+    tiles = [Tile(baseline(GREEN), "one"), Tile(baseline(BLUE), "two", RED), Tile(baseline(YELLOW), "three")]
     sheet = np.asarray(contact_sheet(tiles, columns=2, title="all"))
     for tile in tiles:
         assert (sheet == tile.image[0, 0]).all(-1).sum() > 150**2, tile.label

@@ -99,7 +99,7 @@ def write(file: Path, **contents: bytes) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("contents", "said"),
+    ("contents", "message"),
     [
         ({"../params/manifest.ocdbt": b"x"}, "lies outside of it"),
         ({"/params/manifest.ocdbt": b"x"}, "lies outside of it"),
@@ -110,8 +110,8 @@ def write(file: Path, **contents: bytes) -> Path:
         ({"params/manifest.ocdbt": b"x", "assets/a b/norm_stats.json": b"{}"}, "cannot name a folder"),
     ],
 )
-def test_what_no_checkpoint_holds_is_refused(tmp_path: Path, contents: dict[str, bytes], said: str) -> None:
-    with pytest.raises(UserError, match=said):
+def test_what_no_checkpoint_holds_is_refused(tmp_path: Path, contents: dict[str, bytes], message: str) -> None:
+    with pytest.raises(UserError, match=message):
         load_weights(build_policy("pi05"), write(tmp_path / "1.zip", **contents))
 
 

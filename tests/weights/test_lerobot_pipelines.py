@@ -91,17 +91,17 @@ def test_lerobots_pipelines_and_policy_give_our_actions(
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "message"),
     [
         ({"tokenizer": "sample"}, "is none that LeRobot could fetch"),
         ({"prompt": "state"}, "no step that writes"),
     ],
 )
-def test_what_lerobot_has_no_step_for_is_reported(tmp_path: Path, changes: dict[str, str], said: str) -> None:
+def test_what_lerobot_has_no_step_for_is_reported(tmp_path: Path, changes: dict[str, str], message: str) -> None:
     policy = exportable()
     policy.config["processor"] |= changes
     policy.save_pretrained(tmp_path / "ours")
-    with pytest.warns(UserWarning, match=said):
+    with pytest.warns(UserWarning, match=message):
         convert(tmp_path / "ours", tmp_path / "lerobot", to="lerobot")
     assert not (tmp_path / "lerobot/policy_preprocessor.json").exists()
     assert json.loads((tmp_path / "lerobot/config.json").read_text())["type"] == "pi05"

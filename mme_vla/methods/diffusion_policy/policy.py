@@ -203,7 +203,7 @@ class DiffusionPolicy(NetworkPolicy):
         text = torch.stack([e.prompt for e in episodes])
         return DiffusionBatch(torch.stack(images), processor.states(torch.stack(states)), text).to(self.device)
 
-    def answer(
+    def predict_chunk(
         self, batch: DiffusionBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories."""

@@ -249,7 +249,7 @@ class MemoryVlaPolicy(NetworkPolicy):
         valid = torch.ones(len(episodes), 1, dtype=torch.bool)
         return GroupBatch(images[:, None], ids[:, None], masks[:, None], times[:, None], valid).to(self.device)
 
-    def answer(
+    def predict_chunk(
         self, batch: GroupBatch, episodes: Sequence[Episode], noise: Mapping[str, Tensor], steps: int | None = None
     ) -> Tensor:
         """A chunk for what `observation` saw, through the episodes' memories, or their banks, which it leaves alone."""

@@ -297,7 +297,7 @@ class SAM2ActPolicy(NetworkPolicy):
         """What running episodes see now."""
         return [episode.scene_inputs() for episode in episodes if isinstance(episode, KeyframeEpisode)]
 
-    def answer(
+    def predict_chunk(
         self,
         batch: list[SceneInputs],
         episodes: "Sequence[Episode]",

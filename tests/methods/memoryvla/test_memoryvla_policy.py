@@ -140,8 +140,8 @@ def test_acting_twice_at_one_frame_stores_one_entry_and_gives_the_same_chunk() -
     assert episode.banks.cognition.times.tolist() == [0, 1] == episode.banks.perceptual.times.tolist()
 
 
-@pytest.mark.parametrize(("length", "written"), [(17, 2), (18, 3), (1, 0), (8, 1)])
-def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, written: int) -> None:
+@pytest.mark.parametrize(("length", "saved"), [(17, 2), (18, 3), (1, 0), (8, 1)])
+def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, saved: int) -> None:
     """However the frames arrive: at once, or one by one."""
     policy = tiny()
     video, now = frames(length), frames(1, seed=1)
@@ -152,7 +152,7 @@ def test_every_eighth_frame_of_the_video_is_saved_but_not_its_last(length: int, 
         parts.observe({name: video[name][i : i + 1] for name in video}, states(1), is_demo=True)
     parts.observe(now, states(1))
     for episode in (straight, parts):
-        assert episode.banks.count == written
+        assert episode.banks.count == saved
     torch.testing.assert_close(straight.banks.cognition.entries, parts.banks.cognition.entries, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(policy.act(straight), policy.act(parts), atol=1e-4)
 

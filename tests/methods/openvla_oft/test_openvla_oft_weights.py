@@ -23,7 +23,7 @@ def built(name: str = "openvla_oft", seed: int = 1) -> Policy:
     return policy
 
 
-def written(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
+def saved(policy: Policy, folder: Path, fmt: str = "openvla") -> Path:
     folder.mkdir()
     write_policy(policy, folder, fmt, torch.float32, policy.require_processor().stats)
     return folder
@@ -36,7 +36,7 @@ def equal(one: Policy, other: Policy) -> bool:
 
 def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) -> None:
     policy = built()
-    folder = written(policy, tmp_path / "run")
+    folder = saved(policy, tmp_path / "run")
     assert detect_format(folder) == "openvla"
     names = set(load_file(folder / "model.safetensors"))
     assert {"vision_backbone.featurizer.blocks.0.ls1.scale_factor", "language_model.lm_head.weight"} <= names
@@ -51,14 +51,14 @@ def test_a_run_is_saved_in_the_published_names_and_read_again(tmp_path: Path) ->
 
 @pytest.mark.parametrize("module", ["vision_backbone", "noisy_action_projector"])
 def test_a_run_with_modules_that_no_policy_has_is_refused(module: str, tmp_path: Path) -> None:
-    folder = written(built(), tmp_path / "run")
+    folder = saved(built(), tmp_path / "run")
     torch.save({"module.featurizer.scale": torch.ones(2)}, folder / f"{module}--150000_checkpoint.pt")
     with pytest.raises(UserError, match=f"{module}--150000_checkpoint.pt"):
         load_weights(built(seed=2), folder)
 
 
 def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_path: Path) -> None:
-    folder = written(built(), tmp_path / "base")
+    folder = saved(built(), tmp_path / "base")
     for file in folder.glob("*.pt"):
         file.unlink()
     for name in ("openvla_oft", "openvla_oft_framesamp_context"):
@@ -72,7 +72,7 @@ def test_openvla_itself_is_a_start_that_lacks_head_state_token_and_memory(tmp_pa
 
 def test_a_run_that_holds_its_adapters_alone_is_read_beside_its_base(tmp_path: Path) -> None:
     policy, run = built(), tmp_path / "run"
-    base = written(policy, tmp_path / "base")
+    base = saved(policy, tmp_path / "base")
     (run / "lora_adapter").mkdir(parents=True)
     for file in base.glob("*.pt"):
         file.rename(run / file.name)
