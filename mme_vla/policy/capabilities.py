@@ -3,7 +3,7 @@
 A policy has a capability as soon as it defines the members: no base class is needed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, Self, runtime_checkable
 
@@ -96,6 +96,15 @@ class CompilesSampling(Protocol):
 
     def compile_sampling(self, layers: bool = False) -> None:
         """Compile the sampler of a policy whose weights are final; see `MMEPolicy.compile_sampling`."""
+        ...
+
+
+@runtime_checkable
+class ComparesSizes(Protocol):
+    """Compares the sizes of its processor with those of its network."""
+
+    def processor_sizes(self) -> Mapping[str, tuple[object, object]]:
+        """Size → its value in the processor and in the network; a checkpoint in which they differ is damaged."""
         ...
 
 

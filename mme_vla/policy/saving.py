@@ -17,6 +17,7 @@ from mme_vla.config.plugins import import_trusted
 from mme_vla.embodiment import ROBOMME_JOINT
 from mme_vla.embodiment.robomme import embodiment_of
 from mme_vla.errors import UserError, brief, did_you_mean
+from mme_vla.policy.capabilities import ComparesSizes
 from mme_vla.policy.card import CARD_FILE, model_card
 from mme_vla.policy.finetune import add_adapters
 from mme_vla.policy.run_folders import newest_checkpoint
@@ -307,8 +308,6 @@ def recompute_buffers(policy: "Policy") -> None:
 
 def check_processor(policy: "Policy", source: str) -> None:
     """Make sure that a policy and its processor have the same robot and sizes."""
-    from mme_vla.policy.network import NetworkPolicy
-
     processor = policy.require_processor()
     robot = embodiment_of(policy.config)
     if policy.config.get("embodiment") is not None and robot != processor.embodiment:
@@ -317,7 +316,7 @@ def check_processor(policy: "Policy", source: str) -> None:
             f"{brief(robot.name)}, or they describe it differently. The files are from two checkpoints, or one was "
             "changed."
         )
-    sizes = policy.processor_sizes() if isinstance(policy, NetworkPolicy) else {}
+    sizes = policy.processor_sizes() if isinstance(policy, ComparesSizes) else {}
     for name, (actual, expected) in sizes.items():
         if actual != expected:
             raise UserError(

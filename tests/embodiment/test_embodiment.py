@@ -121,7 +121,7 @@ def test_a_checkpoint_keeps_its_robot(tmp_path: Path) -> None:
     policy = build_policy("pi05", backbone=TINY, embodiment="robomme_waypoint")
     policy.save_pretrained(tmp_path)
     assert MMEPolicy.from_pretrained(tmp_path).embodiment == shipped("robomme_waypoint")
-    assert Processor.load(tmp_path).horizon == 4
+    assert Processor.load(tmp_path).embodiment.action.horizon == 4
 
 
 def test_statistics_of_another_robot_are_refused() -> None:

@@ -28,7 +28,7 @@ def test_a_processor_of_another_robot_than_the_configurations_is_refused(tmp_pat
     settings = json.loads(file.read_text())
     settings["embodiment"]["action"]["relative"] = []
     file.write_text(json.dumps(settings))
-    with pytest.raises(UserError, match="two say different things"):
+    with pytest.raises(UserError, match="they describe it differently"):
         MMEPolicy.from_pretrained(tmp_path)
 
 

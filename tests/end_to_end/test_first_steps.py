@@ -156,7 +156,7 @@ def test_arguments_for_the_constructor_of_memory_are_explained() -> None:
         def __init__(self) -> None:
             super().__init__(32, 48)
 
-    with pytest.raises(TypeError, match=r"Own: Memory.__init__\(\) takes no arguments.*self.budget"):
+    with pytest.raises(TypeError, match=r"Own: MemoryModule.__init__\(\) takes no arguments.*self.budget"):
         Own()
 
 

@@ -121,7 +121,7 @@ def test_a_client_must_say_that_it_adds_the_pose() -> None:
             assert client.metadata["action_space"] == "ee_delta"
             assert client.infer({**request, "action_space": "ee_delta"})["actions"].shape == (16, 7)
         for state, reason in (
-            (request, "say action_space='ee_delta'"),
+            (request, "send action_space='ee_delta'"),
             (request | {"action_space": "ee_pose"}, "ee_delta only"),
         ):
             with served.client() as client, pytest.raises(UserError, match=reason):

@@ -11,7 +11,6 @@ from helpers.scripted_env import VIDEO, make_scripted_env
 from helpers.union_frames import JOBS, STEPS, WatchedEnv, both_ways, make_watched_env, outcomes
 from mme_vla import UserError
 from mme_vla.evaluation.rollout.settings import RolloutSettings
-from mme_vla.policy.base import Policy
 from mme_vla.subgoal import SubgoalPredictor
 from mme_vla.subgoal.background import BackgroundPredictor
 from mme_vla.subgoal.base import Subgoal, SubgoalEpisode
@@ -113,7 +112,7 @@ def test_a_video_shows_everything_and_changes_nothing(name: str, tmp_path: Path)
 
 def test_a_policy_that_does_not_say_what_it_reads_gets_all_frames() -> None:
     policy = quick_policy("pi05")
-    policy.frames_read = lambda steps, exec_start: Policy.frames_read(policy, steps, exec_start)
+    policy.frames_read = lambda steps, exec_start: None
     envs = InlineEnvs(base=make_watched_env, max_steps=STEPS - 1)
     roll(policy, JOBS, envs, max_steps=STEPS - 1)
     assert [env.drawn["wrist"] for env in envs.made.values()] == FRAMES

@@ -105,7 +105,7 @@ def test_conditioning_frames_are_highlighted_and_the_current_one_is_not(monkeypa
     policy, calls = quick_policy("framesamp_context"), []
     monkeypatch.setattr(
         "mme_vla.policy.episode.Episode._take",
-        lambda self, front, demo, executed, rendered, states: calls.append((len(front), int(demo.sum()))),
+        lambda self, front, demo, executed, states: calls.append((front.length, int(demo.sum()))),
     )
     running = RunningEpisode(policy, UNMASK, 0, piece=8)
     image = np.zeros((64, 64, 3), np.uint8)

@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from mme_vla.envs.render_request import RenderRequest
-
 from helpers.rollout_fakes import InlineEnvs, roll
 from helpers.scripted_env import ScriptedEnv
+from mme_vla.envs.observations import RenderRequest
 from mme_vla.envs.vector.pool import Job
 from mme_vla.evaluation.records import EpisodeRecord
 

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 import torch
-from mme_vla.backbone.blocks import PI05_VISIBILITY, Span, Visibility
 from torch import Tensor
 
+from mme_vla.backbone.attention import PI05_VISIBILITY, Span, Visibility
 from mme_vla.integration.base import MEMORY_VISIBILITY, memory_visibility
 
 OWN: Visibility = {

@@ -232,7 +232,7 @@ def test_modulator(unit):
     layer.load_state_dict(read(table, params(tensors)))
     k, v = layer.keys_values(tensors["in/memory"])
     mask = additive_mask(tensors["in/memory_mask"][:, None], torch.float32)
-    assert error(layer.gather_selection(tensors["in/x"], k, v, mask), tensors["out/r"]) <= TOLERANCE
+    assert error(layer.read_memory(tensors["in/x"], k, v, mask), tensors["out/r"]) <= TOLERANCE
     assert error(layer(tensors["in/x"], k, v, mask), tensors["out/x_hat"]) <= TOLERANCE
 
 

@@ -143,20 +143,18 @@ def test_a_damaged_line_of_a_probe_is_named(tmp_path: Path) -> None:
     row = json.loads(first)
     for changed in ({"change": row["change"] + 1}, {"step": row["step"] + 1}):
         path.write_text(json.dumps(row | changed) + "\n" + "".join(others))
-        with pytest.raises(
-            UserError, match=r"offline\.jsonl, line 1, is not a line of a probe: .*not what was written"
-        ):
+        with pytest.raises(UserError, match=r"offline\.jsonl, line 1 is not what was written"):
             read(path)
     del row["crc32"]
     path.write_text(json.dumps(row) + "\n" + "".join(others))  # as earlier versions wrote it
     assert len(read(path)[0]) == len(others)
     for changed in ({"change": {"a": 1}}, {"step": "x"}, {"step": True}, {"kind": "other"}, {"more": 1}):
         path.write_text(json.dumps(row | changed) + "\n" + "".join(others))
-        with pytest.raises(UserError, match="line 1, is not a line of a probe"):
+        with pytest.raises(UserError, match="line 1: "):
             read(path)
     for line in ('{"kind": "done"}', '{"kind": "done", "recording": 7}', "[]"):
         path.write_text(line + "\n")
-        with pytest.raises(UserError, match="line 1, is not a line of a probe"):
+        with pytest.raises(UserError, match="line 1: "):
             read(path)
 
 

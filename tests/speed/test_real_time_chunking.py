@@ -104,5 +104,5 @@ def test_a_policy_that_answers_at_once_says_that_it_cannot() -> None:
     other.supports_rtc = False
     episode = episode_of(other)
     episode.set_action_prefix(np.zeros((3, 8)), 1)
-    with pytest.raises(UserError, match="needs a policy whose actions are a flow"):
+    with pytest.raises(UserError, match="does not support real-time chunking"):
         other.act(episode)

@@ -130,5 +130,5 @@ def test_what_is_gathered_together_is_not_counted_twice() -> None:
     policy = small_policy("framesamp_expert")
     groups = [id(group.module) for group in policy.shard_groups()]
     inside = [id(p) for group in policy.shard_groups() for p in group.module.parameters()]
-    assert len(groups) == len(set(groups)) == 2 + policy.backbone.depth
+    assert len(groups) == len(set(groups)) == 2 + policy.backbone.config.depth
     assert len(inside) == len(set(inside))

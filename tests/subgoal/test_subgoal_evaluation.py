@@ -148,9 +148,9 @@ def frames(first: int, count: int) -> np.ndarray:
 
 
 def settle(predictor: BackgroundPredictor) -> None:
-    """Wait until the answer under way is there."""
-    assert predictor._answers is not None
-    predictor._answers.exception(timeout=30)
+    """Wait until the prediction under way is there."""
+    assert predictor._prediction is not None
+    predictor._prediction.exception(timeout=30)
 
 
 def test_in_the_background_only_the_first_subgoal_is_waited_for() -> None:
